@@ -1,0 +1,120 @@
+"""The canonical topology that every face model is carried to.
+
+One bilaterally symmetric grid in a cylindrical chart. The head frame is right-handed, in metres: x to the
+picture's right, y up, z out of the face; its origin lies on the chart's vertical axis, inside the head, at the
+height of the nose's underside. u runs to the picture's right over +-`HALF_ANGLE_DEG` of azimuth, v runs down
+from the forehead to below the chin. The 68 landmarks (Multi-PIE order) sit at the same (u, v) in every model,
+so a texture learned on one model fits all others. Changing anything here changes `LAYOUT_VERSION`.
+"""
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+LAYOUT_VERSION = 1
+GRID = 129  # vertices along each side of the grid; odd, so that one column lies on the midline
+HALF_ANGLE_DEG = 61.0
+TOP_M, BOTTOM_M = 0.092, -0.082
+
+# Right half (picture's left) and midline of the anatomical mean: landmark, x, y, z in millimetres.
+_MEASURES_MM = """
+ 0 -73.5  37   46.5 |  1 -73   15   49.5 |  2 -69.5 -4.5 55.5 |  3 -65.5 -23.5 61.5 |  4 -57  -45   71.5
+ 5 -43   -62   83.5 |  6 -30.5 -69  97.5 |  7 -15.5 -72.5 112.5 | 8  0 -75.5 114.5 | 17 -58   52   89
+18 -49.5  60  100   | 19 -38   62.5 108.5 | 20 -24  62   115   | 21 -11.5 59  117.5 | 27  0   37.5 117.5
+28   0    26.5 125  | 29   0   16  133   | 30   0    4  140.5 | 31 -12.5 -11.5 118.5 | 32 -6 -11.5 124
+33   0   -12  125.5 | 36 -44.5 34.5 96   | 37 -38.5 38.5 103.5 | 38 -28  39.5 105.5 | 39 -18.5 32.5 102
+40 -27.5  31  104   | 41 -38.5 30.5 102.5 | 48 -25.5 -35 112  | 49 -17  -28 122     | 50 -7.5 -24 127.5
+51   0   -25  128.5 | 57   0  -44  125.5 | 58 -10.5 -43 124   | 59 -18  -40.5 119   | 60 -22 -35 111.5
+61 -10   -32.4 121  | 62   0  -32.5 122.5 | 66  0   -34.6 122.5 | 67 -10.5 -34.5 120.5
+"""
+MIRROR_68 = np.array(
+    [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)]
+    + [45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40]
+    + [*range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), 67, 66, 65]
+)
+CONTOUR = tuple(range(17))
+INNER_MOUTH_CORNERS = (60, 64)  # the two that the paper's 66 landmarks leave out
+OUTER_EYE_CORNERS = (36, 45)  # their distance is the inter-ocular distance everywhere in facerf
+
+
+def _landmarks_m() -> np.ndarray:
+    points = np.full((68, 3), np.nan)
+    for cell in _MEASURES_MM.replace("\n", "|").split("|"):
+        if cell.strip():
+            index, *xyz = (float(token) for token in cell.split())
+            points[int(index)] = xyz
+            points[MIRROR_68[int(index)]] = np.array(xyz) * [-1, 1, 1]
+    return points / 1000
+
+
+LANDMARKS_M = _landmarks_m()  # [68, 3]
+
+
+def chart_uv(points_m: np.ndarray) -> np.ndarray:
+    """Head-frame points [..., 3] to (u, v) [..., 2]: azimuth about the axis, and height."""
+    azimuth_deg = np.degrees(np.arctan2(points_m[..., 0], points_m[..., 2]))
+    u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
+    v = (TOP_M - points_m[..., 1]) / (TOP_M - BOTTOM_M)
+    return np.stack([u, v], -1)
+
+
+def chart_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions [..., 3] of the rays from outside the head to its axis through (u, v)."""
+    azimuth = np.radians((uv[..., 0] - 0.5) * 2 * HALF_ANGLE_DEG)
+    y = TOP_M - uv[..., 1] * (TOP_M - BOTTOM_M)
+    outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], -1)
+    origins = outward * radius_m
+    origins[..., 1] = y
+    return origins, -outward
+
+
+LANDMARK_UV = chart_uv(LANDMARKS_M)  # [68, 2]
+
+
+@cache
+def grid_uv() -> Tensor:
+    """(u, v) of every vertex [V, 2], row by row from the forehead down; V = GRID * GRID."""
+    side = torch.linspace(0, 1, GRID)
+    v, u = torch.meshgrid(side, side, indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 2)
+
+
+@cache
+def grid_triangles() -> Tensor:
+    """Vertex ids [F, 3], counter-clockwise seen from outside; diagonals mirrored about the midline."""
+    row, col = torch.meshgrid(torch.arange(GRID - 1), torch.arange(GRID - 1), indexing="ij")
+    top_left = (row * GRID + col).reshape(-1)
+    top_right, bottom_left = top_left + 1, top_left + GRID
+    bottom_right = bottom_left + 1
+    falling = torch.stack([top_left, bottom_left, bottom_right, top_left, bottom_right, top_right], -1)
+    rising = torch.stack([top_left, bottom_left, top_right, top_right, bottom_left, bottom_right], -1)
+    left_half = (col < GRID // 2).reshape(-1, 1)
+    return torch.where(left_half, falling, rising).reshape(-1, 3)
+
+
+def locate(uv: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Vertex ids [N, 3] and barycentric weights [N, 3] of the grid triangle that holds each (u, v) [N, 2]."""
+    position = np.clip(uv, 0, 1) * (GRID - 1)
+    cell = np.minimum(position.astype(np.int64), GRID - 2)
+    fraction = position - cell
+    triangles = grid_triangles().reshape(GRID - 1, GRID - 1, 2, 3)[cell[:, 1], cell[:, 0]]  # [N, 2, 3]
+    corners = grid_uv().double().numpy()[triangles.numpy()] * (GRID - 1) - cell[:, None, None]  # [N, 2, 3, 2]
+    a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
+    p = fraction[:, None]
+    det = _cross(b - a, c - a)
+    weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], -1) / det[..., None]
+    best = weights.min(-1).argmax(-1)
+    rows = np.arange(len(uv))
+    return triangles[rows, best], torch.from_numpy(weights[rows, best]).float()
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@cache
+def landmark_weights() -> tuple[Tensor, Tensor]:
+    """Vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, the same for every model."""
+    return locate(LANDMARK_UV)
