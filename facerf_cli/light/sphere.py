@@ -1,0 +1,95 @@
+"""Directions of light: rigs, azimuth and elevation, and the lat-long map, each defined here and nowhere else.
+
+A light direction is the unit vector from the face toward the light, in camera space (x to the picture's right,
+y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the camera),
+u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres at (index + 0.5) / size.
+"""
+
+import math
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+RIG_LIGHTS = 150  # the paper's light stage
+_RELAX_STEPS = 200
+_RELAX_NEIGHBOURS = 18
+
+
+def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
+    """Unit directions [n, 3] float32, uniform on the sphere and the same at every call.
+
+    A golden spiral about +y, then a fixed number of steps in which each light is pushed off its neighbours.
+    """
+    if n < 1:
+        raise ValueError(f"a rig needs at least one light, not {n}")
+    points = _golden_spiral(n)
+    if n > 1:
+        for step in range(_RELAX_STEPS):
+            points = _repel(points, 0.2 * (1 - step / _RELAX_STEPS))
+    return torch.from_numpy(points).float()
+
+
+def _golden_spiral(lights: int) -> np.ndarray:
+    index = np.arange(lights)
+    azimuth = index * math.pi * (3 - math.sqrt(5))
+    y = 1 - (2 * index + 1) / lights
+    ring = np.sqrt(1 - y * y)
+    return np.stack([ring * np.sin(azimuth), y, ring * np.cos(azimuth)], -1)
+
+
+def _repel(points: np.ndarray, step: float) -> np.ndarray:
+    """Move unit vectors [L, 3] apart by at most `step` of their mean spacing."""
+    spacing = math.sqrt(4 * math.pi / len(points))
+    distance, neighbour = cKDTree(points).query(points, k=min(_RELAX_NEIGHBOURS + 1, len(points)))
+    away = points[:, None] - points[neighbour[:, 1:]]
+    force = (away * (spacing / distance[:, 1:, None]) ** 6 / spacing).sum(1)
+    force -= (force * points).sum(-1, keepdims=True) * points
+    length = np.linalg.norm(force, axis=-1, keepdims=True)
+    moved = points + step * spacing * force / (1 + length)
+    return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+
+
+def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
+    """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the picture's right side."""
+    azimuth, elevation = torch.broadcast_tensors(
+        torch.deg2rad(torch.as_tensor(azimuth_deg, dtype=torch.get_default_dtype())),
+        torch.deg2rad(torch.as_tensor(elevation_deg, dtype=torch.get_default_dtype())),
+    )
+    ring = elevation.cos()
+    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+
+
+def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3] of any length."""
+    x, y, z = directions.unbind(-1)
+    return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.atan2(y, torch.hypot(x, z)))
+
+
+def uv_to_direction(uv: Tensor) -> Tensor:
+    """Map positions [..., 2] to unit directions [..., 3]: azimuth 180 - 360 u, elevation 90 - 180 v."""
+    azimuth, elevation = math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1])
+    ring = elevation.cos()
+    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+
+
+def direction_to_uv(directions: Tensor) -> Tensor:
+    """Directions [..., 3] of any length to map positions [..., 2] in [0, 1]."""
+    azimuth_deg, elevation_deg = direction_to_azel(directions)
+    return torch.stack([0.5 - azimuth_deg / 360, 0.5 - elevation_deg / 180], -1)
+
+
+def latlong_directions(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Unit direction of every pixel's centre [H, W, 3]."""
+    v = (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    u = (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
+    return uv_to_direction(torch.stack([grid_u, grid_v], -1)).to(dtype)
+
+
+def latlong_solid_angles(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Exact solid angle of every pixel [H, W] in steradians; they sum to 4 pi at any size."""
+    elevation = math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
+    band = elevation[:-1].sin() - elevation[1:].sin()
+    return (band * (2 * math.pi / width))[:, None].expand(height, width).to(dtype)

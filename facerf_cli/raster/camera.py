@@ -1,0 +1,94 @@
+"""Axes, the fixed camera and the head pose, each defined here and nowhere else.
+
+Camera space is right-handed, in metres: x to the picture's right, y up, z out of the face toward the camera.
+The camera sits at the origin and looks down -z, so what it sees has z < 0; the head pose is what varies (paper,
+'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the right, y down,
+and their centres at index + 0.5.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+CROP_FOCAL_PER_SIDE = 4.0
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion; everything in pixels of its own picture."""
+
+    focal_px: float
+    width_px: int
+    height_px: int
+    cx_px: float
+    cy_px: float
+
+
+def crop_camera(side_px: int) -> Camera:
+    """The camera of every face crop: focal length 4 x its side, centred principal point."""
+    return Camera(CROP_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
+
+
+def project(points_camera: Tensor, camera: Camera) -> Tensor:
+    """Camera-space points [..., 3] in metres to pixels [..., 2]; only meaningful for z < 0."""
+    x, y, z = points_camera.unbind(-1)
+    scale = camera.focal_px / -z
+    return torch.stack([camera.cx_px + scale * x, camera.cy_px - scale * y], -1)
+
+
+def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tensor:
+    """Pixel position (x, y) of every pixel's centre [H, W, 2], float32."""
+    y = torch.arange(camera.height_px, device=device, dtype=torch.float32) + 0.5
+    x = torch.arange(camera.width_px, device=device, dtype=torch.float32) + 0.5
+    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([grid_x, grid_y], -1)
+
+
+def pose_to_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Tensor:
+    """head_to_camera = Rz(roll) Rx(pitch) Ry(yaw), [3, 3] float32.
+
+    yaw > 0 turns the nose to the picture's right, pitch > 0 down, roll > 0 counter-clockwise on screen.
+    """
+    yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
+    ry = _matrix([math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)])
+    rx = _matrix([1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)])
+    rz = _matrix([math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1])
+    return (rz @ rx @ ry).float()
+
+
+def _matrix(*rows: list[float]) -> Tensor:
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:
+    """The (yaw, pitch, roll) in degrees of a rotation [3, 3]; at pitch +-90 the roll is taken as 0."""
+    r = head_to_camera.detach().double().cpu()
+    pitch = math.asin(max(-1.0, min(1.0, r[2, 1].item())))
+    if math.hypot(r[0, 1].item(), r[1, 1].item()) < 1e-6:  # looking straight up or down: yaw and roll coincide
+        yaw, roll = math.atan2(r[0, 2].item(), r[0, 0].item()), 0.0
+    else:
+        yaw = math.atan2(-r[2, 0].item(), r[2, 2].item())
+        roll = math.atan2(-r[0, 1].item(), r[1, 1].item())
+    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
+
+
+def so3_exp(omega: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of axis-angle vectors [..., 3] in radians; differentiable at zero too."""
+    angle2 = (omega * omega).sum(-1)[..., None, None]
+    small = angle2 < 1e-4  # the series' next term is below 1e-12 there, and sqrt has no gradient at 0
+    safe = torch.where(small, torch.ones_like(angle2), angle2)
+    angle = safe.sqrt()
+    sine = torch.where(small, 1 - angle2 / 6 + angle2**2 / 120, angle.sin() / angle)
+    versine = torch.where(small, 0.5 - angle2 / 24 + angle2**2 / 720, (1 - angle.cos()) / safe)
+    skew = skew_matrix(omega)
+    eye = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    return eye + sine * skew + versine * (skew @ skew)
+
+
+def skew_matrix(vector: Tensor) -> Tensor:
+    """[v]x [..., 3, 3] of vectors [..., 3], so that [v]x w is the cross product v x w."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
