@@ -1,0 +1,35 @@
+# make demo | test | lint | bench | man. The first call makes the virtual environment.
+PYTHON ?= python3
+VENV ?= .venv
+STAMP := $(VENV)/.installed
+FACERF := $(VENV)/bin/facerf
+
+.PHONY: demo test lint bench man setup clean
+.DEFAULT_GOAL := demo
+
+$(STAMP): pyproject.toml constraints.txt
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+setup: $(STAMP)
+
+demo: $(STAMP)
+	$(FACERF) relight examples/astronaut.jpg --envmap examples/maps/*.exr -o out/demo --ball
+
+lint: $(STAMP)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+test: lint
+	OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest
+
+bench: $(STAMP)
+	set -e; for script in benchmarks/*.py; do echo "== $$script"; $(VENV)/bin/python $$script; done
+
+man: $(STAMP)
+	$(VENV)/bin/python -m facerf_cli.manpages man
+
+clean:
+	rm -rf out build *.egg-info .mypy_cache .ruff_cache .pytest_cache
