@@ -20,7 +20,7 @@ _PARTS = ("eyes", "brows", "lips", "nostrils", "neck")  # what skin leaves out
 _PAIRED = ("eyes", "brows", "nostrils")  # outlined on the picture's left, then mirrored
 _EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.5, "neck": 5.0, "face": 16.0}
 
-_CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at 115 mm from the axis
+CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at 115 mm from the axis
 _BROW_ABOVE_MM, _BROW_BELOW_MM = (0.5, 1.5, 2.0, 2.0, 0.5), (1.0, 2.5, 4.0, 5.5, 5.0)  # of landmarks 17 to 21
 _NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4690, 0.5825), (4.0, 1.9), 14.0
 _FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04), (0.32, 0.045), (0.14, 0.075), (0.045, 0.17)]
@@ -32,19 +32,27 @@ def region_mask(name: str, side: int) -> Tensor:
     if name == "skin":
         return (1 - torch.stack([region_mask(part, side) for part in _PARTS]).sum(0)).clamp(0, 1)
     centre = (np.arange(side) + 0.5) / side
-    points_mm = np.stack(np.meshgrid(centre, centre), -1) * _CHART_MM
-    inside_mm = _inside_mm(points_mm, _outline_mm(name))
-    edge_mm = max(_EDGE_MM[name], _CHART_MM.max() / side)  # never sharper than a texel
-    ramp = np.clip(inside_mm / edge_mm + 0.5, 0, 1)
+    uv = np.stack(np.meshgrid(centre, centre), -1)
+    distance_mm = inside_mm(name, uv)
+    edge_mm = max(_EDGE_MM[name], CHART_MM.max() / side)  # never sharper than a texel
+    ramp = np.clip(distance_mm / edge_mm + 0.5, 0, 1)
     mask = ramp * ramp * (3 - 2 * ramp)
     mirrored = mask[:, ::-1]
     mask = np.maximum(mask, mirrored) if name in _PAIRED else (mask + mirrored) / 2
     return torch.from_numpy(mask).float()
 
 
+def inside_mm(name: str, uv: np.ndarray) -> np.ndarray:
+    """Distance [...] on the unrolled chart from (u, v) [..., 2] to the region's outline, positive inside.
+
+    Of paired regions only the one on the picture's left (u < 0.5) is measured.
+    """
+    return _inside_outline(uv * CHART_MM, _outline_mm(name))
+
+
 def _outline_mm(name: str) -> np.ndarray:
     """Closed outline [N, 2] on the unrolled chart, in millimetres."""
-    landmarks = LANDMARK_UV * _CHART_MM
+    landmarks = LANDMARK_UV * CHART_MM
     if name == "eyes":
         arcs = [landmarks[[36, 37, 38, 39]], landmarks[[39, 40, 41, 36]]]
     elif name == "brows":
@@ -59,12 +67,12 @@ def _outline_mm(name: str) -> np.ndarray:
         turn, tilt = np.linspace(0, 2 * np.pi, 40), np.radians(_NOSTRIL_TILT_DEG)
         along, across = _NOSTRIL_HALF_MM[0] * np.cos(turn), _NOSTRIL_HALF_MM[1] * np.sin(turn)
         ellipse = [along * np.cos(tilt) + across * np.sin(tilt), across * np.cos(tilt) - along * np.sin(tilt)]
-        arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * _CHART_MM]
+        arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * CHART_MM]
     elif name == "neck":
-        corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * _CHART_MM
+        corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * CHART_MM
         return np.concatenate([_smooth(landmarks[:17]), corners])
     elif name == "face":
-        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *_FOREHEAD_UV, LANDMARK_UV[0]]) * _CHART_MM]
+        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *_FOREHEAD_UV, LANDMARK_UV[0]]) * CHART_MM]
     else:
         raise ValueError(f"no region is called {name!r}; there are {', '.join(REGIONS)}")
     return np.concatenate([_smooth(arc) for arc in arcs])
@@ -77,7 +85,7 @@ def _smooth(points: np.ndarray, steps: int = 6) -> np.ndarray:
     return CubicSpline(length, points)(at)
 
 
-def _inside_mm(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
+def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """Distance [...] of `points` [..., 2] to the closed `outline` [N, 2], positive inside (even-odd rule)."""
     distance = np.full(points.shape[:-1], np.inf)
     inside = np.zeros(points.shape[:-1], bool)

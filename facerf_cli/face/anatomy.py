@@ -1,0 +1,218 @@
+"""The mean face of the built-in model, from named anatomical measures (millimetres, head frame).
+
+The neutral is a height field over the chart's cylinder: distance from the vertical axis at azimuth and height y.
+A table of section depths gives head, cheeks and jaw without their features; nose, eyes and mouth are laid on it by
+their own few measures; at last the surface is pulled onto the 68 landmarks of `LANDMARKS_M`. Only the picture's
+left half is built, then mirrored.
+"""
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator, RBFInterpolator, RectBivariateSpline
+
+from facerf_cli.face.regions import CHART_MM, inside_mm
+from facerf_cli.face.topology import (
+    BOTTOM_M,
+    GRID,
+    HALF_ANGLE_DEG,
+    LANDMARK_UV,
+    LANDMARKS_M,
+    TOP_M,
+    grid_uv,
+    landmark_weights,
+)
+
+# Section depths: height | distance from the axis at each azimuth, the nose and the lips taken away.
+_AZIMUTHS_DEG = (0, 8, 16, 24, 32, 40, 48, 54.5, 61)
+_SECTIONS_MM = """
+ 93 | 107.5 107   105.5 101.5  96    91    86.5  83   80.5
+ 84 | 111   110.5 109   105   100    94.5  89.5  86   83
+ 74 | 114   114   112   108   103    97    91.5  88   85
+ 66 | 116.5 117   115   110.5 104.5  98    92.5  88.5 85.5
+ 59 | 117.5 118   116.5 113.5 106    98.5  92.5  88.5 85.5
+ 52 | 117   116.5 115.5 114.5 108    99    93    88.5 85.5
+ 45 | 112.5 110.5 111.5 113   108    99.5  93    89   85.5
+ 38 | 108.5 106   110.5 110.5 106.5  99.5  93.5  89   85
+ 31 | 107   105.5 108.5 108.5 104.5 100    94    89.5 85
+ 23 | 109   109   108.5 108.5 106   101.5  95    89.5 84
+ 14 | 111   110.5 110   111   108.5 102.5  95    89   83.5
+  4 | 114   113   113   112.5 109.5 102.5  93.5  87.5 82
+ -6 | 118.5 115.5 114.5 113   108   100.5  92    86   80.5
+-16 | 124   119.5 115   111.5 105.5  98    90    84   78.5
+-26 | 124   120.5 115.5 110   103.5  96    88.5  82   75.5
+-36 | 121.5 118   114   108.5 101    93.5  85.5  78.5 72
+-46 | 121   118   112   105.5  97.5  89.5  80.5  73   67
+-54 | 119.5 116.5 110   102.5  94    84    73.5  67   63
+-60 | 120.5 116.5 108.5  99.5  89.5  77.5  67    63   61.5
+-66 | 120   116.5 106.5  94.5  81    69    63    61   60
+-71 | 118   114.5 102.5  86.5  72    64    60.5  59.5 59.5
+-75 | 115   111    95.5  76.5  66.5  61    59    59   59
+-79 | 108   102    80.5  68.5  62.5  59    58    58.5 58.5
+-84 |  79.5  74.5  68    63    59    57.5  57.5  58   58.5
+"""
+
+# Nose: height | depth of the midline profile, half width of the section, roundness of its ridge (exponent).
+_NOSE_MM = """
+ 50 | 117.2  9    2    glabella
+ 42 | 116.2  8.5  2    sellion
+ 37 | 117.7  8.5  2
+ 32 | 120.7  9    2.2  nasion between the eyes
+ 26 | 125.2 10    2.3
+ 20 | 130   11.2  2.5  rhinion
+ 14 | 135   12    2.6
+  8 | 139.2 12.5  2.7  supratip
+  3 | 140.8 12    2.6  pronasale
+ -1 | 140.2 10.5  2.4
+ -5 | 137     8.5 2.2
+ -8 | 132.3   7   2.2  columella
+-10.5 | 127.5 6.5 2
+-12 | 125.7  6.5  2    subnasale
+-16 | 124.6  6    2
+"""
+_ALA_XY_MM, _ALA_HALF_MM, _ALA_HEIGHT_MM = (13.8, -3.0), (5.6, 7.2), 8.5
+_NOSTRIL_DEPTH_MM = 4.0
+
+# Eyes: a sphere with a cornea, lids laid over it.
+EYE_CENTRE_MM, EYE_RADIUS_MM = np.array([-31.5, 35.5, 93.0]), 12.2
+_CORNEA_RADIUS_MM, _CORNEA_RISE_MM = 5.8, 0.9
+_LID_THICKNESS_MM = 1.5
+_FOLD_ABOVE_MM, _FOLD_DEPTH_MM = 4.5, 0.9
+
+# Lips: share of the way from the seam to the vermilion's edge | relief over the sections, upper and lower lip.
+_LIP_SHARES = (0, 0.15, 0.4, 0.7, 1.0, 1.3, 1.7)
+_LIP_UPPER_MM, _LIP_LOWER_MM = (0.2, 2.2, 3.8, 4.4, 3.3, 1.0, 0), (0.4, 2.8, 4.9, 5.0, 2.6, 0.6, 0)
+_SEAM_DEPTH_MM = 2.0
+_PHILTRUM_MM = (5.0, 0.7, 0.6)  # half distance of the columns, their height, depth of the groove
+
+
+def mean_vertices() -> np.ndarray:
+    """The mean face [V, 3] in metres; mirror symmetric to the last bit."""
+    uv = grid_uv().double().numpy()
+    left = uv[:, 0] <= 0.5
+    radius_mm = _features(uv[left])
+    radius_mm = radius_mm + _pull_onto_landmarks(uv, _mirrored(radius_mm))[left]
+    return _on_rays(uv, _mirrored(radius_mm)) / 1000
+
+
+def _mirrored(left: np.ndarray) -> np.ndarray:
+    """Values [GRID * (GRID // 2 + 1)] of the picture's left half and midline, to the whole grid [V]."""
+    half = left.reshape(GRID, GRID // 2 + 1)
+    return np.concatenate([half, half[:, -2::-1]], 1).reshape(-1)
+
+
+def _on_rays(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    azimuth = np.radians((uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG)
+    height = (TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)) * 1000
+    return np.stack([radius * np.sin(azimuth), height, radius * np.cos(azimuth)], -1)
+
+
+def _features(uv: np.ndarray) -> np.ndarray:
+    """Distance from the axis [N] in millimetres at (u, v) [N, 2] with u <= 0.5."""
+    azimuth_deg = (0.5 - uv[:, 0]) * 2 * HALF_ANGLE_DEG
+    height = (TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)) * 1000
+    radius = _sections(azimuth_deg, height)
+    across = radius * np.sin(np.radians(azimuth_deg))  # distance from the midline plane
+    radius = radius + _nose(across, height)
+    radius = radius - _NOSTRIL_DEPTH_MM * _step(inside_mm("nostrils", uv), -1.2, 1.2)
+    radius = radius + _mouth(uv, across, height)
+    return _eye(uv, radius)
+
+
+def _table(text: str) -> np.ndarray:
+    rows = [line.replace("|", " ").split() for line in text.strip().splitlines()]
+    width = min(len(row) for row in rows)
+    return np.array([[float(cell) for cell in row[:width]] for row in rows])
+
+
+def _sections(azimuth_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
+    rows = _table(_SECTIONS_MM)[::-1]
+    azimuths = np.array([*(-a for a in _AZIMUTHS_DEG[:0:-1]), *_AZIMUTHS_DEG])
+    depths = np.concatenate([rows[:, :1:-1], rows[:, 1:]], 1)
+    return RectBivariateSpline(rows[:, 0], azimuths, depths).ev(height, azimuth_deg)
+
+
+def _nose(across: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Relief of bridge, tip and wings over the sections."""
+    level, depth, half_width, roundness = (PchipInterpolator(*pair) for pair in _nose_columns())
+    inside = np.clip(height, level.x[0], level.x[-1])
+    rise = np.clip(depth(inside) - _sections(np.zeros_like(height), height), 0, None)
+    rise = rise * _step(height, -17, -14) * _step(-height, -54, -46)
+    ridge = rise * np.exp(-((across / half_width(inside)) ** roundness(inside)))
+    offset = np.stack([across, height], -1) - _ALA_XY_MM
+    wing = _ALA_HEIGHT_MM * np.exp(-(((offset / _ALA_HALF_MM) ** 2).sum(-1) ** 1.6))
+    return np.maximum(ridge, 0) + np.maximum(wing - 0.55 * ridge, 0)
+
+
+def _nose_columns() -> list[tuple[np.ndarray, np.ndarray]]:
+    rows = _table(_NOSE_MM)[::-1]
+    return [(rows[:, 0], rows[:, column]) for column in range(4)]
+
+
+def _mouth(uv: np.ndarray, across: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Relief of the lips, their seam and the philtrum over the sections."""
+    u, y = LANDMARK_UV[:, 0], LANDMARKS_M[:, 1] * 1000
+    column = np.clip(uv[:, 0], u[48], 0.5)
+    top, bottom = CubicSpline(u[48:55], y[48:55])(column), _lower_line(column, u, y)
+    seam = (y[60] + (y[[62, 66]].mean() - y[60]) * _step(column, u[48], u[61])) * np.ones_like(column)
+    open_share = np.clip(1 - ((0.5 - uv[:, 0]) / (0.5 - u[48])) ** 2, 0, 1) ** 0.6
+    above = np.interp((height - seam) / np.maximum(top - seam, 1.5), *_smooth_relief(_LIP_UPPER_MM))
+    below = np.interp((seam - height) / np.maximum(seam - bottom, 1.5), *_smooth_relief(_LIP_LOWER_MM))
+    relief = np.where(height > seam, above, below) * open_share
+    relief = relief - _SEAM_DEPTH_MM * _step(inside_mm("mouth", uv), -0.6, 1.0)
+    columns, rise, groove = _PHILTRUM_MM
+    ridges = rise * np.exp(-(((across - columns) / 2) ** 2)) - groove * np.exp(-((across / 2.8) ** 2))
+    return relief + ridges * _step(height, -27, -22) * _step(-height, 11, 14)
+
+
+def _lower_line(column: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    order = [48, 59, 58, 57, 56, 55, 54]
+    return CubicSpline(u[order], y[order])(column)
+
+
+def _smooth_relief(relief: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    share = np.linspace(0, _LIP_SHARES[-1], 60)
+    return share, PchipInterpolator(_LIP_SHARES, relief)(share)
+
+
+def _eye(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """The lids over the eyeball, and the eyeball between them."""
+    inside = inside_mm("eyes", uv)
+    ball = _eyeball(uv)
+    above = (LANDMARK_UV[[36, 39], 1].mean() - uv[:, 1]) * CHART_MM[1]
+    lid = ball + _LID_THICKNESS_MM - np.clip(-inside - 3, 0, None) ** 2 * 0.15
+    skin = np.logaddexp(radius * 1.5, lid * 1.5) / 1.5  # a soft maximum
+    skin = np.where(np.isfinite(ball), skin, radius)
+    fold = np.exp(-(((-inside - _FOLD_ABOVE_MM) / 1.1) ** 2)) * _step(above, 1, 4)
+    skin = skin - _FOLD_DEPTH_MM * fold
+    return np.where(np.isfinite(ball), skin + (np.minimum(ball, skin) - skin) * _step(inside, 0.2, 1.2), skin)
+
+
+def _eyeball(uv: np.ndarray) -> np.ndarray:
+    """Distance from the axis to the eyeball along the chart's rays, -inf where they miss it."""
+    directions = _on_rays(uv, np.ones(len(uv)))
+    height, directions[:, 1] = directions[:, 1].copy(), 0
+    to_centre = EYE_CENTRE_MM - np.stack([np.zeros_like(height), height, np.zeros_like(height)], -1)
+    along = (to_centre * directions).sum(-1)
+    miss2 = (to_centre**2).sum(-1) - along**2
+    hit = np.sqrt(np.maximum(EYE_RADIUS_MM**2 - miss2, 0))
+    points = directions * (along + hit)[:, None] - to_centre
+    from_pupil = np.hypot(points[:, 0], points[:, 1])
+    cornea = _CORNEA_RISE_MM * np.clip(1 - (from_pupil / _CORNEA_RADIUS_MM) ** 2, 0, None)
+    return np.where(miss2 < EYE_RADIUS_MM**2, along + hit + cornea, -np.inf)
+
+
+def _pull_onto_landmarks(uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
+    """What to add to the radius [V] so that the landmarks of the mesh lie at their measures."""
+    corners, weights = (tensor.numpy() for tensor in landmark_weights())
+    wanted = np.hypot(LANDMARKS_M[:, 0], LANDMARKS_M[:, 2]) * 1000
+    found = (_on_rays(uv, radius_mm)[corners] * weights[..., None]).sum(1)
+    residual = wanted - np.hypot(found[:, 0], found[:, 2])
+    edge = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
+    edge = edge[(np.abs(edge - 0.5) == 0.5).any(-1) & (edge[:, 1] < 0.3)]
+    anchors, values = np.concatenate([LANDMARK_UV, edge]), np.concatenate([residual, np.zeros(len(edge))])
+    return RBFInterpolator(anchors * CHART_MM, values, kernel="thin_plate_spline")(uv * CHART_MM)
+
+
+def _step(value: np.ndarray, start: float, end: float) -> np.ndarray:
+    """0 below `start`, 1 above `end`, smooth between."""
+    share = np.clip((value - start) / (end - start), 0, 1)
+    return share * share * (3 - 2 * share)
