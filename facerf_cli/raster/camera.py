@@ -3,7 +3,7 @@
 Camera space is right-handed, in metres: x to the picture's right, y up, z out of the face toward the camera.
 The camera sits at the origin and looks down -z, so what it sees has z < 0; the head pose is what varies (paper,
 'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the right, y down,
-and their centres at index + 0.5.
+and their centres at index + `PIXEL_CENTRE`.
 """
 
 import math
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 CROP_FOCAL_PER_SIDE = 4.0
+PIXEL_CENTRE = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,16 @@ def project(points_camera: Tensor, camera: Camera) -> Tensor:
     return torch.stack([camera.cx_px + scale * x, camera.cy_px - scale * y], -1)
 
 
+def pixel_rays(px: Tensor, camera: Camera) -> Tensor:
+    """The viewing ray through pixels [..., 2], scaled to z = -1: [..., 3]; a point at depth d is d * ray."""
+    x, y = (px[..., 0] - camera.cx_px) / camera.focal_px, (camera.cy_px - px[..., 1]) / camera.focal_px
+    return torch.stack([x, y, -torch.ones_like(x)], -1)
+
+
 def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tensor:
     """Pixel position (x, y) of every pixel's centre [H, W, 2], float32."""
-    y = torch.arange(camera.height_px, device=device, dtype=torch.float32) + 0.5
-    x = torch.arange(camera.width_px, device=device, dtype=torch.float32) + 0.5
+    y = torch.arange(camera.height_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
+    x = torch.arange(camera.width_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
     return torch.stack([grid_x, grid_y], -1)
 
