@@ -1,0 +1,218 @@
+"""The contract of every verb that walks folders (DESIGN): what is read, skipped, written, reported.
+
+A verb hands `run_batch` two functions: `outputs_of(item)` names the files that an item will have when it is
+finished, and `process(item)` makes them. `process` raises `InputError` for an item that is at fault (the run
+goes on); any other `FacerfError` concerns the whole run and ends it.
+"""
+
+import json
+import logging
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.commands.options import Settings
+from facerf_cli.commands.workers import in_processes
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.records import LOGGER_NAME, STDERR, json_line, one_line, unexpected
+
+REPORT_NAME = "report.jsonl"
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """The options of the contract, as the user gave them."""
+
+    output: Path
+    overwrite: bool = False
+    dry_run: bool = False
+    jobs: int = 1
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What `process` made of one item: the files it wrote, and facts for the report's row."""
+
+    outputs: Sequence[Path]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """One item's end, in a form that crosses a process border."""
+
+    item: Item
+    seconds: float
+    outcome: Outcome | None = None
+    error: str = ""
+    trace: str = ""
+    stops_the_run: FacerfError | None = None
+
+
+def run_batch(
+    verb: str,
+    inputs: Sequence[str],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    suffixes: frozenset[str] = PHOTO_SUFFIXES,
+) -> int:
+    """Work through the inputs and give the exit code: 0 all done, 1 some failed.
+
+    Raises `UsageError` (exit 2) where there is nothing to work on or the output folder cannot be used. With
+    `jobs` > 1 `process` runs in spawned processes and must be picklable.
+    """
+    items = collect_items(inputs, options.output, suffixes)
+    finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
+    done = set(finished)
+    todo = [item for item in items if item not in done]
+    if options.dry_run:
+        return _say_what_would_be_done(todo, finished, outputs_of)
+    report = _open_report(options.output / REPORT_NAME, verb, todo, finished, outputs_of)
+    if finished:
+        log.info("%d of %d already finished (--overwrite makes them anew)", len(finished), len(items))
+    work = _Work(process)
+    parallel = options.jobs > 1 and len(todo) > 1
+    results = in_processes(work, todo, options.jobs, _broken) if parallel else map(work, todo)
+    failures = 0
+    for result in _with_progress(results, len(todo), verb, settings):
+        if result.stops_the_run is not None:
+            raise result.stops_the_run
+        with report.open("a", encoding="utf-8") as stream:
+            stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
+        failures += _tell(result)
+    if failures and len(items) > 1:
+        log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
+    return 1 if failures else 0
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Runs `process` on an item and turns whatever happens into a `_Result`."""
+
+    process: Callable[[Item], Outcome]
+
+    def __call__(self, item: Item) -> _Result:
+        start_s = time.perf_counter()
+
+        def result(**ends: Any) -> _Result:
+            return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
+
+        try:
+            if not item.input_path.exists():
+                raise InputError(f"{item.input_path}: no such file")
+            return result(outcome=self.process(item))
+        except InputError as error:
+            return result(error=str(error), trace=traceback.format_exc())
+        except FacerfError as error:
+            return result(stops_the_run=error)
+        except Exception as error:  # a fault of ours must not cost the other items
+            return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+
+
+def _broken(item: Item, error: Exception) -> _Result:
+    """The result of an item whose process died under it."""
+    advice = "its process died, perhaps for want of memory; try fewer --jobs"
+    return _Result(item, 0.0, error=f"{item.input_path}: {advice} ({error})")
+
+
+def _is_finished(outputs: Sequence[Path]) -> bool:
+    return bool(outputs) and all(path.exists() for path in outputs)
+
+
+def _say_what_would_be_done(
+    todo: list[Item], finished: list[Item], outputs_of: Callable[[Item], Sequence[Path]]
+) -> int:
+    for item in todo:
+        for path in outputs_of(item):
+            print(f"{item.input_path} -> {path}")
+    log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
+    return 0
+
+
+def _open_report(
+    path: Path,
+    verb: str,
+    todo: list[Item],
+    finished: list[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+) -> Path:
+    """Start the report: older rows stay, but for those of items that are about to be made anew."""
+    rows = {(row.get("verb"), row.get("item")): row for row in _rows_of(path)}
+    for item in todo:
+        rows.pop((verb, item.name), None)
+    for item in finished:
+        skipped = _Result(item, 0.0, Outcome(outputs_of(item)))
+        rows.setdefault((verb, item.name), _report_row(verb, skipped, path.parent) | {"status": "skipped"})
+    try:
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
+    except FacerfError as error:
+        raise UsageError(f"output folder {error}") from error
+    return path
+
+
+def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:  # a run that was killed may leave half a line
+            continue
+        if isinstance(row, dict):
+            yield row
+
+
+def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, Any]:
+    outcome = result.outcome or Outcome([])
+    row = {
+        "verb": verb,
+        "item": result.item.name,
+        "input": result.item.input_path,
+        "status": "failed" if result.error else "done",
+        "seconds": result.seconds,
+        "error": result.error or None,
+        "outputs": [
+            path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
+            for path in outcome.outputs
+        ],
+    }
+    return row | {name: value for name, value in outcome.facts.items() if name not in row}
+
+
+def _tell(result: _Result) -> int:
+    """Outputs to stdout, an error to stderr; 1 for a failure."""
+    if result.error:
+        log.error("%s", one_line(result.error))
+        if result.trace:
+            log.debug("%s", "\n" + result.trace)
+        return 1
+    for path in result.outcome.outputs if result.outcome else ():
+        print(path, flush=True)
+    return 0
+
+
+def _with_progress(
+    results: Iterator[_Result], total: int, verb: str, settings: Settings
+) -> Iterator[_Result]:
+    """Pass the results through, with a progress bar on stderr where that is a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
+    redirect = sys.stdout.isatty()
+    with Progress(*columns, console=STDERR, disable=not shown, redirect_stdout=redirect) as progress:
+        task = progress.add_task(verb, total=total)
+        for result in results:
+            yield result
+            progress.advance(task)

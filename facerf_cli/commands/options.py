@@ -1,0 +1,84 @@
+"""The options that verbs share, so that each is named, explained and read once."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    import torch
+
+DeviceName = Literal["auto", "cpu", "cuda", "mps"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The global options; `ctx.obj` in every verb."""
+
+    verbosity: int = 0  # -1 errors only, 0 notes and warnings, 1 everything and tracebacks
+    log_json: bool = False
+    device: DeviceName = "auto"
+    checkpoint: Path | None = None  # None: the one in assets/
+    seed: int = 0
+
+
+def settings_of(context: typer.Context) -> Settings:
+    """The global options of this call."""
+    settings = context.obj
+    assert isinstance(settings, Settings)
+    return settings
+
+
+def torch_device(settings: Settings) -> "torch.device":
+    """Seed torch and give the device that `--device` names; `auto` takes cuda, then mps, then cpu."""
+    import torch
+
+    torch.manual_seed(settings.seed)
+    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
+    name = next(kind for kind in present if present[kind]) if settings.device == "auto" else settings.device
+    if not present[name]:
+        found = ", ".join(kind for kind in present if present[kind])
+        raise UsageError(f"--device {name}: torch finds no such device here (it finds: {found})")
+    return torch.device(name)
+
+
+InputsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PHOTO...",
+        help="Pictures, folders (walked recursively), or - for a list of paths on standard input.",
+        show_default=False,
+    ),
+]
+OutputOption = Annotated[
+    Path,
+    typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.", show_default=False),
+]
+OverwriteOption = Annotated[
+    bool, typer.Option("--overwrite", help="Make results anew that are already there (default: skip them).")
+]
+DryRunOption = Annotated[
+    bool, typer.Option("--dry-run", help="Say what would be read and written; write nothing.")
+]
+JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Pictures worked on at a time.")]
+InputColourspaceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--input-colourspace",
+        metavar="NAME",
+        help="Colour space of the input, over what the file says: sRGB, linear (lin_rec709), ACEScg, "
+        "Rec.2020, lin_rec2020, 'Display P3', or any name of the OCIO configuration.",
+        show_default="what the file says",
+    ),
+]
+FaceModelOption = Annotated[
+    str,
+    typer.Option(
+        "--face-model",
+        metavar="NAME|PATH",
+        help="Morphable model: builtin, or a .npz by `face-model import`.",
+    ),
+]

@@ -1,0 +1,140 @@
+"""The command line: verbs, global options, errors to exit codes.
+
+A verb is a function in `facerf_cli/commands/`, named like the verb, listed in `VERBS`. typer needs every
+verb's signature before it parses the line, so this module imports all of them; therefore **a command module
+imports torch, OpenImageIO, scipy, trimesh and the rooms that use them inside its function bodies**, not at
+its top. `facerf --help` stays quick that way, and a test holds it.
+"""
+
+import errno
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from facerf_cli import __version__
+from facerf_cli.commands.doctor import doctor
+from facerf_cli.commands.options import DeviceName, Settings
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
+
+VERBS: tuple[Callable[..., Any], ...] = (doctor,)
+GROUPS: dict[str, typer.Typer] = {}  # verbs that have verbs of their own
+
+EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+# Global options by how they are written; these are moved before the verb wherever they stand.
+FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})
+VALUED = frozenset({"--device", "--checkpoint", "--seed"})
+
+log = logging.getLogger(LOGGER_NAME)
+app = typer.Typer(
+    name="facerf",
+    help="One photo of a face in; the face under any light, from any direction, out.",
+    pretty_exceptions_enable=False,
+    context_settings=HELP_NAMES,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"facerf {__version__}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _global_options(
+    context: typer.Context,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say more; tracebacks with errors.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only errors; no progress bar.")] = False,
+    log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr as JSON lines.")] = False,
+    device: Annotated[DeviceName, typer.Option(help="Where torch computes.")] = Settings.device,
+    checkpoint: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Trained network, .safetensors.", show_default="the one shipped"),
+    ] = Settings.checkpoint,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of whatever is drawn.")] = Settings.seed,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    if verbose and quiet:
+        raise UsageError("-v and -q exclude each other")
+    verbosity = int(verbose) - int(quiet)
+    configure_logging(verbosity, log_json)
+    context.obj = Settings(verbosity, log_json, device, checkpoint, seed)
+
+
+for _verb in VERBS:
+    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(_verb)
+for _name, _group in GROUPS.items():
+    app.add_typer(_group, name=_name)
+
+
+def run() -> None:
+    """The entry point of the `facerf` script."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds, so that temporary files go
+    sys.exit(main(sys.argv[1:]))
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run one command line and give its exit code; whatever goes wrong becomes one line on stderr."""
+    configure_logging()
+    try:
+        line = global_options_first(arguments or ["--help"])
+        code = app(args=line, prog_name="facerf", standalone_mode=False)
+        sys.stdout.flush()
+        if code == 130:  # typer makes an exit code of Ctrl-C
+            return _fail(None, "interrupted", 130)
+        return code if isinstance(code, int) else 0
+    except UsageError as error:
+        return _fail(error, str(error), 2)
+    except FacerfError as error:
+        return _fail(error, str(error), 1)
+    except OSError as error:
+        if error.errno == errno.EPIPE:
+            # The reader of our stdout has gone; point it elsewhere so that Python's own flush stays quiet.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 128 + signal.SIGPIPE
+        return _fail(error, f"{error.filename or 'system'}: {error.strerror or error}", 1)
+    except typer.Abort:
+        return _fail(None, "aborted", 1)
+    except Exception as error:
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # typer's: the line was wrong
+            return _fail(None, f"{error.format_message()} {_see_help(error)}", error.exit_code)
+        return _fail(error, unexpected(error), 1)
+
+
+def global_options_first(arguments: Sequence[str]) -> list[str]:
+    """The line with its global options moved to the front, so that they may also stand after the verb."""
+    moved: list[str] = []
+    kept: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        if argument == "--":
+            kept += [argument, *rest]
+        elif argument in FLAGS or (argument.split("=")[0] in VALUED and "=" in argument):
+            moved.append(argument)
+        elif argument in VALUED:
+            moved += [argument, *([value] if (value := next(rest, None)) is not None else [])]
+        else:
+            kept.append(argument)
+    return moved + kept
+
+
+def _see_help(error: Any) -> str:
+    context = getattr(error, "ctx", None)
+    return f"(see '{context.command_path if context else 'facerf'} --help')"
+
+
+def _fail(error: BaseException | None, message: str, code: int) -> int:
+    trace = error if error is not None and log.isEnabledFor(logging.DEBUG) else None
+    log.error("%s", message, exc_info=trace)
+    return code

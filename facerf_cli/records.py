@@ -1,0 +1,124 @@
+"""What facerf says about itself and its results: log lines, JSON rows, and the provenance in its outputs."""
+
+import json
+import logging
+import math
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from facerf_cli import __version__
+
+# IPTC's vocabulary of digital sources (cv.iptc.org/newscodes/digitalsourcetype): a photo changed by a trained
+# model, and a picture that came out of a trained model alone.
+COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
+SYNTHETIC_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmicMedia"
+
+STDERR = Console(
+    stderr=True
+)  # shared by the log and the progress bar, so that they do not overwrite each other
+LOGGER_NAME = "facerf"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result comes from; every output of a verb carries it."""
+
+    input_name: str
+    checkpoint_name: str = ""
+    face_model_name: str = ""
+    face_model_licence: str = ""
+    source_type: str = COMPOSITE_SOURCE_TYPE
+
+    def attributes(self) -> dict[str, str | int]:
+        """Metadata for a file's header; empty fields are left out."""
+        attributes: dict[str, str | int] = {
+            "Software": f"facerf {__version__}",
+            "facerf:version": __version__,
+            "facerf:synthetic": 1,
+            "IPTC:DigitalSourceType": self.source_type,
+            "facerf:input": self.input_name,
+            "facerf:checkpoint": self.checkpoint_name,
+            "facerf:face_model": self.face_model_name,
+            "facerf:face_model_licence": self.face_model_licence,
+        }
+        return {name: value for name, value in attributes.items() if value != ""}
+
+
+def json_line(row: Mapping[str, Any]) -> str:
+    """A row as one line of strict JSON: paths as text, numpy scalars as numbers, NaN and infinity as null."""
+    return json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return value.as_posix()
+    if hasattr(value, "tolist"):  # numpy and torch, scalars and arrays
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+class LineFormatter(logging.Formatter):
+    """`facerf: warning: …`; a plain note has no prefix. The traceback only where the caller attached one."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as text."""
+        prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
+        text = prefix + one_line(record.getMessage())
+        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line, for machines (`--log-json`)."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The record as a JSON line."""
+        row = {
+            "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
+            "level": record.levelname.lower(),
+            "message": one_line(record.getMessage()),
+        }
+        if record.exc_info:
+            row["traceback"] = self.formatException(record.exc_info)
+        return json_line(row)
+
+
+class _StderrHandler(logging.Handler):
+    """Prints above a running progress bar when stderr is a terminal, plainly when it is not."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = self.format(record)
+        if STDERR.is_terminal:
+            STDERR.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(text, file=sys.stderr, flush=True)
+
+
+def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
+    """Send the log to stderr: verbosity -1 errors only, 0 notes and warnings, 1 everything."""
+    logger = logging.getLogger(LOGGER_NAME)
+    handler = _StderrHandler()
+    handler.setFormatter(JsonFormatter() if as_json else LineFormatter())
+    logger.handlers[:] = [handler]
+    logger.propagate = False
+    logger.setLevel({-1: logging.ERROR, 0: logging.INFO}.get(verbosity, logging.DEBUG))
+
+
+def unexpected(error: Exception) -> str:
+    """What is said of an error that is our fault, not the user's."""
+    return f"unexpected {type(error).__name__}: {error} (rerun with -v for the traceback)"
+
+
+def one_line(text: str) -> str:
+    """The text with its line breaks and runs of spaces made single spaces."""
+    return " ".join(text.split())
