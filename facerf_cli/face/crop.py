@@ -1,0 +1,129 @@
+"""The square that the face is cut out of a photo with: axis-aligned, never rotated (paper, 'Data Preparation').
+
+Pixel positions follow `raster/camera.py`: centres at index + `PIXEL_CENTRE`, origin at the top-left corner.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.topology import LANDMARKS_M, TOP_M
+from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
+
+MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
+_SMALLEST_FACE_PX = 4.0
+_EYES, _MOUTH = slice(36, 48), slice(48, 68)
+# The hairline lies this far above the eyes, in units of the distance from the eyes to the mouth.
+_EYES_M, _MOUTH_M = LANDMARKS_M[_EYES].mean(0), LANDMARKS_M[_MOUTH].mean(0)
+_FOREHEAD = (TOP_M - _EYES_M[1]) / (_EYES_M[1] - _MOUTH_M[1])
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A square of a photo, `side_px` photo pixels wide from (x0_px, y0_px), seen as size_px x size_px."""
+
+    x0_px: float
+    y0_px: float
+    side_px: float
+    size_px: int
+
+    @property
+    def camera(self) -> Camera:
+        """The fixed camera of the crop's pixels."""
+        return crop_camera(self.size_px)
+
+    @property
+    def scale(self) -> float:
+        """Crop pixels for each photo pixel."""
+        return self.size_px / self.side_px
+
+    def to_crop(self, photo_px: np.ndarray) -> np.ndarray:
+        """Photo positions [..., 2] in the crop's pixels."""
+        return (np.asarray(photo_px, np.float64) - (self.x0_px, self.y0_px)) * self.scale
+
+    def to_photo(self, crop_px: np.ndarray) -> np.ndarray:
+        """Crop positions [..., 2] in the photo's pixels."""
+        return np.asarray(crop_px, np.float64) / self.scale + (self.x0_px, self.y0_px)
+
+    def apply(self, image: np.ndarray) -> np.ndarray:
+        """Cut an image [H, W, C] to float32 [size, size, C]; beyond its border the edge pixels go on.
+
+        Catmull-Rom, widened to the crop's pixel where that is larger. Its undershoot is held inside the
+        image's own range, so that light stays non-negative.
+        """
+        if image.ndim != 3:
+            raise ValueError(f"image has shape {image.shape}, not [H, W, C]")
+        rows = _resampler(image.shape[0], self.y0_px, self.side_px, self.size_px)
+        columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)
+        top, bottom = _used(rows)
+        left, right = _used(columns)
+        region = image[top:bottom, left:right].astype(np.float32)
+        height, width, channels = region.shape
+        tall = rows[:, top:bottom] @ region.reshape(height, -1)  # [size, W C]
+        tall = tall.reshape(self.size_px, width, channels).transpose(1, 0, 2).reshape(width, -1)
+        cut = (columns[:, left:right] @ tall).reshape(self.size_px, self.size_px, channels)
+        bounded = np.clip(cut.transpose(1, 0, 2), region.min((0, 1)), region.max((0, 1)))
+        return np.ascontiguousarray(bounded, np.float32)
+
+    def valid(self, height_px: int, width_px: int) -> np.ndarray:
+        """Bool [size, size]: True where the crop's pixel has its centre inside a photo of that size."""
+        centres_px = np.arange(self.size_px) + PIXEL_CENTRE
+        x, y = self.to_photo(np.stack([centres_px, centres_px], -1)).T
+        return ((y >= 0) & (y <= height_px))[:, None] & ((x >= 0) & (x <= width_px))
+
+
+def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
+    """The square around landmarks [68, 2] in photo pixels that holds chin, temples, forehead and a margin."""
+    landmarks_px = check_landmarks(landmarks_px)
+    up = landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0)
+    forehead_px = landmarks_px[[0, *range(17, 27), 16]]
+    # brows and temples moved along the face's own up, so that a head that lies on its side keeps its forehead
+    along = (forehead_px - landmarks_px[_EYES].mean(0)) @ up / (up @ up)
+    points = np.concatenate([landmarks_px, forehead_px + (_FOREHEAD - along)[:, None] * up])
+    low, high = points.min(0), points.max(0)
+    side_px = MARGIN * float((high - low).max())
+    x0_px, y0_px = (low + high - side_px) / 2
+    return Crop(float(x0_px), float(y0_px), side_px, size_px)
+
+
+def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:
+    """The landmarks as float64 [68, 2], or an InputError where no face can have them."""
+    landmarks_px = np.asarray(landmarks_px, np.float64)
+    if landmarks_px.shape != (68, 2):
+        raise InputError(f"landmarks have the shape {landmarks_px.shape}; 68 pairs of x and y are needed")
+    if not np.isfinite(landmarks_px).all():
+        raise InputError("landmarks hold values that are not finite; detect them again or mend the file")
+    eyes_to_mouth_px = np.linalg.norm(landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0))
+    if min(np.ptp(landmarks_px, axis=0).min(), eyes_to_mouth_px) < _SMALLEST_FACE_PX:
+        raise InputError("landmarks lie on one spot or one line; a face of some pixels' size is needed")
+    return landmarks_px
+
+
+def _resampler(length: int, start_px: float, side_px: float, size_px: int) -> csr_array:
+    """Weights [size, length] of a one-dimensional Catmull-Rom resampling with replicated ends."""
+    step = side_px / size_px
+    width = max(step, 1.0)  # photo pixels in a unit of the kernel
+    centres_px = start_px + (np.arange(size_px) + 0.5) * step
+    taps = math.ceil(4 * width) + 1
+    index = np.floor(centres_px - PIXEL_CENTRE - 2 * width).astype(np.int64)[:, None] + np.arange(taps + 1)
+    weights = _catmull_rom((index + PIXEL_CENTRE - centres_px[:, None]) / width)
+    weights /= weights.sum(1, keepdims=True)
+    row = np.broadcast_to(np.arange(size_px)[:, None], index.shape)
+    entries = (weights.ravel().astype(np.float32), (row.ravel(), index.clip(0, length - 1).ravel()))
+    return csr_array(entries, shape=(size_px, length))
+
+
+def _catmull_rom(x: np.ndarray) -> np.ndarray:
+    x = np.abs(x)
+    inner = 1.5 * x**3 - 2.5 * x**2 + 1
+    outer = -0.5 * x**3 + 2.5 * x**2 - 4 * x + 2
+    return np.where(x < 1, inner, np.where(x < 2, outer, 0.0))
+
+
+def _used(weights: csr_array) -> tuple[int, int]:
+    """First and one past the last photo pixel that any crop pixel reads."""
+    used = weights.indices[weights.data != 0]
+    return int(used.min()), int(used.max()) + 1
