@@ -54,8 +54,7 @@ def _repel(points: np.ndarray, step: float) -> np.ndarray:
 def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
     """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the picture's right side."""
     azimuth, elevation = torch.broadcast_tensors(
-        torch.deg2rad(torch.as_tensor(azimuth_deg, dtype=torch.get_default_dtype())),
-        torch.deg2rad(torch.as_tensor(elevation_deg, dtype=torch.get_default_dtype())),
+        torch.deg2rad(torch.as_tensor(azimuth_deg)), torch.deg2rad(torch.as_tensor(elevation_deg))
     )
     ring = elevation.cos()
     return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)

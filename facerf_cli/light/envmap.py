@@ -1,0 +1,115 @@
+"""A lat-long map as the weights of a rig's lights.
+
+A light of weight 1 gives a white Lambertian surface that faces it radiance 1, so a light's weight is
+(1 / pi) times the integral of the map's radiance over the light's cell: the directions that it is nearest to.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.light.sphere import direction_to_uv, latlong_directions
+
+Sampling = Literal["cell", "paper"]
+_COLUMNS_AT_ONCE = 1 << 10  # of the map, when its rows are integrated in float64
+
+
+def check_envmap(envmap: Tensor) -> None:
+    """Say what is wrong with a map [H, W, 3] that a user brought, if anything is."""
+    if envmap.ndim != 3 or envmap.shape[2] != 3 or envmap.shape[1] != 2 * envmap.shape[0]:
+        size = " x ".join(str(side) for side in reversed(envmap.shape[:2]))
+        raise InputError(f"an environment map is twice as wide as high (lat-long), not {size} pixels")
+    broken = int((~envmap.isfinite()).any(-1).sum())
+    if broken:
+        raise InputError(f"{broken} pixels of the environment map are NaN or infinite; mend it first")
+
+
+def envmap_weights(
+    envmap: Tensor, directions: Tensor, rotate_deg: float = 0.0, sampling: Sampling = "cell"
+) -> Tensor:
+    """Weights [L, 3] float32 of the lights at `directions` [L, 3] under a linear map [H, W, 3].
+
+    `rotate_deg` is added to the azimuth of everything in the map. pi times the sum of the "cell" weights is the
+    map's integral, at any map size. "paper" takes the map's pixel at the light's direction (paper, 'Relighting'),
+    times the light's equal share of the sphere.
+    """
+    return rotated_weights(envmap, directions, [rotate_deg], sampling)[0]
+
+
+def rotated_weights(
+    envmap: Tensor, directions: Tensor, rotations_deg: Sequence[float], sampling: Sampling = "cell"
+) -> Tensor:
+    """`envmap_weights` at many rotations [R, L, 3]; what does not turn is computed once."""
+    if sampling == "paper":
+        return torch.stack([_pixel_weights(envmap, directions, rotation) for rotation in rotations_deg])
+    height = max(256, 2 * math.ceil(8 * math.sqrt(len(directions))))  # dozens of texels a cell at the least
+    cell = nearest_light(directions, height, 2 * height).reshape(-1)
+    rows = _RowIntegrals(envmap, height)
+    weights = torch.zeros(len(rotations_deg), len(directions), 3, dtype=torch.float64)
+    for weight, rotation_deg in zip(weights, rotations_deg, strict=True):
+        weight.index_add_(0, cell, rows.turned(2 * height, rotation_deg).reshape(-1, 3) / math.pi)
+    return weights.float()
+
+
+def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:
+    """Index of the light [L, 3] whose cell holds each texel's centre [H, W] int64."""
+    texels = latlong_directions(height, width, torch.float64)
+    _, index = cKDTree(directions.double().cpu().numpy()).query(texels.numpy())
+    return torch.from_numpy(index).long()
+
+
+def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float = 0.0) -> Tensor:
+    """Integral of a map's radiance over each texel of another, turned lat-long grid [height, width, 3] float64.
+
+    Exact for a map that is constant over each of its own pixels, whatever the two sizes and the angle.
+    """
+    return _RowIntegrals(envmap, height).turned(width, rotate_deg)
+
+
+class _RowIntegrals:
+    """A map integrated over the elevations of `height` new rows, ready to be cut at any azimuth."""
+
+    def __init__(self, envmap: Tensor, height: int) -> None:
+        envmap = torch.as_tensor(envmap)
+        old = _row_edges(envmap.shape[0])
+        new = _row_edges(height)
+        top, bottom = torch.minimum(new[:-1, None], old[:-1]), torch.maximum(new[1:, None], old[1:])
+        overlap = (top - bottom).clamp(min=0)  # [height, H] of sin(elevation)
+        parts = [
+            torch.einsum("nh,hwc->nwc", overlap, part.double())
+            for part in envmap.cpu().split(_COLUMNS_AT_ONCE, dim=1)
+        ]
+        pixel_azimuth = 2 * math.pi / envmap.shape[1]
+        zero = torch.zeros(height, 1, 3, dtype=torch.float64)
+        self._up_to = torch.cat([zero, torch.cat(parts, 1).cumsum(1) * pixel_azimuth], 1)  # [height, W + 1, 3]
+
+    def turned(self, width: int, rotate_deg: float) -> Tensor:
+        """Integrals over `width` texels a row [height, width, 3] with `rotate_deg` added to every azimuth."""
+        pixels = self._up_to.shape[1] - 1
+        u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360  # azimuth grows to the left
+        turns = u.floor()
+        position = (u - turns) * pixels
+        pixel = position.long().clamp(max=pixels - 1)
+        before, after = self._up_to[:, pixel], self._up_to[:, pixel + 1]
+        fraction = (position - pixel)[:, None]
+        edges = before + fraction * (after - before) + turns[:, None] * self._up_to[:, -1:]
+        return edges.diff(dim=1)
+
+
+def _row_edges(height: int) -> Tensor:
+    """sin(elevation) of the edges of the rows [height + 1], from 1 down to -1."""
+    return (math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)).sin()
+
+
+def _pixel_weights(envmap: Tensor, directions: Tensor, rotate_deg: float) -> Tensor:
+    envmap = torch.as_tensor(envmap)
+    height, width = envmap.shape[:2]
+    uv = direction_to_uv(directions.double())
+    column = ((uv[:, 0] + rotate_deg / 360) * width).floor().long() % width
+    row = (uv[:, 1] * height).long().clamp(0, height - 1)
+    return (envmap[row, column].double() * (4 / len(directions))).float()

@@ -1,0 +1,173 @@
+import math
+
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.light.ball import ball
+from facerf_cli.light.envmap import check_envmap, envmap_weights, rotated_weights, texel_integrals
+from facerf_cli.light.sphere import (
+    azel_to_direction,
+    direction_to_uv,
+    latlong_directions,
+    latlong_solid_angles,
+    rig_directions,
+)
+from tests.oracles.envmap import weigh_slowly
+
+RIG = rig_directions()
+
+
+def one_texel(height: int, uv: tuple[float, float]) -> torch.Tensor:
+    """A map that lights a white surface facing that one texel with radiance 1."""
+    envmap = torch.zeros(height, 2 * height, 3)
+    row, column = int(uv[1] * height), int(uv[0] * 2 * height)
+    envmap[row, column] = math.pi / latlong_solid_angles(height, 2 * height)[row, column]
+    return envmap
+
+
+def lambert(normals: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    return (normals @ RIG.T).clamp(min=0) @ weights
+
+
+def integral(envmap: torch.Tensor) -> torch.Tensor:
+    return (envmap.double() * latlong_solid_angles(*envmap.shape[:2], torch.float64)[..., None]).sum((0, 1))
+
+
+@pytest.mark.parametrize("height, width", [(1, 1), (1, 2), (4, 8), (7, 5), (64, 128), (300, 600), (512, 3000)])
+@pytest.mark.parametrize("rotate_deg", [0, 17.3, -1000])
+def test_pi_times_the_weights_is_the_maps_integral(height: int, width: int, rotate_deg: float) -> None:
+    envmap = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(height)) ** 4 * 100
+    weights = envmap_weights(envmap, RIG, rotate_deg)
+    torch.testing.assert_close(math.pi * weights.double().sum(0), integral(envmap), rtol=1e-6, atol=0)
+    assert bool((weights >= 0).all())
+
+
+@pytest.mark.parametrize("height", [1, 2, 8, 256])
+def test_a_constant_map_lights_a_white_surface_with_its_own_radiance(height: int) -> None:
+    weights = envmap_weights(torch.full((height, 2 * height, 3), 0.7), RIG)
+    assert math.pi * float(weights[:, 0].sum()) == pytest.approx(4 * math.pi * 0.7, rel=1e-6)
+    shaded = lambert(torch.nn.functional.normalize(torch.randn(50, 3), dim=-1), weights)
+    torch.testing.assert_close(shaded, torch.full((50, 3), 0.7), rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("rotate_deg", [0, 10.0])
+def test_a_coarse_map_is_cut_at_the_cells_and_not_at_its_pixels(rotate_deg: float) -> None:
+    envmap = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(5))
+    truth = torch.from_numpy(weigh_slowly(envmap.numpy(), RIG.numpy(), rotate_deg)).float()
+    error = envmap_weights(envmap, RIG, rotate_deg) - truth
+    assert error.abs().max() < 0.04 * truth.mean()
+    assert error.std() < 0.01 * truth.mean()
+
+
+def test_a_bright_texel_at_u_a_quarter_lights_the_pictures_right() -> None:
+    envmap = one_texel(64, (0.25, 0.5))
+    normals = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
+    right, left = lambert(normals, envmap_weights(envmap, RIG))[:, 0]
+    assert right > 0.97 and left == 0
+    diffuse = ball(envmap, 65, "diffuse")
+    assert diffuse[32, 60].mean() > 0.8 and diffuse[32, 4].mean() < 1e-3
+
+
+@pytest.mark.parametrize("azimuth_deg, elevation_deg", [(30, 20), (-110, -45), (175, 60)])
+def test_a_light_and_a_one_texel_map_agree(azimuth_deg: float, elevation_deg: float) -> None:
+    light = azel_to_direction(azimuth_deg, elevation_deg)
+    u, v = direction_to_uv(light).tolist()
+    rig = torch.cat([light[None], -light[None], torch.linalg.cross(light, torch.tensor([0.6, 0, 0.8]))[None]])
+    weights = envmap_weights(one_texel(128, (u, v)), rig)
+    torch.testing.assert_close(weights, torch.tensor([[1.0], [0], [0]]).expand(3, 3), rtol=1e-5, atol=0)
+    diffuse = ball(one_texel(128, (u, v)), 101, "diffuse")
+    y, x = torch.meshgrid(50 - torch.arange(101.0), torch.arange(101.0) - 50, indexing="ij")
+    normals = torch.stack([x, y, (50.5**2 - x * x - y * y).clamp(min=0).sqrt()], -1) / 50.5
+    inner = normals[..., 2] > 0.3
+    torch.testing.assert_close(diffuse[inner][:, 1], (normals @ light).clamp(min=0)[inner], rtol=0, atol=0.03)
+
+
+def test_rotation_adds_to_every_azimuth() -> None:
+    ahead = one_texel(64, (0.5, 0.5))
+    weights = envmap_weights(ahead, RIG, rotate_deg=90)
+    brightest = RIG[weights[:, 0].argmax()]
+    assert brightest[0] > 0.95  # from the camera's side to the picture's right
+
+
+def test_rotation_by_whole_pixels_moves_the_map() -> None:
+    envmap = torch.rand(16, 32, 3)
+    for pixels in (1, -3, 37):
+        moved = envmap.roll(-pixels, dims=1)  # azimuth grows to the left of the map
+        torch.testing.assert_close(
+            envmap_weights(envmap, RIG, rotate_deg=pixels * 360 / 32), envmap_weights(moved, RIG), rtol=1e-5, atol=1e-7
+        )
+
+
+def test_rotation_by_half_a_pixel_is_the_mean_of_both_sides() -> None:
+    envmap = torch.rand(8, 16, 3)
+    half = texel_integrals(envmap, 8, 16, rotate_deg=360 / 32)
+    both = (texel_integrals(envmap, 8, 16) + texel_integrals(envmap, 8, 16, rotate_deg=360 / 16)) / 2
+    torch.testing.assert_close(half, both, rtol=1e-12, atol=1e-12)
+
+
+def test_a_symmetric_rig_sees_a_turned_map_as_itself_turned() -> None:
+    count = 12
+    ring = azel_to_direction(torch.arange(count) * (360 / count) + 7, 0)
+    envmap = torch.rand(32, 64, 3)
+    plain = envmap_weights(envmap, ring)
+    turned = envmap_weights(envmap, ring, rotate_deg=360 / count)
+    torch.testing.assert_close(turned, plain.roll(1, dims=0), rtol=0.03, atol=0)
+
+
+def test_many_rotations_are_the_single_ones() -> None:
+    envmap = torch.rand(16, 32, 3)
+    angles = [0, 12.5, 180, 359]
+    for sampling in ("cell", "paper"):
+        many = rotated_weights(envmap, RIG, angles, sampling)
+        single = torch.stack([envmap_weights(envmap, RIG, angle, sampling) for angle in angles])
+        assert torch.equal(many, single)
+
+
+def test_paper_sampling_takes_the_pixel_at_the_light() -> None:
+    envmap = latlong_directions(256, 512) + 2  # each pixel says where it is
+    for rotate_deg in (0, 45):
+        weights = envmap_weights(envmap, RIG, rotate_deg, sampling="paper")
+        seen = weights * len(RIG) / 4 - 2
+        back = math.radians(-rotate_deg)
+        turn = torch.tensor(
+            [[math.cos(back), 0, math.sin(back)], [0, 1, 0], [-math.sin(back), 0, math.cos(back)]]
+        )
+        torch.testing.assert_close(seen, RIG @ turn.T, rtol=0, atol=0.02)
+
+
+def test_both_samplings_agree_on_a_smooth_map() -> None:
+    envmap = latlong_directions(128, 256) + 2
+    cell, paper = envmap_weights(envmap, RIG), envmap_weights(envmap, RIG, sampling="paper")
+    assert (cell.sum(0) / paper.sum(0) - 1).abs().max() < 0.01
+
+
+def test_the_mirror_ball_shows_what_lies_behind_the_camera_at_its_centre() -> None:
+    envmap = latlong_directions(128, 256)
+    mirror = ball(envmap, 61)
+    torch.testing.assert_close(mirror[30, 30], torch.tensor([0.0, 0, 1]), rtol=0, atol=0.01)
+    right = 30 + round(30.5 * math.sin(math.radians(45)))  # there the ball reflects straight to the right
+    assert mirror[30, right, 0] > 0.98
+    assert mirror[60 - right, 30, 1] > 0.98
+    assert mirror[0, 0].abs().max() == 0
+
+
+def test_balls_under_a_constant_map_are_white_and_turn_with_the_map() -> None:
+    for kind in ("mirror", "diffuse"):
+        assert float(ball(torch.ones(8, 16, 3), 33, kind)[16, 16, 0]) == pytest.approx(1, rel=1e-3)
+    lit = ball(one_texel(32, (0.5, 0.5)), 33, "diffuse", rotate_deg=90)
+    assert lit[16, 30].mean() > 0.8 and lit[16, 2].mean() < 1e-3
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (4, 8, 4), (8, 4, 3)])
+def test_maps_of_the_wrong_shape_are_named(shape: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="twice as wide"):
+        check_envmap(torch.zeros(shape))
+
+
+def test_broken_pixels_are_counted() -> None:
+    envmap = torch.zeros(4, 8, 3)
+    check_envmap(envmap)
+    envmap[1, 2, 0], envmap[3, 3] = torch.nan, torch.inf
+    with pytest.raises(InputError, match="2 pixels"):
+        check_envmap(envmap)
