@@ -1,4 +1,4 @@
-"""The square that the face is cut out of a photo with: axis-aligned, never rotated (paper, 'Data Preparation').
+"""The square that the face is cut out of a photo with: axis-aligned, never rotated (paper, 'Dataset').
 
 Pixel positions follow `raster/camera.py`: centres at index + `PIXEL_CENTRE`, origin at the top-left corner.
 """

@@ -5,14 +5,13 @@ landmarks slide: each is held to the closest point of the mesh's silhouette near
 step. Everything is batched over B faces in float64.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, LANDMARKS_M, OUTER_EYE_CORNERS, locate
 from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
@@ -20,13 +19,16 @@ from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
 _INNER = slice(len(CONTOUR), 68)
 _IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
 _RAYS_PER_LANDMARK, _POINTS_PER_RAY = 8, 10
-_BAND = (0.6, 1.0)  # how far in from the jaw line the silhouette may wander, as a share of the way from the nose
+_BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _WINDOW = 2 * _RAYS_PER_LANDMARK  # a contour landmark slides at most two landmarks' way along the jaw
+
+
+_INVISIBLE_M = 1e-4  # a direction of shape that moves no landmark further at one deviation is left out
 
 
 @dataclass(frozen=True)
 class FitSettings:
-    """One setting for all pictures. Noise is a share of the inter-ocular distance, priors standard deviations."""
+    """One setting for all pictures: noise as a share of the inter-ocular distance, priors as deviations."""
 
     noise_inner: float = 0.03
     noise_contour: float = 0.08
@@ -39,7 +41,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FitBatch:
-    """Fits of B faces, float64: rotation [B, 3, 3] head to camera, translation_m [B, 3], alpha, beta [B, K]."""
+    """Fits of B faces, float64: rotation [B, 3, 3] (head to camera), translation_m [B, 3], alpha, beta."""
 
     rotation: Tensor
     translation_m: Tensor
@@ -57,21 +59,23 @@ class FitBatch:
 class _Basis:
     """The model at the points that a fit may use: the inner landmarks first, then the contour's band.
 
-    mean [N, 3], modes [N, 3, K] (identity, then expression), outward [rays, 3] in the head frame.
+    The fit works in Q coordinates with standard normal priors, an orthonormal turn of the whitened coefficients
+    that leaves out what moves none of these points.
     """
 
-    mean: Tensor
-    modes: Tensor
-    outward: Tensor
+    mean: Tensor  # [N, 3]
+    modes: Tensor  # [N, 3, Q]
+    spread: Tensor  # [K, Q], coordinates to coefficients, identity then expression
+    outward: Tensor  # [rays, 3], head frame
 
 
 @dataclass(frozen=True)
 class _State:
-    """Pose and coefficients of B faces."""
+    """Pose and shape of B faces."""
 
     rotation: Tensor  # [B, 3, 3]
     translation_m: Tensor  # [B, 3]
-    coefficients: Tensor  # [B, K], identity then expression
+    coordinates: Tensor  # [B, Q], see _Basis
 
     def where(self, accept: Tensor, other: "_State") -> "_State":
         """This state where accept [B] holds, else the other."""
@@ -81,11 +85,10 @@ class _State:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Landmark differences in pixels [B, 68, 2] and where they are taken: head frame [B, 68, 3], ids [B, 68]."""
+    """Landmark differences in pixels [B, 68, 2] and the points of the basis (ids [B, 68]) that they are of."""
 
     difference_px: Tensor
-    points_head: Tensor
-    points_camera: Tensor
+    points_camera: Tensor  # [B, 68, 3]
     ids: Tensor
 
 
@@ -96,19 +99,19 @@ def fit_batch(
     settings: FitSettings = FitSettings(),
     trust: Tensor | None = None,
 ) -> FitBatch:
-    """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weighs the landmarks."""
+    """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weighs each landmark."""
     target_px = landmarks_px.double()
     trust = torch.ones(target_px.shape[:2], dtype=torch.float64) if trust is None else trust.double()
-    basis = _basis(model)
+    basis = _basis(model, settings)
     state, scale = _weak_perspective(basis, target_px, camera)
     noise_px = torch.full((68,), settings.noise_inner, dtype=torch.float64)
     noise_px[list(CONTOUR)] = settings.noise_contour
     noise_px = noise_px * (_IOD_M * scale)[:, None]  # [B, 68]
-    precision = _prior_precision(model, settings)
-    state = _levenberg(basis, state, target_px, camera, trust.sqrt() / noise_px, precision, settings)
+    state = _levenberg(basis, state, target_px, camera, trust.sqrt() / noise_px, settings)
     distance_px = _residuals(basis, state, target_px, camera).difference_px.norm(dim=-1)
     error = (distance_px * trust).sum(1) / trust.sum(1) / _iod_px(target_px)
-    alpha, beta = state.coefficients.split([len(model.identity), len(model.expression)], dim=1)
+    coefficients = state.coordinates @ basis.spread.mT
+    alpha, beta = coefficients.split([len(model.identity), len(model.expression)], dim=1)
     return FitBatch(state.rotation, state.translation_m, alpha, beta, error)
 
 
@@ -117,15 +120,8 @@ def _iod_px(landmarks_px: Tensor) -> Tensor:
     return (landmarks_px[:, left] - landmarks_px[:, right]).norm(dim=-1)
 
 
-def _prior_precision(model: MorphableModel, settings: FitSettings) -> Tensor:
-    """1 / variance of each coefficient [K], identity then expression."""
-    counts = torch.tensor([len(model.identity), len(model.expression)])
-    stds = torch.tensor([settings.identity_std, settings.expression_std], dtype=torch.float64)
-    return stds.repeat_interleave(counts) ** -2
-
-
-@lru_cache(maxsize=2)
-def _basis(model: MorphableModel) -> _Basis:
+@lru_cache(maxsize=4)
+def _basis(model: MorphableModel, settings: FitSettings) -> _Basis:
     rays = (len(CONTOUR) - 1) * _RAYS_PER_LANDMARK + 1
     along = np.arange(rays) / _RAYS_PER_LANDMARK
     contour = LANDMARK_UV[list(CONTOUR)]
@@ -134,12 +130,25 @@ def _basis(model: MorphableModel) -> _Basis:
     share = np.linspace(*_BAND, _POINTS_PER_RAY)[:, None]
     band = centre + share * (ends - centre)[:, None]  # [rays, points, 2]
     corners, weights = locate(np.concatenate([LANDMARK_UV[_INNER], band.reshape(-1, 2)]))
-    modes = torch.cat([model.identity, model.expression])  # [K, V, 3]
-    at_points = torch.einsum("nc,kncx->nxk", weights.double(), modes[:, corners].double())
+    modes, spread = _turned(model, settings, corners, weights.double())
     mean = (model.mean[corners].double() * weights[..., None].double()).sum(1)
     ends_m = mean[68 - len(CONTOUR) :].reshape(rays, _POINTS_PER_RAY, 3)[:, -1]
     outward = (ends_m - mean[[28 - len(CONTOUR), 33 - len(CONTOUR)]].mean(0)) * torch.tensor([1.0, 1.0, 0.0])
-    return _Basis(mean, at_points, outward / outward.norm(dim=-1, keepdim=True))
+    return _Basis(mean, modes, spread, outward / outward.norm(dim=-1, keepdim=True))
+
+
+def _turned(
+    model: MorphableModel, settings: FitSettings, corners: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The modes [N, 3, Q] at N points of the mesh and the spread [K, Q] of their coordinates."""
+    modes = torch.cat([model.identity[:, corners], model.expression[:, corners]]).double()  # [K, N, 3, 3]
+    stds = torch.full((len(modes),), settings.expression_std, dtype=torch.float64)
+    stds[: len(model.identity)] = settings.identity_std
+    whitened = torch.einsum("k,nc,kncx->nxk", stds, weights, modes)
+    turn = torch.linalg.svd(whitened.flatten(0, 1), full_matrices=False).Vh.mT
+    turned = whitened @ turn
+    visible = turned.norm(dim=1).amax(0) > _INVISIBLE_M
+    return turned[..., visible], stds[:, None] * turn[:, visible]
 
 
 def _weak_perspective(basis: _Basis, target_px: Tensor, camera: Camera) -> tuple[_State, Tensor]:
@@ -162,7 +171,7 @@ def _weak_perspective(basis: _Basis, target_px: Tensor, camera: Camera) -> tuple
 def _residuals(basis: _Basis, state: _State, target_px: Tensor, camera: Camera) -> _Residuals:
     """Where the 68 landmarks lie on the mesh now, the contour at the closest points of its silhouette."""
     batch, inner, rays = len(target_px), 68 - len(CONTOUR), len(basis.outward)
-    head = basis.mean + (state.coefficients @ basis.modes.flatten(0, 1).mT).unflatten(1, (-1, 3))
+    head = basis.mean + (state.coordinates @ basis.modes.flatten(0, 1).mT).unflatten(1, (-1, 3))
     in_camera = head @ state.rotation.mT + state.translation_m[:, None]
     px = project(in_camera, camera)
     outward = basis.outward @ state.rotation.mT  # [B, rays, 3]
@@ -179,7 +188,7 @@ def _residuals(basis: _Basis, state: _State, target_px: Tensor, camera: Camera) 
     pick = ids[..., None]
     difference = px.gather(1, pick.expand(-1, -1, 2)) - target_px
     take = pick.expand(-1, -1, 3)
-    return _Residuals(difference, head.gather(1, take), in_camera.gather(1, take), ids)
+    return _Residuals(difference, in_camera.gather(1, take), ids)
 
 
 def _jacobian(basis: _Basis, state: _State, at: _Residuals, camera: Camera) -> Tensor:
@@ -209,18 +218,17 @@ def _levenberg(
     target_px: Tensor,
     camera: Camera,
     inverse_noise: Tensor,
-    precision: Tensor,
     settings: FitSettings,
 ) -> _State:
     """Damped Gauss-Newton; each face accepts a step only where its cost falls."""
     damping = torch.full((len(target_px),), settings.damping, dtype=torch.float64)
     at = _residuals(basis, state, target_px, camera)
-    cost = _cost(at, state, inverse_noise, precision, settings.huber)
+    cost = _cost(at, state, inverse_noise, settings.huber)
     for _ in range(settings.steps):
-        step = _step(basis, state, at, camera, inverse_noise, precision, damping, settings.huber)
+        step = _step(basis, state, at, camera, inverse_noise, damping, settings.huber)
         trial = _moved(state, step)
         trial_at = _residuals(basis, trial, target_px, camera)
-        trial_cost = _cost(trial_at, trial, inverse_noise, precision, settings.huber)
+        trial_cost = _cost(trial_at, trial, inverse_noise, settings.huber)
         accept = trial_cost < cost  # False for NaN
         state = trial.where(accept, state)
         at = _Residuals(
@@ -234,11 +242,11 @@ def _levenberg(
     return state
 
 
-def _cost(at: _Residuals, state: _State, inverse_noise: Tensor, precision: Tensor, huber: float) -> Tensor:
+def _cost(at: _Residuals, state: _State, inverse_noise: Tensor, huber: float) -> Tensor:
     """Huber's cost of the landmarks plus the Gaussian priors [B]."""
     distance = at.difference_px.norm(dim=-1) * inverse_noise
     robust = torch.where(distance <= huber, distance**2, huber * (2 * distance - huber))
-    return robust.sum(1) + (state.coefficients**2 * precision).sum(1)
+    return robust.sum(1) + (state.coordinates**2).sum(1)
 
 
 def _step(
@@ -247,7 +255,6 @@ def _step(
     at: _Residuals,
     camera: Camera,
     inverse_noise: Tensor,
-    precision: Tensor,
     damping: Tensor,
     huber: float,
 ) -> Tensor:
@@ -256,9 +263,10 @@ def _step(
     weight = inverse_noise * (huber / distance.clamp(min=huber)).sqrt()  # [B, 68]
     jacobian = (_jacobian(basis, state, at, camera) * weight[..., None, None]).flatten(1, 2)
     residual = (at.difference_px * weight[..., None]).flatten(1, 2)
-    prior = torch.cat([torch.zeros(6, dtype=torch.float64), precision])
+    prior = torch.ones(jacobian.shape[-1], dtype=torch.float64)
+    prior[:6] = 0
     gradient = (residual[:, None] @ jacobian)[:, 0]
-    gradient[:, 6:] += precision * state.coefficients
+    gradient[:, 6:] += state.coordinates
     normal = jacobian.mT @ jacobian
     diagonal = normal.diagonal(dim1=1, dim2=2)
     diagonal += prior + damping[:, None] * (diagonal + prior)
@@ -270,4 +278,4 @@ def _moved(state: _State, step: Tensor) -> _State:
     omega, shift, change = step.split([3, 3, step.shape[1] - 6], dim=1)
     rotation = so3_exp(omega) @ state.rotation
     translation = state.translation_m - shift * state.translation_m[:, 2:]
-    return _State(rotation, translation, state.coefficients + change)
+    return _State(rotation, translation, state.coordinates + change)
