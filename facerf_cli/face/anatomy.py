@@ -7,7 +7,7 @@ left half is built, then mirrored.
 """
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator, RBFInterpolator, RectBivariateSpline
+from scipy.interpolate import CubicSpline, PchipInterpolator, RectBivariateSpline
 
 from facerf_cli.face.regions import CHART_MM, inside_mm
 from facerf_cli.face.topology import (
@@ -39,8 +39,8 @@ _SECTIONS_MM = """
  -6 | 118.5 115.5 114.5 113   108   100.5  92    86   80.5
 -16 | 124   119.5 115   111.5 105.5  98    90    84   78.5
 -26 | 124   120.5 115.5 110   103.5  96    88.5  82   75.5
--36 | 121.5 118   114   108.5 101    93.5  85.5  78.5 72
--46 | 121   118   112   105.5  97.5  89.5  80.5  73   67
+-36 | 121   117.5 114   108.5 101    93.5  85.5  78.5 72
+-46 | 120   117   112   105.5  97.5  89.5  80.5  73   67
 -54 | 119.5 116.5 110   102.5  94    84    73.5  67   63
 -60 | 120.5 116.5 108.5  99.5  89.5  77.5  67    63   61.5
 -66 | 120   116.5 106.5  94.5  81    69    63    61   60
@@ -50,6 +50,8 @@ _SECTIONS_MM = """
 -84 |  79.5  74.5  68    63    59    57.5  57.5  58   58.5
 """
 
+_SECTION_ROUNDING_MM = 0.2  # what the table's steps leave uncertain
+
 # Nose: height | depth of the midline profile, half width of the section, roundness of its ridge (exponent).
 _NOSE_MM = """
  50 | 117.2  9    2    glabella
@@ -58,29 +60,33 @@ _NOSE_MM = """
  32 | 120.7  9    2.2  nasion between the eyes
  26 | 125.2 10    2.3
  20 | 130   11.2  2.5  rhinion
- 14 | 135   12    2.6
-  8 | 139.2 12.5  2.7  supratip
-  3 | 140.8 12    2.6  pronasale
- -1 | 140.2 10.5  2.4
- -5 | 137     8.5 2.2
- -8 | 132.3   7   2.2  columella
--10.5 | 127.5 6.5 2
+ 14 | 135   12.4  2.7
+  8 | 139.2 13.4  3    supratip
+  3 | 140.8 14.5  3.2  pronasale
+ -1 | 140.2 15    3.4
+ -5 | 137   14    3.2
+ -8 | 132.3 11    2.6  columella
+-10.5 | 127.5 8 2
 -12 | 125.7  6.5  2    subnasale
 -16 | 124.6  6    2
 """
-_ALA_XY_MM, _ALA_HALF_MM, _ALA_HEIGHT_MM = (13.8, -3.0), (5.6, 7.2), 8.5
+_ALA_XY_MM, _ALA_HALF_MM, _ALA_HEIGHT_MM = (12.8, -2.6), (5.8, 7.4), 11.0
+_ALAR_GROOVE_MM = 0.9
 _NOSTRIL_DEPTH_MM = 4.0
 
 # Eyes: a sphere with a cornea, lids laid over it.
-EYE_CENTRE_MM, EYE_RADIUS_MM = np.array([-31.5, 35.5, 93.0]), 12.2
+EYE_CENTRE_MM, EYE_RADIUS_MM = np.array([-31.5, 35.3, 92.5]), 12.2
 _CORNEA_RADIUS_MM, _CORNEA_RISE_MM = 5.8, 0.9
-_LID_THICKNESS_MM = 1.5
+_LID_THICKNESS_MM, _CANTHUS_DEPTH_MM = 1.5, 2.5  # the inner corner is no deeper than this
 _FOLD_ABOVE_MM, _FOLD_DEPTH_MM = 4.5, 0.9
 
-# Lips: share of the way from the seam to the vermilion's edge | relief over the sections, upper and lower lip.
-_LIP_SHARES = (0, 0.15, 0.4, 0.7, 1.0, 1.3, 1.7)
-_LIP_UPPER_MM, _LIP_LOWER_MM = (0.2, 2.2, 3.8, 4.4, 3.3, 1.0, 0), (0.4, 2.8, 4.9, 5.0, 2.6, 0.6, 0)
-_SEAM_DEPTH_MM = 2.0
+# Lips: share of the way from the seam to the vermilion's edge | relief over the sections, upper and lower lip;
+# beyond the edge it falls off over a few millimetres.
+_LIP_SHARES = (0, 0.15, 0.4, 0.7, 1.0)
+_LIP_UPPER_MM, _LIP_LOWER_MM = (0.8, 3.5, 4.7, 4.9, 3.6), (0.8, 3.2, 5.0, 5.4, 4.0)
+_LIP_FALLOFF_MM = (2.8, 3.4)
+_SEAM_DEPTH_MM = 1.3
+_PULL_REACH_MM = 4.5
 _PHILTRUM_MM = (5.0, 0.7, 0.6)  # half distance of the columns, their height, depth of the groove
 
 
@@ -127,7 +133,8 @@ def _sections(azimuth_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
     rows = _table(_SECTIONS_MM)[::-1]
     azimuths = np.array([*(-a for a in _AZIMUTHS_DEG[:0:-1]), *_AZIMUTHS_DEG])
     depths = np.concatenate([rows[:, :1:-1], rows[:, 1:]], 1)
-    return RectBivariateSpline(rows[:, 0], azimuths, depths).ev(height, azimuth_deg)
+    smoothing = depths.size * _SECTION_ROUNDING_MM**2
+    return RectBivariateSpline(rows[:, 0], azimuths, depths, s=smoothing).ev(height, azimuth_deg)
 
 
 def _nose(across: np.ndarray, height: np.ndarray) -> np.ndarray:
@@ -138,8 +145,10 @@ def _nose(across: np.ndarray, height: np.ndarray) -> np.ndarray:
     rise = rise * _step(height, -17, -14) * _step(-height, -54, -46)
     ridge = rise * np.exp(-((across / half_width(inside)) ** roundness(inside)))
     offset = np.stack([across, height], -1) - _ALA_XY_MM
-    wing = _ALA_HEIGHT_MM * np.exp(-(((offset / _ALA_HALF_MM) ** 2).sum(-1) ** 1.6))
-    return np.maximum(ridge, 0) + np.maximum(wing - 0.55 * ridge, 0)
+    from_centre = np.linalg.norm(offset / _ALA_HALF_MM, axis=-1)
+    wing = _ALA_HEIGHT_MM * np.exp(-(from_centre**3.2))
+    groove = _ALAR_GROOVE_MM * np.exp(-(((from_centre - 1.3) / 0.25) ** 2)) * _step(height, -5, 2) * _step(across, 5, 10)
+    return _soft_maximum(ridge, wing, 1.2) - _soft_maximum(0, 0, 1.2) - groove
 
 
 def _nose_columns() -> list[tuple[np.ndarray, np.ndarray]]:
@@ -153,9 +162,9 @@ def _mouth(uv: np.ndarray, across: np.ndarray, height: np.ndarray) -> np.ndarray
     column = np.clip(uv[:, 0], u[48], 0.5)
     top, bottom = CubicSpline(u[48:55], y[48:55])(column), _lower_line(column, u, y)
     seam = (y[60] + (y[[62, 66]].mean() - y[60]) * _step(column, u[48], u[61])) * np.ones_like(column)
-    open_share = np.clip(1 - ((0.5 - uv[:, 0]) / (0.5 - u[48])) ** 2, 0, 1) ** 0.6
-    above = np.interp((height - seam) / np.maximum(top - seam, 1.5), *_smooth_relief(_LIP_UPPER_MM))
-    below = np.interp((seam - height) / np.maximum(seam - bottom, 1.5), *_smooth_relief(_LIP_LOWER_MM))
+    open_share = np.clip(1 - ((0.5 - uv[:, 0]) / (0.5 - u[48])) ** 2, 0, 1) ** 0.8
+    above = _lip(height - seam, top - seam, _LIP_UPPER_MM, _LIP_FALLOFF_MM[0])
+    below = _lip(seam - height, seam - bottom, _LIP_LOWER_MM, _LIP_FALLOFF_MM[1])
     relief = np.where(height > seam, above, below) * open_share
     relief = relief - _SEAM_DEPTH_MM * _step(inside_mm("mouth", uv), -0.6, 1.0)
     columns, rise, groove = _PHILTRUM_MM
@@ -168,9 +177,10 @@ def _lower_line(column: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     return CubicSpline(u[order], y[order])(column)
 
 
-def _smooth_relief(relief: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    share = np.linspace(0, _LIP_SHARES[-1], 60)
-    return share, PchipInterpolator(_LIP_SHARES, relief)(share)
+def _lip(from_seam: np.ndarray, breadth: np.ndarray, relief: tuple[float, ...], falloff_mm: float) -> np.ndarray:
+    breadth = np.maximum(breadth, 1.5)
+    inside = PchipInterpolator(_LIP_SHARES, relief)(np.clip(from_seam / breadth, 0, 1))
+    return inside * np.exp(-((np.maximum(from_seam - breadth, 0) / falloff_mm) ** 2))
 
 
 def _eye(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
@@ -179,15 +189,15 @@ def _eye(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
     ball = _eyeball(uv)
     above = (LANDMARK_UV[[36, 39], 1].mean() - uv[:, 1]) * CHART_MM[1]
     lid = ball + _LID_THICKNESS_MM - np.clip(-inside - 3, 0, None) ** 2 * 0.15
-    skin = np.logaddexp(radius * 1.5, lid * 1.5) / 1.5  # a soft maximum
-    skin = np.where(np.isfinite(ball), skin, radius)
+    skin = _soft_maximum(radius, lid, 0.67)
     fold = np.exp(-(((-inside - _FOLD_ABOVE_MM) / 1.1) ** 2)) * _step(above, 1, 4)
     skin = skin - _FOLD_DEPTH_MM * fold
-    return np.where(np.isfinite(ball), skin + (np.minimum(ball, skin) - skin) * _step(inside, 0.2, 1.2), skin)
+    recess = np.clip(skin - ball, 0, _CANTHUS_DEPTH_MM)
+    return skin - recess * _step(inside, 0.0, 0.9)
 
 
 def _eyeball(uv: np.ndarray) -> np.ndarray:
-    """Distance from the axis to the eyeball along the chart's rays, -inf where they miss it."""
+    """Distance from the axis to the eyeball along the chart's rays, 0 where they miss it."""
     directions = _on_rays(uv, np.ones(len(uv)))
     height, directions[:, 1] = directions[:, 1].copy(), 0
     to_centre = EYE_CENTRE_MM - np.stack([np.zeros_like(height), height, np.zeros_like(height)], -1)
@@ -197,7 +207,7 @@ def _eyeball(uv: np.ndarray) -> np.ndarray:
     points = directions * (along + hit)[:, None] - to_centre
     from_pupil = np.hypot(points[:, 0], points[:, 1])
     cornea = _CORNEA_RISE_MM * np.clip(1 - (from_pupil / _CORNEA_RADIUS_MM) ** 2, 0, None)
-    return np.where(miss2 < EYE_RADIUS_MM**2, along + hit + cornea, -np.inf)
+    return np.where(miss2 < EYE_RADIUS_MM**2, along + hit + cornea, 0)
 
 
 def _pull_onto_landmarks(uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
@@ -206,10 +216,19 @@ def _pull_onto_landmarks(uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
     wanted = np.hypot(LANDMARKS_M[:, 0], LANDMARKS_M[:, 2]) * 1000
     found = (_on_rays(uv, radius_mm)[corners] * weights[..., None]).sum(1)
     residual = wanted - np.hypot(found[:, 0], found[:, 2])
-    edge = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
-    edge = edge[(np.abs(edge - 0.5) == 0.5).any(-1) & (edge[:, 1] < 0.3)]
-    anchors, values = np.concatenate([LANDMARK_UV, edge]), np.concatenate([residual, np.zeros(len(edge))])
-    return RBFInterpolator(anchors * CHART_MM, values, kernel="thin_plate_spline")(uv * CHART_MM)
+    landmarks_mm = LANDMARK_UV * CHART_MM
+    strength = np.linalg.solve(_near(landmarks_mm, landmarks_mm), residual)
+    return _near(uv * CHART_MM, landmarks_mm) @ strength
+
+
+def _near(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
+    """A Matern kernel [A, B], 1 at the same place, so that each landmark pulls its own surroundings only."""
+    distance = np.linalg.norm(a_mm[:, None] - b_mm, axis=-1) * np.sqrt(3) / _PULL_REACH_MM
+    return (1 + distance) * np.exp(-distance)
+
+
+def _soft_maximum(a: np.ndarray | float, b: np.ndarray | float, width_mm: float) -> np.ndarray:
+    return np.logaddexp(np.divide(a, width_mm), np.divide(b, width_mm)) * width_mm
 
 
 def _step(value: np.ndarray, start: float, end: float) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline, RBFInterpolator
 
 from facerf_cli.face.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM
-from facerf_cli.face.regions import CHART_MM
+from facerf_cli.face.regions import CHART_MM, inside_mm
 from facerf_cli.face.topology import BOTTOM_M, GRID, LANDMARK_UV, MIRROR_68, TOP_M, grid_uv, locate
 
 EXPRESSION_STD = 0.5  # one standard deviation is half of the full expression
@@ -29,7 +29,6 @@ smile | 48:-7,7.5,-7 49:-5,4.5,-4.5 50:-2,2,-2 51:0,1.5,-1.5 59:-5,4.5,-4 58:-3,
 frown | 48:-1,-6,-2 49:-.5,-2.5,-.8 50:0,-1,-.4 59:-1,-3,-.5 58:-.4,-1,0 60:-1,-5,-1.5 61:0,-1.6,-.4 67:0,-1.6,-.3 mouth_side:-1.5,-6,-1 buccal:-.5,-3,.5 crease:0,-1.8,-.5 chin_side:0,1,1 chin_pad:0,1,.8
 brow_up | 17:-.3,5,-1 18:-.4,7.5,-1.5 19:-.3,8,-1.5 20:0,7.5,-.8 21:.3,6.5,-.3 glabella:0,2,0 forehead:0,3.5,0 forehead_side:0,2.5,0 forehead_mid:0,1.5,0 lid_crease:0,3,-.5 outer_lid:0,1.5,-.3 temple:0,1,0
 brow_down | 17:1,-1.5,1.2 18:2.5,-3.5,1.8 19:3,-4.5,1.5 20:2.5,-5,1.2 21:2,-4,1.5 glabella:.7,-2,.8 forehead:.8,-1.8,0 forehead_side:.5,-1.2,0 lid_crease:.5,-3,.3 outer_lid:0,-1,.3 37:0,-.8,0 38:0,-.8,0
-eye_close | 37:.2,-7,-.6 38:.2,-7.7,-1 41:0,.6,0 40:0,.6,0 36:.4,-.7,.2 39:-.3,0,0 lid_crease:0,-1.2,0 under_eye:0,.4,0 outer_lid:0,-.5,0
 eye_wide | 37:0,2,-.6 38:0,2.2,-.7 41:0,-.9,0 40:0,-.9,0 lid_crease:0,1.3,-.3
 cheek_puff | cheek:-3,0,6.5 buccal:-5,0,9 crease:-1,0,3.5 mouth_side:-2,0,7 48:1,0,3 59:.5,0,2.5 49:.5,.3,2.5 60:.8,0,2.5 apple:-.5,1,2 jaw:-3.5,0,3.5 chin_side:0,0,2 4:-3,0,1.5 3:-2.5,0,1 5:-1,0,1.5
 nose_wrinkle | 31:-.8,4,-.8 32:-.2,2.2,-.3 33:0,1.2,-.3 30:0,1,-.5 alar_groove:-1,5,.8 nasal_side:.3,3,1.6 crease:-.5,5.5,.5 under_eye:0,2.5,1 apple:0,3,1 50:-.3,4,0 49:-.3,3.5,0 51:0,2.2,0 61:-.2,3,0 62:0,1.8,0 48:-.3,2,0 60:-.3,1.8,0 21:1,-3,.6 20:1,-2.4,.6 19:.6,-1.6,.3 glabella:.3,-1.8,.7 29:0,.6,.3 41:0,.8,0 40:0,1,0 bridge:0,.3,.6
@@ -40,8 +39,8 @@ mouth_stretch | 48:-7,-3,-5.5 60:-6,-2.6,-4.8 49:-3.5,-.6,-2.5 59:-4.5,-2.5,-2.5
 _WHOLE = """
 pucker | 48:8,.6,6.5 60:7.5,.4,6.5 49:5,1.5,7.5 50:2,2.2,8 51:0,2.4,8 61:3.2,.6,7.5 62:0,0,7.2 59:5.5,0,7.5 58:3,-1.2,7 57:0,-1.6,6.5 67:3.4,.2,7.6 66:0,.5,7.4 mouth_side:6,0,3 crease:2.2,-1,2.5 buccal:2.5,0,-.5 chin_side:1,1,1.5 mentolabial:0,.5,2 chin_pad:0,1.2,1 33:0,-.6,.8
 funnel | 48:6,0,6.5 60:5.5,0,6 49:3,3.5,7 50:1,5,7 51:0,5.4,7 61:1.5,4.6,5.5 62:0,4.8,5.5 59:3,-4,6 58:1.2,-7,5 57:0,-7.5,4.6 67:1.6,-6.4,5.5 66:0,-6.8,5.5 mouth_side:4.5,0,3 crease:1.5,0,2 mentolabial:0,-4.5,1 chin_side:.5,-2.5,0 chin_pad:0,-3,-1 8:0,-3,-1 7:0,-2.7,-1 6:0,-2,-.6 33:0,.3,.4
-lip_press | 51:0,-2.2,-3 50:0,-2.4,-3 49:-.5,-1.5,-2 48:-.8,-.3,-1 60:-.8,-.3,-1 61:0,-1.5,-2.6 62:0,-1.4,-2.8 57:0,3,-2.6 58:0,2.8,-2.4 59:-.3,1.6,-1.5 66:0,.6,-2.6 67:0,.6,-2.4 mentolabial:0,1.6,.8 chin_pad:0,1.4,.8 chin_side:0,1,.5 mouth_side:-.5,0,.5
-lip_roll_in | 51:0,-4,-3 50:0,-4,-3 49:0,-2.4,-1.6 61:0,-.8,-4.5 62:0,-.8,-4.5 57:0,4,-3 58:0,3.8,-3 59:0,2,-1.4 66:0,.8,-4.5 67:0,.8,-4.4
+lip_press | 51:0,-2.2,-3 50:0,-2.4,-3 49:-.5,-1.5,-2 48:-.8,-.3,-1 60:-.8,-.3,-1 61:0,-.7,-2.4 62:0,-.8,-2.6 57:0,3,-2.4 58:0,2.8,-2.2 59:-.3,1.6,-1.4 66:0,.6,-2.4 67:0,.6,-2.2 mentolabial:0,1.6,.8 chin_pad:0,1.4,.8 chin_side:0,1,.5 mouth_side:-.5,0,.5
+lip_roll_in | 51:0,-3.4,-3 50:0,-3.6,-3 49:0,-2.2,-1.6 61:0,-.6,-3.6 62:0,-.6,-3.8 57:0,3.4,-2.6 58:0,3.2,-2.6 59:0,1.7,-1.4 66:0,.6,-3.8 67:0,.6,-3.6
 """
 # Jaw: share of the turn about the hinge at each point; the lips' corners follow half way.
 _JAW_HINGE_MM, _JAW_TURN_DEG = np.array([0, 12.0, 25.0]), 17.0
@@ -51,8 +50,9 @@ mentolabial:1 chin_pad:1 chin_side:1 mouth_side:.5 buccal:.36 jaw:.5 cheek:.12 c
 """
 _JAW_SIDEWAYS_MM = 9.0
 _LIDS = {"upper_lid": [36, 37, 38, 39], "lower_lid": [36, 41, 40, 39]}
-_LID_OVER_BALL_MM = 2.0
+_LID_OVER_BALL_MM, _LID_FALL, _LID_SKIN_MM = 1.5, 0.96, 11.0  # shut: lid before the eyeball, share, skin drawn
 _MOUTH_GAP_MM = 15.0
+_MOUTH_HOLLOW = 0.5  # depth of the mouth's inside, by how far the lips part
 
 
 def expression_shapes(mean_m: np.ndarray) -> dict[str, np.ndarray]:
@@ -60,12 +60,10 @@ def expression_shapes(mean_m: np.ndarray) -> dict[str, np.ndarray]:
     uv = _point_uv(mean_m * 1000)
     shapes: dict[str, np.ndarray] = {}
     for name, moves in _rows(_PAIRED).items():
-        if name == "eye_close":
-            moves = moves | _lids_shut(moves)
         right = _spread(uv, moves, other_side=0)
-        if name == "eye_close":
-            right = _slide_over_eyeball(mean_m * 1000, right)
         shapes[name + "_left"], shapes[name + "_right"] = _mirror(right), right
+    closed = _lid_closed(mean_m * 1000)
+    shapes["eye_close_left"], shapes["eye_close_right"] = _mirror(closed), closed
     for name, moves in _rows(_WHOLE).items():
         shapes[name] = _spread(uv, moves, other_side=1)
     share = {name: float(part) for name, part in (cell.split(":") for cell in _JAW_SHARE.split())}
@@ -98,8 +96,7 @@ def _point_uv(mean_mm: np.ndarray) -> dict[str, np.ndarray]:
             v = (TOP_M - float(y) / 1000) / (TOP_M - BOTTOM_M)
             row = rows[round(v * (GRID - 1))]
             uv[name] = np.array([np.interp(float(x), row[:, 0], np.linspace(0, 1, GRID)), v])
-    for lid, corners in _LIDS.items():
-        line = CubicSpline(LANDMARK_UV[corners, 0], LANDMARK_UV[corners, 1])(_LID_U)
+    for lid, line in zip(_LIDS, _lid_lines(_LID_U), strict=True):
         uv |= {f"{lid}{k}": np.array([u, v]) for k, (u, v) in enumerate(zip(_LID_U, line, strict=True))}
     return uv
 
@@ -107,16 +104,6 @@ def _point_uv(mean_mm: np.ndarray) -> dict[str, np.ndarray]:
 def _surface_mm(mean_mm: np.ndarray, uv: np.ndarray) -> np.ndarray:
     corners, weights = (tensor.numpy() for tensor in locate(uv[None]))
     return (mean_mm[corners[0]] * weights[0][:, None]).sum(0)
-
-
-def _lids_shut(moves: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Upper lid points brought down to the lower lid, column by column."""
-    height_mm = (TOP_M - BOTTOM_M) * 1000
-    upper, lower = (CubicSpline(LANDMARK_UV[c, 0], LANDMARK_UV[c, 1]) for c in _LIDS.values())
-    shut = {f"upper_lid{k}": (upper(u) - lower(u)) * height_mm for k, u in enumerate(_LID_U)}
-    shut |= {"37": (LANDMARK_UV[37, 1] - lower(LANDMARK_UV[37, 0])) * height_mm}
-    shut |= {"38": (LANDMARK_UV[38, 1] - lower(LANDMARK_UV[38, 0])) * height_mm}
-    return {name: np.array([0, 0.96 * fall + 0.4, 0]) for name, fall in shut.items()}
 
 
 def _spread(uv: dict[str, np.ndarray], moves: dict[str, np.ndarray], other_side: int) -> np.ndarray:
@@ -137,7 +124,14 @@ def _spread(uv: dict[str, np.ndarray], moves: dict[str, np.ndarray], other_side:
     anchors = np.concatenate([left, left[side] * [-1, 1] + [1, 0], edge])
     values = np.concatenate([move, mirrored, np.zeros((len(edge), 3))])
     field = RBFInterpolator(_mouth_pulled_open(anchors), values, kernel="thin_plate_spline")
-    return field(_mouth_pulled_open(grid_uv().double().numpy()))
+    grid = grid_uv().double().numpy()
+    shape = field(_mouth_pulled_open(grid))
+    upper, lower = _inner_lips(grid[:, 0])
+    lips = (field(_mouth_pulled_open(np.stack([grid[:, 0], v], -1)))[:, 1] for v in (upper, lower))
+    parted = np.maximum(np.subtract(*lips), 0)
+    slit = np.clip(inside_mm("mouth", grid) / 0.8, 0, 1)
+    shape[:, 2] -= _MOUTH_HOLLOW * slit * parted  # between parted lips one looks into the mouth
+    return shape
 
 
 def _along_lids(uv: dict[str, np.ndarray], moves: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -153,23 +147,41 @@ def _along_lids(uv: dict[str, np.ndarray], moves: dict[str, np.ndarray]) -> dict
 
 def _mouth_pulled_open(uv: np.ndarray) -> np.ndarray:
     """Millimetres [N, 2] on the unrolled chart with the lips moved apart, so that each moves on its own."""
-    u = np.clip(uv[:, 0], LANDMARK_UV[60, 0], LANDMARK_UV[64, 0])
-    below = [60, 67, 66, 65, 64]
-    upper, lower = (CubicSpline(LANDMARK_UV[c, 0], LANDMARK_UV[c, 1])(u) for c in (range(60, 65), below))
+    upper, lower = _inner_lips(uv[:, 0])
     half_mm = np.maximum((lower - upper) / 2 * CHART_MM[1], 0.3)
     from_seam_mm = (uv[:, 1] - (upper + lower) / 2) * CHART_MM[1]
-    corner = np.clip(1 - ((uv[:, 0] - 0.5) / (0.5 - LANDMARK_UV[60, 0])) ** 2, 0, None) ** 0.5
+    corner = np.clip(1 - ((uv[:, 0] - 0.5) / (0.5 - LANDMARK_UV[60, 0])) ** 2, 0, None) ** 1.5
     apart = _MOUTH_GAP_MM * corner * np.clip(from_seam_mm / half_mm, -1, 1) * np.exp(-np.abs(from_seam_mm) / 25)
     return uv * CHART_MM + np.stack([np.zeros_like(apart), apart], -1)
 
 
-def _slide_over_eyeball(mean_mm: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """The same displacement [V, 3], but in front of the eyeball on the picture's left."""
-    moved = mean_mm + move - EYE_CENTRE_MM
+def _inner_lips(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """v [N] of the upper and the lower lip's inner line at u [N]."""
+    inside = np.clip(u, LANDMARK_UV[60, 0], LANDMARK_UV[64, 0])
+    lines = ([60, 61, 62, 63, 64], [60, 67, 66, 65, 64])
+    upper, lower = (CubicSpline(LANDMARK_UV[ids, 0], LANDMARK_UV[ids, 1])(inside) for ids in lines)
+    return upper, lower
+
+
+def _lid_closed(mean_mm: np.ndarray) -> np.ndarray:
+    """Displacement [V, 3] in millimetres that draws the upper lid over the eyeball on the picture's left."""
+    uv = grid_uv().double().numpy()
+    (upper, lower), tall = _lid_lines(uv[:, 0]), (TOP_M - BOTTOM_M) * 1000
+    opening = np.maximum(lower - upper, 0) * tall
+    height = (lower - uv[:, 1]) * tall  # above the lower lid
+    above = np.clip((height - opening) / _LID_SKIN_MM, 0, 1)
+    fall = np.minimum(np.maximum(height, 0), opening) * _LID_FALL * (1 - above) ** 2 * (1 + 2 * above)
+    moved = mean_mm - EYE_CENTRE_MM - fall[:, None] * [0, 1, 0]
     distance = np.linalg.norm(moved, axis=-1)
-    share = np.clip(np.linalg.norm(move, axis=-1) / 3, 0, 1)[:, None]
     lifted = moved * np.maximum(1, (EYE_RADIUS_MM + _LID_OVER_BALL_MM) / distance)[:, None]
-    return move + share * (lifted - moved)
+    share = np.clip(fall / 2, 0, 1)[:, None]
+    return EYE_CENTRE_MM + moved + share * (lifted - moved) - mean_mm
+
+
+def _lid_lines(u: np.ndarray) -> list[np.ndarray]:
+    """v [N] of the upper and the lower lid's margin at u [N], one line at and beyond the corners."""
+    inside = np.clip(u, LANDMARK_UV[36, 0], LANDMARK_UV[39, 0])
+    return [CubicSpline(LANDMARK_UV[ids, 0], LANDMARK_UV[ids, 1])(inside) for ids in _LIDS.values()]
 
 
 def _mirror(shape: np.ndarray) -> np.ndarray:

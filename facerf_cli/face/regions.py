@@ -22,7 +22,7 @@ _EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.
 
 CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at 115 mm from the axis
 _BROW_ABOVE_MM, _BROW_BELOW_MM = (0.5, 1.5, 2.0, 2.0, 0.5), (1.0, 2.5, 4.0, 5.5, 5.0)  # of landmarks 17 to 21
-_NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4690, 0.5825), (4.0, 1.9), 14.0
+_NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4650, 0.5720), (4.2, 2.0), 14.0
 _FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04), (0.32, 0.045), (0.14, 0.075), (0.045, 0.17)]
 
 
