@@ -58,7 +58,7 @@ def _mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
 
 
 def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:
-    """Integral of radiance times cosine over each normal's hemisphere, as a small lat-long map [h, 2 h, 3]."""
+    """Radiance times cosine, integrated, as a small lat-long map of the normals [h, 2 h, 3]."""
     normals = latlong_directions(_IRRADIANCE_ROWS, 2 * _IRRADIANCE_ROWS)
     sources = latlong_directions(_SOURCE_ROWS, 2 * _SOURCE_ROWS).reshape(-1, 3)
     power = texel_integrals(envmap, _SOURCE_ROWS, 2 * _SOURCE_ROWS, rotate_deg).reshape(-1, 3).float()

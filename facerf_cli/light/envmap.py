@@ -34,9 +34,9 @@ def envmap_weights(
 ) -> Tensor:
     """Weights [L, 3] float32 of the lights at `directions` [L, 3] under a linear map [H, W, 3].
 
-    `rotate_deg` is added to the azimuth of everything in the map. pi times the sum of the "cell" weights is the
-    map's integral, at any map size. "paper" takes the map's pixel at the light's direction (paper, 'Relighting'),
-    times the light's equal share of the sphere.
+    `rotate_deg` is added to the azimuth of everything in the map. pi times the sum of the "cell" weights is
+    the map's integral, at any map size. "paper" takes the map's pixel at the light's direction (paper,
+    'Relighting'), times the light's equal share of the sphere.
     """
     return rotated_weights(envmap, directions, [rotate_deg], sampling)[0]
 
@@ -64,7 +64,7 @@ def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:
 
 
 def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float = 0.0) -> Tensor:
-    """Integral of a map's radiance over each texel of another, turned lat-long grid [height, width, 3] float64.
+    """A map's radiance integrated over the texels of another, turned grid [height, width, 3] float64.
 
     Exact for a map that is constant over each of its own pixels, whatever the two sizes and the angle.
     """
@@ -82,16 +82,18 @@ class _RowIntegrals:
         overlap = (top - bottom).clamp(min=0)  # [height, H] of sin(elevation)
         parts = [
             torch.einsum("nh,hwc->nwc", overlap, part.double())
-            for part in envmap.cpu().split(_COLUMNS_AT_ONCE, dim=1)
+            for part in torch.split(envmap.cpu(), _COLUMNS_AT_ONCE, dim=1)
         ]
         pixel_azimuth = 2 * math.pi / envmap.shape[1]
         zero = torch.zeros(height, 1, 3, dtype=torch.float64)
-        self._up_to = torch.cat([zero, torch.cat(parts, 1).cumsum(1) * pixel_azimuth], 1)  # [height, W + 1, 3]
+        up_to = torch.cat(parts, 1).cumsum(1) * pixel_azimuth
+        self._up_to = torch.cat([zero, up_to], 1)  # [height, W + 1, 3]
 
     def turned(self, width: int, rotate_deg: float) -> Tensor:
         """Integrals over `width` texels a row [height, width, 3] with `rotate_deg` added to every azimuth."""
         pixels = self._up_to.shape[1] - 1
-        u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360  # azimuth grows to the left
+        # u falls as azimuth grows, so what now lies at u came from further right.
+        u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360
         turns = u.floor()
         position = (u - turns) * pixels
         pixel = position.long().clamp(max=pixels - 1)

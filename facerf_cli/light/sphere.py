@@ -1,8 +1,9 @@
-"""Directions of light: rigs, azimuth and elevation, and the lat-long map, each defined here and nowhere else.
+"""Directions of light: rigs, azimuth and elevation, and the lat-long map; defined here and nowhere else.
 
-A light direction is the unit vector from the face toward the light, in camera space (x to the picture's right,
-y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the camera),
-u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres at (index + 0.5) / size.
+A light direction is the unit vector from the face toward the light, in camera space (x to the picture's
+right, y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the
+camera), u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres at
+(index + 0.5) / size.
 """
 
 import math
@@ -53,15 +54,14 @@ def _repel(points: np.ndarray, step: float) -> np.ndarray:
 
 def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
     """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the picture's right side."""
-    azimuth, elevation = torch.broadcast_tensors(
-        torch.deg2rad(torch.as_tensor(azimuth_deg)), torch.deg2rad(torch.as_tensor(elevation_deg))
-    )
+    azimuth = torch.deg2rad(torch.as_tensor(azimuth_deg))
+    elevation = torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth)
     ring = elevation.cos()
     return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
 
 
 def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3] of any length."""
+    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3], any length."""
     x, y, z = directions.unbind(-1)
     return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.atan2(y, torch.hypot(x, z)))
 

@@ -1,9 +1,9 @@
 """Axes, the fixed camera and the head pose, each defined here and nowhere else.
 
-Camera space is right-handed, in metres: x to the picture's right, y up, z out of the face toward the camera.
-The camera sits at the origin and looks down -z, so what it sees has z < 0; the head pose is what varies (paper,
-'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the right, y down,
-and their centres at index + `PIXEL_CENTRE`.
+Camera space is right-handed, in metres: x to the picture's right, y up, z out of the face toward the
+camera. The camera sits at the origin and looks down -z, so what it sees has z < 0; the head pose is what
+varies (paper, 'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the
+right, y down, and their centres at index + `PIXEL_CENTRE`.
 """
 
 import math
@@ -73,7 +73,7 @@ def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:
     """The (yaw, pitch, roll) in degrees of a rotation [3, 3]; at pitch +-90 the roll is taken as 0."""
     r = head_to_camera.detach().double().cpu()
     pitch = math.asin(max(-1.0, min(1.0, r[2, 1].item())))
-    if math.hypot(r[0, 1].item(), r[1, 1].item()) < 1e-6:  # looking straight up or down: yaw and roll coincide
+    if math.hypot(r[0, 1].item(), r[1, 1].item()) < 1e-6:  # straight up or down: yaw is roll
         yaw, roll = math.atan2(r[0, 2].item(), r[0, 0].item()), 0.0
     else:
         yaw = math.atan2(-r[2, 0].item(), r[2, 2].item())
@@ -98,4 +98,4 @@ def skew_matrix(vector: Tensor) -> Tensor:
     """[v]x [..., 3, 3] of vectors [..., 3], so that [v]x w is the cross product v x w."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)

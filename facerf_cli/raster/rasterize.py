@@ -1,10 +1,10 @@
 """Which triangle each pixel sees, where in it, and how far away: a z-buffer in plain torch.
 
 Every triangle is cut into pixel rows and every row into its run of pixels, all of them at once, so the work
-grows with what is covered and not with the bounding boxes. A pixel belongs to a triangle if its centre lies in
-it; a run holds its left end and not its right, a triangle its upper end and not its lower, and both triangles
-of a shared edge compute the same crossing, so that there are neither holes nor doubles. Visibility has no
-gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle have.
+grows with what is covered and not with the bounding boxes. A pixel belongs to a triangle if its centre lies
+in it; a run holds its left end and not its right, a triangle its upper end and not its lower, and both
+triangles of a shared edge compute the same crossing, so that there are neither holes nor doubles. Visibility
+has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle have.
 """
 
 from collections.abc import Iterator
@@ -138,7 +138,7 @@ def _chunks(screen: _Screen) -> Iterator[_Screen]:
     if chunk[-1] == 0:
         yield screen
         return
-    for number in chunk.unique():
+    for number in torch.unique(chunk):
         yield screen.part(torch.nonzero(chunk == number).squeeze(-1))
 
 
@@ -193,7 +193,7 @@ def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int
 
 
 def _barycentric(corners: Tensor, pixel: Tensor, camera: Camera) -> Tensor:
-    """Weights [P, 3] of camera-space corners [P, 3, 3] where the ray through the pixel's centre meets them."""
+    """Weights [P, 3] of camera-space corners [P, 3, 3] where the pixel's ray meets them."""
     a, b, c = corners.unbind(1)
     column_row = torch.stack([pixel % camera.width_px, pixel // camera.width_px], -1)
     ray = pixel_rays(column_row.to(corners.dtype) + PIXEL_CENTRE, camera)

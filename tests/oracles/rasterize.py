@@ -6,11 +6,14 @@ from torch import Tensor
 from facerf_cli.raster.camera import Camera
 
 
-def rasterize_slowly(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def rasterize_slowly(
+    vertices_camera: Tensor, triangles: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
     """Triangle [H, W] (-1 = none), barycentric [H, W, 3] and depth [H, W] (inf = none), differentiable."""
     triangle = torch.full((camera.height_px, camera.width_px), -1)
-    barycentric = [[torch.zeros(3, dtype=torch.float64)] * camera.width_px for _ in range(camera.height_px)]
-    depth = [[torch.tensor(torch.inf, dtype=torch.float64)] * camera.width_px for _ in range(camera.height_px)]
+    nothing, infinity = torch.zeros(3, dtype=torch.float64), torch.tensor(torch.inf, dtype=torch.float64)
+    barycentric = [[nothing] * camera.width_px for _ in range(camera.height_px)]
+    depth = [[infinity] * camera.width_px for _ in range(camera.height_px)]
     corners = vertices_camera.double()[triangles].transpose(1, 2)  # [F, 3 (xyz), 3 (corner)]
     for row in range(camera.height_px):
         for column in range(camera.width_px):
@@ -26,4 +29,8 @@ def rasterize_slowly(vertices_camera: Tensor, triangles: Tensor, camera: Camera)
                 triangle[row, column] = best
                 barycentric[row][column] = scaled[best] * distance[best]
                 depth[row][column] = distance[best]
-    return triangle, torch.stack([torch.stack(r) for r in barycentric]), torch.stack([torch.stack(r) for r in depth])
+    return triangle, _picture(barycentric), _picture(depth)
+
+
+def _picture(rows: list[list[Tensor]]) -> Tensor:
+    return torch.stack([torch.stack(row) for row in rows])

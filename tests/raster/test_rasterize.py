@@ -12,7 +12,7 @@ WIDE = Camera(focal_px=40.0, width_px=37, height_px=22, cx_px=17.3, cy_px=11.9) 
 def triangle_soup(count: int, seed: int, spread_m: float = 0.8) -> tuple[Tensor, Tensor]:
     """Triangles of all sizes that pierce each other and leave the picture, float64."""
     generator = torch.Generator().manual_seed(seed)
-    centre = torch.randn(count, 1, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.4, 0.3, 0.2])
+    centre = torch.randn(count, 1, 3, generator=generator).double() * torch.tensor([0.4, 0.3, 0.2])
     size = spread_m * 10 ** (-1.5 * torch.rand(count, 1, 1, generator=generator, dtype=torch.float64))
     corners = centre + size * torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)
     return (corners - torch.tensor([0, 0, 2.5])).reshape(-1, 3), torch.arange(3 * count).reshape(-1, 3)
@@ -24,7 +24,8 @@ def bumpy_grid(side: int, seed: int) -> tuple[Tensor, Tensor]:
     step = torch.linspace(-1.5, 1.5, side, dtype=torch.float64)
     y, x = torch.meshgrid(step, step, indexing="ij")
     jitter = (torch.rand(3, side, side, generator=generator, dtype=torch.float64) - 0.5) * (3 / (side - 1))
-    vertices = torch.stack([x + 0.6 * jitter[0], y + 0.6 * jitter[1], -2 + 0.3 * jitter[2]], -1).reshape(-1, 3)
+    xyz = [x + 0.6 * jitter[0], y + 0.6 * jitter[1], -2 + 0.3 * jitter[2]]
+    vertices = torch.stack(xyz, -1).reshape(-1, 3)
     a = (torch.arange(side - 1)[:, None] * side + torch.arange(side - 1)).reshape(-1, 1)
     b, c, d = a + 1, a + side, a + side + 1
     flip = torch.rand(len(a), 1, generator=generator) < 0.5
