@@ -1,0 +1,185 @@
+"""Damped Gauss-Newton on projected landmarks, batched over B faces in float64; `face/fit.py` sets it up.
+
+Contour landmarks slide: each is held to the closest point of the mesh's silhouette near the jaw, found
+anew at every step (paper, 'Landmark loss').
+"""
+
+from dataclasses import dataclass, fields
+from typing import Self
+
+import torch
+from torch import Tensor
+
+from facerf_cli.face.topology import CONTOUR
+from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
+
+INNER_COUNT = 68 - len(CONTOUR)
+RAYS_PER_LANDMARK, POINTS_PER_RAY = 8, 10  # of the contour's band
+_FIRST_DAMPING = 1e-3
+_WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides at most two landmarks' way along the jaw
+
+
+class _Batched:
+    """Dataclasses of tensors whose first axis is the face."""
+
+    def where(self, accept: Tensor, other: Self) -> Self:
+        """These faces where accept [B] holds, else the other's."""
+        names = [field.name for field in fields(self)]  # type: ignore[arg-type]
+        pairs = ((getattr(self, name), getattr(other, name)) for name in names)
+        return type(self)(*(torch.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
+
+
+@dataclass(frozen=True)
+class FitBasis:
+    """The model at the points that a fit may use: the inner landmarks first, then the contour's band by rays.
+
+    The fit works in Q coordinates with standard normal priors, an orthonormal turn of the whitened
+    coefficients that leaves out what moves none of these points.
+    """
+
+    mean: Tensor  # [N, 3]
+    modes: Tensor  # [N, 3, Q]
+    spread: Tensor  # [K, Q], coordinates to coefficients, identity then expression
+    outward: Tensor  # [rays, 3], head frame
+
+
+@dataclass(frozen=True)
+class FitState(_Batched):
+    """Pose and shape of B faces."""
+
+    rotation: Tensor  # [B, 3, 3], head to camera
+    translation_m: Tensor  # [B, 3]
+    coordinates: Tensor  # [B, Q], see FitBasis
+
+
+@dataclass(frozen=True)
+class Residuals(_Batched):
+    """Landmark differences in pixels, and the points of the basis that they are taken at."""
+
+    difference_px: Tensor  # [B, 68, 2]
+    points_camera: Tensor  # [B, 68, 3]
+    ids: Tensor  # [B, 68]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is minimised: Huber's cost of the weighed landmark differences, plus the squared coordinates."""
+
+    basis: FitBasis
+    target_px: Tensor  # [B, 68, 2]
+    camera: Camera
+    inverse_noise: Tensor  # [B, 68], 1 / pixels
+    huber: float
+
+
+def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tuple[FitState, Tensor]:
+    """The mean's pose from a scaled orthographic fit to the inner landmarks, and its pixels per metre [B]."""
+    model = basis.mean[:INNER_COUNT]
+    picture = target_px[:, len(CONTOUR) :] * torch.tensor([1.0, -1.0], dtype=torch.float64)  # y up
+    centred = model - model.mean(0)
+    middle = picture.mean(1)
+    affine = torch.linalg.lstsq(centred.expand(len(picture), -1, -1), picture - middle[:, None]).solution.mT
+    u, stretch, vh = torch.linalg.svd(affine, full_matrices=False)  # affine [B, 2, 3]
+    scale = stretch.mean(-1)
+    rows = u @ vh
+    rotation = torch.cat([rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])], 1)
+    depth_m = camera.focal_px / scale
+    offset = (middle - torch.tensor([camera.cx_px, -camera.cy_px], dtype=torch.float64)) / scale[:, None]
+    translation = torch.cat([offset, -depth_m[:, None]], 1) - rotation @ model.mean(0)
+    coordinates = torch.zeros(len(picture), basis.modes.shape[-1], dtype=torch.float64)
+    return FitState(rotation, translation, coordinates), scale
+
+
+def minimise(problem: Problem, state: FitState, steps: int) -> FitState:
+    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost falls."""
+    damping = torch.full((len(problem.target_px),), _FIRST_DAMPING, dtype=torch.float64)
+    at = residuals(problem, state)
+    cost = _cost(problem, state, at)
+    for _ in range(steps):
+        trial = moved(state, _step(problem, state, at, damping))
+        trial_at = residuals(problem, trial)
+        trial_cost = _cost(problem, trial, trial_at)
+        accept = trial_cost < cost  # False for NaN
+        state, at = trial.where(accept, state), trial_at.where(accept, at)
+        cost = torch.where(accept, trial_cost, cost)
+        damping = torch.where(accept, damping / 5, damping * 10).clamp(1e-9, 1e6)
+    return state
+
+
+def residuals(problem: Problem, state: FitState) -> Residuals:
+    """Where the 68 landmarks lie on the mesh now, the contour at the closest points of its silhouette."""
+    basis, batch = problem.basis, len(problem.target_px)
+    head = basis.mean + (state.coordinates @ basis.modes.flatten(0, 1).mT).reshape(batch, -1, 3)
+    in_camera = head @ state.rotation.mT + state.translation_m[:, None]
+    px = project(in_camera, problem.camera)
+    contour_ids = INNER_COUNT + _closest_edge(problem, state, px[:, INNER_COUNT:])
+    ids = torch.cat([contour_ids, torch.arange(INNER_COUNT).expand(batch, -1)], 1)
+    difference_px = px.gather(1, ids[..., None].expand(-1, -1, 2)) - problem.target_px
+    return Residuals(difference_px, in_camera.gather(1, ids[..., None].expand(-1, -1, 3)), ids)
+
+
+def _closest_edge(problem: Problem, state: FitState, band_px: Tensor) -> Tensor:
+    """The band's points [B, 17] on the silhouette that lie closest to the contour landmarks."""
+    outward = problem.basis.outward @ state.rotation.mT  # [B, rays, 3]
+    rays = outward.shape[1]
+    by_ray = band_px.reshape(-1, rays, POINTS_PER_RAY, 2)
+    reach = by_ray[..., 0] * outward[..., None, 0] - by_ray[..., 1] * outward[..., None, 1]
+    edge = reach.argmax(-1) + torch.arange(rays) * POINTS_PER_RAY  # [B, rays]
+    edge_px = band_px.gather(1, edge[..., None].expand(-1, -1, 2))
+    near = torch.arange(len(CONTOUR))[:, None] * RAYS_PER_LANDMARK + torch.arange(-_WINDOW, _WINDOW + 1)
+    near = near.clamp(0, rays - 1)  # [17, window]
+    distance = (edge_px[:, near] - problem.target_px[:, : len(CONTOUR), None]).norm(dim=-1)
+    closest = near.expand(len(edge), -1, -1).gather(2, distance.argmin(-1, keepdim=True))[..., 0]
+    return edge.gather(1, closest)
+
+
+def jacobian(problem: Problem, state: FitState, at: Residuals) -> Tensor:
+    """d(px) / d(omega, shift, coordinates) [B, 68, 2, 6 + Q] at fixed correspondences, see `moved`."""
+    x, y, z = at.points_camera.unbind(-1)
+    zero, scale = torch.zeros_like(x), problem.camera.focal_px / -z
+    rows_u = torch.stack([scale, zero, -scale * x / z], -1)
+    rows_v = torch.stack([zero, -scale, scale * y / z], -1)
+    px_by_camera = torch.stack([rows_u, rows_v], -2)  # [B, 68, 2, 3]
+    turned = at.points_camera - state.translation_m[:, None]
+    by_rotation = -px_by_camera @ skew_matrix(turned)
+    by_translation = px_by_camera * -state.translation_m[:, None, None, 2:]
+    px_by_head = px_by_camera @ state.rotation[:, None]
+    contour, inner = px_by_head[:, : len(CONTOUR)], px_by_head[:, len(CONTOUR) :]
+    modes = problem.basis.modes
+    by_contour = contour @ modes[at.ids[:, : len(CONTOUR)]]
+    # the inner landmarks' modes are the same for all faces: one product a landmark, all faces at once
+    by_inner = (inner.permute(1, 0, 2, 3).flatten(1, 2) @ modes[:INNER_COUNT]).reshape(
+        INNER_COUNT, -1, 2, modes.shape[-1]
+    )
+    by_coordinates = torch.cat([by_contour, by_inner.permute(1, 0, 2, 3)], 1)
+    return torch.cat([by_rotation, by_translation, by_coordinates], -1)
+
+
+def moved(state: FitState, step: Tensor) -> FitState:
+    """The state after a step [B, 6 + Q]: rotation exp(omega) R, translation shifted in units of its depth."""
+    omega, shift, change = step[:, :3], step[:, 3:6], step[:, 6:]
+    translation = state.translation_m - shift * state.translation_m[:, 2:]
+    return FitState(so3_exp(omega) @ state.rotation, translation, state.coordinates + change)
+
+
+def _cost(problem: Problem, state: FitState, at: Residuals) -> Tensor:
+    """Huber's cost of the landmarks plus the Gaussian priors [B]."""
+    distance, huber = at.difference_px.norm(dim=-1) * problem.inverse_noise, problem.huber
+    robust = torch.where(distance <= huber, distance**2, huber * (2 * distance - huber))
+    return robust.sum(1) + (state.coordinates**2).sum(1)
+
+
+def _step(problem: Problem, state: FitState, at: Residuals, damping: Tensor) -> Tensor:
+    """The damped step [B, 6 + Q] of the iteratively reweighted least squares."""
+    distance = at.difference_px.norm(dim=-1) * problem.inverse_noise
+    weight = problem.inverse_noise * (problem.huber / distance.clamp(min=problem.huber)).sqrt()  # [B, 68]
+    weighted = (jacobian(problem, state, at) * weight[..., None, None]).flatten(1, 2)
+    difference = (at.difference_px * weight[..., None]).flatten(1, 2)
+    prior = torch.ones(weighted.shape[-1], dtype=torch.float64)
+    prior[:6] = 0
+    gradient = (difference[:, None] @ weighted)[:, 0]
+    gradient[:, 6:] += state.coordinates
+    normal = weighted.mT @ weighted
+    diagonal = normal.diagonal(dim1=1, dim2=2)
+    diagonal += prior + damping[:, None] * (diagonal + prior)
+    return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky(normal))[..., 0]
