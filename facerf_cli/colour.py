@@ -1,0 +1,174 @@
+"""Colour spaces: from the encodings of files to scene-linear Rec.709, and to sRGB for display.
+
+Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
+the ACES spaces). Names that are not known here are looked up in the OpenColorIO configuration ($OCIO, else
+`ocio://default`).
+"""
+
+import difflib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from facerf_cli.errors import UsageError
+
+# x, y of red, green, blue and white.
+REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+_P3_CHROMATICITIES = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.3290)
+_REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+_AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+_ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+
+# Cone responses of XYZ after Bradford (Lam 1985).
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_ADOBE_GAMMA = 563 / 256
+
+AUTO_EXPOSURE_PERCENTILE = 99.0
+AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # where that percentile of the luminance is put
+
+
+def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, float32 of any shape; negative values are mirrored."""
+    size = np.abs(encoded)
+    linear = np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4)
+    return np.copysign(linear, encoded).astype(np.float32)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1, float32 of any shape; negative values are mirrored, values above 1 go on."""
+    size = np.abs(linear)
+    encoded = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055)
+    return np.copysign(encoded, linear).astype(np.float32)
+
+
+def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """The inverse of ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
+    alpha, beta = 1.09929682680944, 0.018053968510807
+    size = np.abs(encoded)
+    linear = np.where(size < 4.5 * beta, size / 4.5, ((size + alpha - 1) / alpha) ** (1 / 0.45))
+    return np.copysign(linear, encoded).astype(np.float32)
+
+
+def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
+    return (np.sign(encoded) * np.abs(encoded) ** _ADOBE_GAMMA).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class ColourSpace:
+    """Primaries and a decoding curve; both None for a space that OpenColorIO converts."""
+
+    name: str
+    chromaticities: tuple[float, ...] | None
+    decode: Callable[[np.ndarray], np.ndarray] | None = None
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether values are proportional to light, where that is known here."""
+        return self.chromaticities is not None and self.decode is None
+
+
+LINEAR = ColourSpace("linear Rec.709", REC709_CHROMATICITIES)
+SRGB = ColourSpace("sRGB", REC709_CHROMATICITIES, srgb_to_linear)
+DISPLAY_P3 = ColourSpace("Display P3", _P3_CHROMATICITIES, srgb_to_linear)
+ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, _adobe_to_linear)
+ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
+REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
+LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
+
+# Compared without case, spaces and punctuation; with the interchange names that OpenImageIO uses.
+_ALIASES = {
+    LINEAR: "linear linrec709 linearrec709 linrec709scene linsrgb linearrec709srgb",
+    SRGB: "srgb srgbrec709scene srgbtexture srgbtx srgbencodedrec709srgb",
+    DISPLAY_P3: "displayp3 p3 srgbp3d65scene srgbdisplayp3",
+    ADOBE_RGB: "adobergb adobergb1998 g22adobergbscene",
+    ACESCG: "acescg linap1 linap1scene",
+    REC2020: "rec2020 bt2020",
+    LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
+}
+_BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
+
+
+def find_space(name: str) -> ColourSpace | None:
+    """The space of that name, ours or OpenColorIO's; None where neither knows it."""
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    if plain in _BY_ALIAS:
+        return _BY_ALIAS[plain]
+    return ColourSpace(name, None) if name.casefold() in _ocio_names() else None
+
+
+def named_space(name: str) -> ColourSpace:
+    """The space that a user names; an unknown name is an error that lists near ones."""
+    space = find_space(name)
+    if space is None:
+        ours = [known.name for known in _ALIASES]
+        near = difflib.get_close_matches(name, [*ours, *_ocio_names().values()], 3, 0.5)
+        hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
+        raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
+    return space
+
+
+@cache
+def _ocio_names() -> dict[str, str]:
+    import OpenImageIO as oiio
+
+    configuration = oiio.ColorConfig()
+    names = [name for name in configuration.getColorSpaceNames() if not configuration.isData(name)]
+    names += [alias for name in names for alias in configuration.getAliases(name)]
+    names += configuration.getRoles()
+    return {name.casefold(): name for name in names}
+
+
+def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Values [H, W, 3] in `space` as scene-linear Rec.709; nothing is clipped, so wide gamuts go negative."""
+    if space.chromaticities is None:
+        return _convert_by_ocio(pixels, space.name)
+    linear = pixels if space.decode is None else space.decode(pixels)
+    matrix = matrix_to_rec709(space.chromaticities)
+    if np.allclose(matrix, np.eye(3), atol=1e-6):
+        return linear.astype(np.float32, copy=False)
+    return linear @ matrix.T.astype(np.float32)
+
+
+def _convert_by_ocio(pixels: np.ndarray, name: str) -> np.ndarray:
+    import OpenImageIO as oiio
+
+    source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
+    for linear_name in ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)"):
+        converted = oiio.ImageBufAlgo.colorconvert(source, name, linear_name)
+        if not converted.has_error:
+            return np.asarray(converted.get_pixels(oiio.FLOAT))
+    raise UsageError(f"colour space '{name}': OpenColorIO cannot convert it: {converted.geterror()}")
+
+
+def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
+    """[3, 3] from linear RGB to XYZ with Y = 1 for white; x, y of red, green, blue and white."""
+    xy = np.array(chromaticities, float).reshape(4, 2)
+    xyz = np.concatenate([xy, 1 - xy.sum(-1, keepdims=True)], -1) / xy[:, 1:]  # [4, 3], each of Y = 1
+    return xyz[:3].T * np.linalg.solve(xyz[:3].T, xyz[3])
+
+
+def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
+    """[3, 3] from linear RGB of these primaries to linear Rec.709, white to white by Bradford."""
+    source, target = rgb_to_xyz(chromaticities), rgb_to_xyz(REC709_CHROMATICITIES)
+    gain = (_BRADFORD @ target.sum(1)) / (_BRADFORD @ source.sum(1))
+    adaptation = np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
+    return np.linalg.inv(target) @ adaptation @ source
+
+
+def luminance(linear: np.ndarray) -> np.ndarray:
+    """Y [...] of linear Rec.709 [..., 3]."""
+    return linear @ rgb_to_xyz(REC709_CHROMATICITIES)[1].astype(linear.dtype)
+
+
+def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """The exposure that puts the 99th percentile of the luminance at 0.8, in EV to a hundredth.
+
+    linear [H, W, 3]; where `mask` [H, W] is given, only pixels above one half of it count. A black picture
+    keeps 0 EV.
+    """
+    values = luminance(linear)
+    values = values.ravel() if mask is None else values[mask > 0.5]
+    high = float(np.percentile(values, AUTO_EXPOSURE_PERCENTILE)) if values.size else 0.0
+    return round(float(np.log2(AUTO_EXPOSURE_TARGET_LINEAR / high)), 2) if high > 1e-9 else 0.0

@@ -1,0 +1,91 @@
+"""Man pages from the app: `python -m facerf_cli.manpages DIR` writes facerf.1 and a page for each verb."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import typer.main
+
+from facerf_cli import __version__
+from facerf_cli.errors import UsageError
+from facerf_cli.main import app
+
+_EXIT_CODES = (
+    ("0", "All is done."),
+    ("1", "Some input failed; each is named in a line on standard error."),
+    ("2", "The command line is wrong, or there is nothing to work on."),
+    ("130", "Interrupted."),
+)
+
+
+def pages() -> dict[str, str]:
+    """File name to troff source, for facerf and every verb."""
+    root = typer.main.get_command(app)
+    context = typer.Context(root, info_name="facerf")
+    return {
+        f"{'-'.join(path)}.1": _page(path, command) for path, command in _walk(context, root, ("facerf",))
+    }
+
+
+def _walk(context: Any, command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield path, command
+    for name in sorted(getattr(command, "commands", {})):
+        yield from _walk(context, command.commands[name], (*path, name))
+
+
+def _page(path: tuple[str, ...], command: Any) -> str:
+    context = typer.Context(command, info_name=" ".join(path))
+    summary, _, rest = (command.help or "").strip().partition("\n")
+    lines = [f'.TH "{"-".join(path).upper()}" "1" "" "facerf {__version__}" "facerf manual"']
+    lines += [".SH NAME", f"{_text('-'.join(path))} \\- {_text(summary.rstrip('.'))}"]
+    lines += [
+        ".SH SYNOPSIS",
+        f".B {_text(' '.join(path))}",
+        _text(" ".join(command.collect_usage_pieces(context))),
+    ]
+    lines += [".SH DESCRIPTION", _text(summary)]
+    for paragraph in filter(None, rest.replace("\b", "").split("\n\n")):
+        lines += [".PP", _text(" ".join(paragraph.split()))]
+    options = [parameter.get_help_record(context) for parameter in command.get_params(context)]
+    lines += _definitions("OPTIONS", [record for record in options if record])
+    verbs = getattr(command, "commands", {})
+    lines += _definitions("VERBS", [(name, verbs[name].get_short_help_str(200)) for name in sorted(verbs)])
+    if len(path) == 1:
+        lines += _definitions("EXIT STATUS", _EXIT_CODES)
+    elif command.epilog:
+        lines += [".PP", _text(command.epilog)]
+    pages_nearby = ["-".join((*path, name)) for name in sorted(verbs)] or ["-".join(path[:-1])]
+    lines += [".SH SEE ALSO", ", ".join(f"\\fB{_text(name)}\\fR(1)" for name in pages_nearby)]
+    return "\n".join(lines) + "\n"
+
+
+def _definitions(title: str, entries: Any) -> list[str]:
+    lines = [f".SH {title}"] if entries else []
+    for term, meaning in entries:
+        lines += [".TP", f"\\fB{_text(term)}\\fR", _text(" ".join(meaning.split()))]
+    return lines
+
+
+def _text(text: str) -> str:
+    """Text as troff prints it literally: backslashes, hyphens that are typed, and dots that begin a line."""
+    text = text.replace("\\", "\\e").replace("-", "\\-")
+    return f"\\&{text}" if text.startswith((".", "'")) else text
+
+
+def main(arguments: list[str]) -> None:
+    """Write all pages into the folder named, and remove pages of verbs that are gone."""
+    if len(arguments) != 1:
+        raise UsageError("usage: python -m facerf_cli.manpages DIR")
+    folder = Path(arguments[0])
+    folder.mkdir(parents=True, exist_ok=True)
+    written = pages()
+    for old in folder.glob("facerf*.1"):
+        if old.name not in written:
+            old.unlink()
+    for name, source in written.items():
+        (folder / name).write_text(source, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,342 @@
+"""Pictures on disk: round trips, what files say of themselves, and files that are broken."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from facerf_cli import colour
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr
+from facerf_cli.records import Provenance
+
+VALUES = np.random.default_rng(1).random((23, 34, 4)).astype(np.float32)  # [H, W, RGBA], not square
+
+
+def save(path: Path, values: np.ndarray, kind: str = "float", **attributes: object) -> Path:
+    """Write [H, W, C] as it stands, through OpenImageIO alone; `__` in a name stands for a colon."""
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
+    for name, value in {"oiio__UnassociatedAlpha": 1, **attributes}.items():
+        if name == "chromaticities":
+            spec.attribute(name, oiio.TypeDesc("float[8]"), value)
+        elif name == "channelnames":
+            spec.channelnames = value
+        else:
+            spec.attribute(name.replace("__", ":"), value)
+    stream = oiio.ImageOutput.create(str(path))
+    assert stream.open(str(path), spec) and stream.write_image(np.ascontiguousarray(values)), (
+        stream.geterror()
+    )
+    assert stream.close()
+    return path
+
+
+@pytest.fixture
+def warned(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> pytest.LogCaptureFixture:
+    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+    return caplog
+
+
+@pytest.mark.parametrize(("suffix", "kind", "tolerance"), [
+    ("exr", "half", 5e-4), ("exr", "float", 0), ("hdr", "float", 1 / 128), ("tif", "float", 0),
+])  # fmt: skip
+def test_floats_are_linear(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
+    rgb = VALUES[..., :3] * 40
+    picture = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
+    np.testing.assert_allclose(picture.pixels, rgb, rtol=tolerance, atol=40 * tolerance)
+    assert picture.pixels.dtype == np.float32 and picture.alpha is None
+
+
+@pytest.mark.parametrize(("suffix", "kind", "tolerance"), [
+    ("png", "uint8", 0.5 / 255), ("png", "uint16", 0.5 / 65535), ("tif", "uint8", 0.5 / 255),
+    ("tif", "uint16", 0.5 / 65535)
+])  # fmt: skip
+def test_integers_are_srgb(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
+    rgb = VALUES[..., :3]
+    picture = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
+    assert picture.colourspace_name == "sRGB"
+    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels), rgb, atol=tolerance * 1.01)
+
+
+def test_jpeg_is_srgb(tmp_path: Path) -> None:
+    ramp = np.linspace(0.1, 0.9, 64, dtype=np.float32)[None, :, None] * np.ones((40, 1, 3), np.float32)
+    path = save(tmp_path / "a.jpg", ramp, "uint8", CompressionQuality=98)
+    np.testing.assert_allclose(colour.linear_to_srgb(read_image(path).pixels), ramp, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kind"), [("pgm", "uint8"), ("pgm", "uint16"), ("png", "uint8"), ("jpg", "uint8")]
+)
+def test_grey_becomes_three_equal_channels(tmp_path: Path, suffix: str, kind: str) -> None:
+    grey = np.full((11, 16, 1), 188 / 255, np.float32)
+    picture = read_image(save(tmp_path / f"a.{suffix}", grey, kind))
+    assert picture.pixels.shape == (11, 16, 3)
+    np.testing.assert_allclose(picture.pixels, colour.srgb_to_linear(grey).repeat(3, -1), atol=2e-4)
+
+
+def test_grey_with_alpha(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", VALUES[..., :2], "uint16", channelnames=("Y", "A"))
+    picture = read_image(path)
+    np.testing.assert_allclose(picture.alpha, VALUES[..., 1], atol=1e-5)
+    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels[..., 2]), VALUES[..., 0], atol=1e-5)
+
+
+def test_pnm_by_its_bytes(tmp_path: Path) -> None:
+    levels = np.arange(72, dtype=np.uint8).reshape(4, 6, 3)
+    (tmp_path / "a.ppm").write_bytes(b"P6\n6 4\n255\n" + levels.tobytes())
+    picture = read_image(tmp_path / "a.ppm")
+    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels) * 255, levels, atol=1e-3)
+    (tmp_path / "a.pgm").write_bytes(b"P5\n3 2\n1023\n" + np.arange(0, 600, 100, dtype=">u2").tobytes())
+    encoded = colour.linear_to_srgb(read_image(tmp_path / "a.pgm").pixels[..., 0]) * 1023
+    np.testing.assert_allclose(encoded, [[0, 100, 200], [300, 400, 500]], atol=0.02)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_alpha_comes_apart_from_colour(tmp_path: Path, suffix: str) -> None:
+    picture = read_image(save(tmp_path / f"a.{suffix}", VALUES, "uint16"))
+    np.testing.assert_allclose(picture.alpha, VALUES[..., 3], atol=1e-5)
+    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels), VALUES[..., :3], atol=1e-5)
+
+
+def test_exr_is_divided_by_its_alpha_but_keeps_light_without_cover(tmp_path: Path) -> None:
+    rgb, alpha = VALUES[..., :3], VALUES[..., 3:].copy()
+    alpha[:3] = 0
+    premultiplied = np.where(alpha > 0, rgb * alpha, rgb)
+    path = save(tmp_path / "a.exr", np.concatenate([premultiplied, alpha], -1), oiio__UnassociatedAlpha=0)
+    picture = read_image(path)
+    np.testing.assert_allclose(picture.pixels, rgb, rtol=1e-5)
+    np.testing.assert_array_equal(picture.alpha, alpha[..., 0])
+
+
+def test_a_fourth_channel_that_is_no_alpha_is_left_out(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.exr", VALUES, channelnames=("R", "G", "B", "Z"))
+    picture = read_image(path)
+    assert picture.alpha is None
+    np.testing.assert_array_equal(picture.pixels, VALUES[..., :3])
+
+
+def test_an_exr_with_layers_only_gives_its_first(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.exr", VALUES[..., [0, 1, 2]], channelnames=("skin.R", "skin.G", "skin.B"))
+    np.testing.assert_array_equal(read_image(path).pixels, VALUES[..., :3])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_orientation_is_applied_as_openImageIO_does(tmp_path: Path, orientation: int) -> None:
+    path = save(tmp_path / "a.tif", VALUES, Orientation=orientation)
+    expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.FLOAT)
+    picture = read_image(path)
+    np.testing.assert_allclose(picture.alpha, expected[..., 3], atol=1e-6)
+    assert picture.pixels.shape == expected[..., :3].shape and "Orientation" not in picture.metadata
+
+
+def test_orientation_6_turns_the_first_row_to_the_right_edge(tmp_path: Path) -> None:
+    values = np.zeros((4, 6, 3), np.float32)
+    values[0, :, 0] = 1
+    turned = read_image(save(tmp_path / "a.png", values, "uint8", Orientation=6)).pixels
+    assert turned.shape == (6, 4, 3) and turned[:, 3, 0].min() == 1 and turned[:, :3].max() == 0
+
+
+def test_chromaticities_of_an_exr(tmp_path: Path) -> None:
+    rgb = VALUES[..., :3]
+    path = save(tmp_path / "a.exr", rgb, chromaticities=colour.ACESCG.chromaticities)
+    expected = colour.to_linear_rec709(rgb, colour.ACESCG)
+    assert np.abs(expected - rgb).max() > 0.1
+    np.testing.assert_allclose(read_image(path).pixels, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "space"), [
+    ("ACEScg", colour.ACESCG), ("sRGB", colour.SRGB), ("lin_rec2020_scene", colour.LINEAR_REC2020),
+])  # fmt: skip
+def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour.ColourSpace) -> None:
+    path = save(tmp_path / "a.exr", VALUES[..., :3], oiio__ColorSpace=name)
+    picture = read_image(path)
+    np.testing.assert_allclose(picture.pixels, colour.to_linear_rec709(VALUES[..., :3], space), atol=1e-5)
+    assert picture.colourspace_name == space.name
+
+
+def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
+    spec = oiio.ImageSpec(4, 4, 3, "uint8")
+    spec.attribute("ICCProfile:profile_description", "Display P3")
+    from facerf_cli.files.images import _space_of_file
+
+    assert _space_of_file(tmp_path, spec) is colour.DISPLAY_P3
+    spec.attribute("ICCProfile:profile_description", "Scanner 7")
+    assert _space_of_file(tmp_path, spec) is colour.SRGB
+    assert "unknown colour space 'Scanner 7', taken for sRGB" in warned.text
+
+
+@pytest.mark.parametrize("space", [colour.ACESCG, colour.REC2020, colour.DISPLAY_P3, colour.LINEAR],
+                         ids=lambda space: space.name)  # fmt: skip
+def test_the_user_s_word_stands_over_the_file_s(tmp_path: Path, space: colour.ColourSpace) -> None:
+    path = save(tmp_path / "a.png", VALUES[..., :3], "uint16")
+    expected = colour.to_linear_rec709(VALUES[..., :3], space)
+    np.testing.assert_allclose(read_image(path, space.name).pixels, expected, atol=1e-4)
+
+
+def test_a_curve_on_floats_is_warned_of(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
+    read_image(save(tmp_path / "a.exr", VALUES[..., :3]), "Rec.2020")
+    assert "decoded by the curve of Rec.2020" in warned.text
+
+
+def test_data_window_is_pasted_into_the_display_window(tmp_path: Path) -> None:
+    spec = oiio.ImageSpec(34, 23, 3, "float")
+    spec.x, spec.y, spec.full_x, spec.full_y, spec.full_width, spec.full_height = -2, 5, 0, 0, 40, 25
+    stream = oiio.ImageOutput.create("a.exr")
+    path = tmp_path / "a.exr"
+    assert stream.open(str(path), spec) and stream.write_image(VALUES[..., :3].copy()) and stream.close()
+    pixels = read_image(path).pixels
+    assert pixels.shape == (25, 40, 3) and pixels[:5].max() == 0 and pixels[:, 32:].max() == 0
+    np.testing.assert_array_equal(pixels[5:25, :32], VALUES[:20, 2:, :3])
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "a.png", "a16.png", "a.exr", "a.hdr", "a.tif", "a.pgm"])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.99])
+def test_a_file_cut_short_is_one_error(
+    tmp_path: Path, name: str, share: float, capfd: pytest.CaptureFixture
+) -> None:
+    big = np.random.default_rng(0).random((120, 160, 1 if name.endswith("pgm") else 3)).astype(np.float32)
+    kind = "uint16" if "16" in name else "float" if name[-3:] in ("exr", "hdr") else "uint8"
+    path = save(tmp_path / name, big, kind)
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    with pytest.raises(InputError) as caught:
+        read_image(path)
+    assert str(caught.value).startswith(f"{path}: ") and "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_jpeg_that_lacks_its_last_byte_and_a_png_with_a_flipped_bit(
+    tmp_path: Path, capfd: pytest.CaptureFixture
+) -> None:
+    path = save(tmp_path / "a.jpg", VALUES[..., :3], "uint8")
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match="cut short"):
+        read_image(path)
+    path = save(tmp_path / "a.png", VALUES[..., :3], "uint8")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="checksum"):
+        read_image(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "name", ["a.exr", "a.png", "a.jpg", "a.hdr", "a.tif", "a.pgm", "a.txt", "a", "a b#%04d.png"]
+)
+def test_a_text_file_is_no_picture(tmp_path: Path, name: str, capfd: pytest.CaptureFixture) -> None:
+    (tmp_path / name).write_text("not a picture\n" * 20)
+    with pytest.raises(InputError, match="not a picture that can be read"):
+        read_image(tmp_path / name)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_image(tmp_path / "a.png")
+    with pytest.raises(InputError, match="is a folder"):
+        read_image(tmp_path)
+
+
+def test_one_pixel(tmp_path: Path) -> None:
+    assert read_image(save(tmp_path / "a.png", VALUES[:1, :1, :3], "uint8")).pixels.shape == (1, 1, 3)
+
+
+def test_a_hundred_megapixels_are_refused_before_decoding(tmp_path: Path) -> None:
+    path = tmp_path / "a.pgm"
+    path.write_bytes(b"P5\n10000 10000\n255\n")  # a header alone: decoding it would be another error
+    with pytest.raises(InputError, match="10000 x 10000 pixels; at most 64 megapixels"):
+        read_image(path, limit_px=PHOTO_LIMIT_PX)
+    with pytest.raises(InputError, match="cut short"):
+        read_image(path, limit_px=10**8)
+
+
+def test_nan_and_infinity_are_counted(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
+    values = VALUES[..., :3].copy()
+    values[3, 5, 1], values[3, 5, 2], values[7, 8, 0] = np.nan, np.inf, -np.inf
+    path = save(tmp_path / "a.exr", values)
+    with pytest.raises(InputError, match="2 of 782 pixels are NaN or infinite"):
+        read_image(path)
+    mended = read_image(path, non_finite="zero").pixels
+    assert "2 pixels are NaN or infinite" in warned.text
+    np.testing.assert_array_equal(mended, np.where(np.isfinite(values), values, 0))
+
+
+def test_exr_round_trip_with_layers_and_provenance(tmp_path: Path) -> None:
+    rgb, alpha = VALUES[..., :3] * 30 - 1, VALUES[..., 3]
+    layers = {
+        "normal": VALUES[..., :3] * 2 - 1,
+        "position": VALUES[..., 1:] - 1,
+        "uv": VALUES[..., :2],
+        "id": alpha,
+    }
+    path = tmp_path / "new" / "a.exr"
+    facts = Provenance("me.jpg", "default", "builtin", "MIT").attributes()
+    assert write_exr(path, rgb, alpha, layers, facts) == 0
+    picture = read_image(path)
+    np.testing.assert_allclose(picture.pixels, rgb, rtol=2e-3, atol=3e-3)
+    np.testing.assert_allclose(picture.alpha, alpha, atol=3e-4)
+    assert picture.metadata["facerf:synthetic"] == 1 and picture.metadata["facerf:input"] == "me.jpg"
+    assert picture.metadata["IPTC:DigitalSourceType"].endswith("compositeWithTrainedAlgorithmicMedia")
+    assert picture.metadata["chromaticities"] == pytest.approx(colour.REC709_CHROMATICITIES)
+    stored = oiio.ImageBuf(str(path))
+    names = list(stored.spec().channelnames)
+    xyz = {f"{layer}.{letter}" for layer in ("normal", "position") for letter in "XYZ"}
+    assert set(names) == {*"RGBA", *xyz, "uv.U", "uv.V", "id"}
+    planes = stored.get_pixels(oiio.FLOAT)
+    np.testing.assert_array_equal(planes[..., names.index("position.Z")], layers["position"][..., 2])
+    np.testing.assert_allclose(planes[..., names.index("normal.Y")], layers["normal"][..., 1], atol=1e-3)
+    assert not list(path.parent.glob(".*"))
+
+
+def test_exr_keeps_what_display_would_clip_and_says_what_half_cannot_hold(tmp_path: Path) -> None:
+    values = np.array([[[-3, 1e-4, 6e4], [1e6, -1e6, 0]]], np.float32)
+    assert write_exr(tmp_path / "a.exr", values) == 2
+    expected = np.array([[[-3, 1e-4, 6e4], [HALF_MAX, -HALF_MAX, 0]]])
+    np.testing.assert_allclose(read_image(tmp_path / "a.exr").pixels, expected, rtol=1e-3)
+    with pytest.raises(ValueError, match="1 values are NaN"):
+        write_exr(tmp_path / "b.exr", np.full((1, 1, 3), [0, np.nan, 0], np.float32))
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_display_round_trip_with_exposure(tmp_path: Path, suffix: str) -> None:
+    linear = np.linspace(0, 0.5, 60, dtype=np.float32)[None, :, None] * np.ones((40, 1, 3), np.float32)
+    path = tmp_path / f"a.{suffix}"
+    assert write_display(path, linear, exposure=1.0) == 1.0
+    shown = read_image(path)
+    assert shown.colourspace_name == "sRGB"
+    tolerance = 0.01 if suffix == "jpg" else 0.002
+    expected = colour.linear_to_srgb(linear * 2)
+    np.testing.assert_allclose(colour.linear_to_srgb(shown.pixels), expected, atol=tolerance)
+
+
+def test_display_auto_exposure_is_told_and_alpha_is_kept_straight(tmp_path: Path) -> None:
+    linear, alpha = VALUES[..., :3] * 0.01, VALUES[..., 3]
+    chosen_ev = write_display(tmp_path / "a.png", linear, "auto", alpha, Provenance("me.jpg").attributes())
+    assert chosen_ev == colour.auto_exposure_ev(linear, alpha)
+    picture = read_image(tmp_path / "a.png")
+    expected = np.clip(linear * 2**chosen_ev, 0, 1)
+    np.testing.assert_allclose(
+        colour.linear_to_srgb(picture.pixels), colour.linear_to_srgb(expected), atol=0.002
+    )
+    np.testing.assert_allclose(picture.alpha, alpha, atol=0.002)
+    assert picture.metadata["Software"].startswith("facerf ")
+
+
+def test_what_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(FacerfError, match="cannot write"):
+        write_display(tmp_path / "file" / "a.png", VALUES[..., :3])
+    with pytest.raises(UsageError, match="suffix"):
+        write_display(tmp_path / "a.xyz", VALUES[..., :3])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
+
+
+def test_real_files(shared_data: Path) -> None:
+    photo = read_image(shared_data / "photos" / "obama.jpg")
+    assert photo.pixels.shape == (1137, 910, 3) and photo.colourspace_name == "sRGB"
+    sky = read_image(shared_data / "hdri" / "kiara_1_dawn_1k.hdr")
+    assert sky.pixels.shape == (512, 1024, 3) and sky.pixels.max() > 2
+    face = read_image(shared_data / "extended_yale_b" / "yaleB02" / "yaleB02_P00A+000E+00.pgm")
+    assert face.pixels.shape == (192, 168, 3) and face.colourspace_name == "sRGB"

@@ -1,0 +1,109 @@
+"""Colour spaces against colour-science and OpenColorIO."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from facerf_cli import colour as ours
+from facerf_cli.errors import UsageError
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there
+    import colour as oracle
+
+RGB = np.random.default_rng(3).uniform(-0.2, 3.0, (5, 7, 3)).astype(np.float32)
+ENCODED = np.random.default_rng(4).uniform(0.0, 1.0, (5, 7, 3)).astype(np.float32)
+ORACLE_NAMES = {
+    ours.ACESCG: "ACEScg",
+    ours.REC2020: "ITU-R BT.2020",
+    ours.LINEAR_REC2020: "ITU-R BT.2020",
+    ours.DISPLAY_P3: "Display P3",
+    ours.LINEAR: "ITU-R BT.709",
+}
+
+
+def oracle_matrix(name: str) -> np.ndarray:
+    source, target = (oracle.RGB_COLOURSPACES[key].copy() for key in (name, "ITU-R BT.709"))
+    source.use_derived_transformation_matrices(True)
+    target.use_derived_transformation_matrices(True)
+    return oracle.matrix_RGB_to_RGB(source, target, "Bradford")
+
+
+@pytest.mark.parametrize("space", ORACLE_NAMES, ids=lambda space: space.name)
+def test_matrices_are_colour_science_s(space: ours.ColourSpace) -> None:
+    assert space.chromaticities is not None
+    expected = oracle_matrix(ORACLE_NAMES[space])
+    np.testing.assert_allclose(ours.matrix_to_rec709(space.chromaticities), expected, atol=2e-6)
+
+
+def test_luminance_is_colour_science_s() -> None:
+    y = oracle.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ[1]
+    np.testing.assert_allclose(ours.luminance(RGB), RGB @ y, atol=2e-4)  # the standard prints four digits
+
+
+@pytest.mark.parametrize("space", ORACLE_NAMES, ids=lambda space: space.name)
+def test_white_stays_white(space: ours.ColourSpace) -> None:
+    white = ours.to_linear_rec709(np.ones((1, 1, 3), np.float32), space)
+    np.testing.assert_allclose(white, 1, atol=1e-6)
+
+
+def test_curves_are_colour_science_s() -> None:
+    np.testing.assert_allclose(ours.srgb_to_linear(ENCODED), oracle.models.eotf_sRGB(ENCODED), atol=1e-6)
+    np.testing.assert_allclose(
+        ours.linear_to_srgb(ENCODED), oracle.models.eotf_inverse_sRGB(ENCODED), atol=1e-6
+    )
+    bt2020 = ours.REC2020.decode(ENCODED)  # type: ignore[misc]
+    expected = oracle.models.oetf_inverse_BT2020(ENCODED, is_12_bits_system=True)
+    np.testing.assert_allclose(bt2020, expected, atol=2e-4)  # its alpha is the rounded 1.0993
+    adobe = ours.ADOBE_RGB.decode(ENCODED)  # type: ignore[misc]
+    expected = oracle.RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding(ENCODED)
+    np.testing.assert_allclose(adobe, expected, atol=1e-6)
+
+
+def test_srgb_there_and_back_beyond_the_gamut() -> None:
+    np.testing.assert_allclose(ours.srgb_to_linear(ours.linear_to_srgb(RGB)), RGB, rtol=2e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ACEScg", "lin_rec2020", "sRGB", "Display P3", "linear", "Adobe RGB"])
+def test_openColorIO_agrees(name: str) -> None:
+    ocio_names = {"Display P3": "srgb_p3d65_scene", "linear": "lin_rec709_scene", "sRGB": "srgb_rec709_scene",
+                  "Adobe RGB": "g22_adobergb_scene"}  # fmt: skip
+    through_ocio = ours.to_linear_rec709(ENCODED, ours.ColourSpace(ocio_names.get(name, name), None))
+    here = ours.to_linear_rec709(ENCODED, ours.named_space(name))
+    np.testing.assert_allclose(here, through_ocio, atol=3e-5)
+
+
+def test_a_space_that_only_openColorIO_knows() -> None:
+    pixels = np.full((2, 3, 3), 0.4135884, np.float32)  # ACEScct's code value of 0.18
+    grey = ours.to_linear_rec709(pixels, ours.named_space("acescct"))
+    np.testing.assert_allclose(grey, 0.18, rtol=2e-4)
+
+
+def test_spelling_does_not_matter() -> None:
+    assert ours.named_space("lin_rec709") is ours.named_space("Linear Rec.709 (sRGB)") is ours.LINEAR
+    assert ours.named_space("DISPLAY-P3") is ours.DISPLAY_P3 and ours.named_space("rec 2020") is ours.REC2020
+
+
+def test_an_unknown_name_lists_near_ones() -> None:
+    with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(near names: ACEScg"):
+        ours.named_space("ACEScgg")
+    with pytest.raises(UsageError, match=r"known: linear Rec\.709, sRGB"):
+        ours.named_space("qqqqq")
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
+def test_auto_exposure_puts_the_percentile_in_its_place(scale: float) -> None:
+    linear = np.random.default_rng(0).random((40, 30, 3)).astype(np.float32) * scale
+    exposed = linear * 2 ** ours.auto_exposure_ev(linear)
+    high = np.percentile(ours.luminance(exposed), ours.AUTO_EXPOSURE_PERCENTILE)
+    assert high == pytest.approx(ours.AUTO_EXPOSURE_TARGET_LINEAR, rel=0.01)
+
+
+def test_auto_exposure_looks_inside_the_mask_only_and_leaves_black_alone() -> None:
+    linear = np.ones((4, 6, 3), np.float32)
+    linear[:, 3:] = 1000
+    mask = np.zeros((4, 6), np.float32)
+    mask[:, :3] = 1
+    assert ours.auto_exposure_ev(linear, mask) == pytest.approx(np.log2(0.8), abs=0.01)
+    assert ours.auto_exposure_ev(linear * 0) == 0 and ours.auto_exposure_ev(linear, mask * 0) == 0

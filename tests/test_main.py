@@ -1,0 +1,151 @@
+"""The command line as a user meets it: global options, one line for an error, exit codes."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from facerf_cli import __version__, main
+from facerf_cli.commands.options import Settings, settings_of
+from facerf_cli.errors import FacerfError, InputError, UsageError
+
+ROOT = Path(main.__file__).parents[1]
+ERRORS: dict[str, BaseException] = {
+    "input": InputError("a.png: is\nbad"),
+    "usage": UsageError("--pose wants three numbers"),
+    "facerf": FacerfError("disk full"),
+    "bug": ZeroDivisionError("by zero"),
+    "stop": KeyboardInterrupt(),
+    "system": PermissionError(13, "Permission denied", "/there"),
+}
+seen: list[Settings] = []
+Verb = Callable[..., int]
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def verb(monkeypatch: pytest.MonkeyPatch) -> Iterator[Verb]:
+    """Runs a line with one more verb, `probe`, that notes its settings and raises what it is told."""
+
+    def probe(context: typer.Context, kind: str = "", pose: str = "") -> None:
+        seen.append(settings_of(context))
+        if kind:
+            raise ERRORS[kind]
+        print(pose)
+
+    registered = list(main.app.registered_commands)
+    main.app.command()(probe)
+    yield lambda *line: main.main(list(line))
+    main.app.registered_commands[:] = registered
+
+
+@pytest.mark.parametrize(("kind", "code", "text"), [
+    ("input", 1, "a.png: is bad"), ("usage", 2, "--pose wants three numbers"), ("facerf", 1, "disk full"),
+    ("bug", 1, "unexpected ZeroDivisionError: by zero (rerun with -v for the traceback)"),
+    ("stop", 130, "interrupted"), ("system", 1, "/there: Permission denied"),
+])  # fmt: skip
+def test_an_error_is_one_line_and_a_code(
+    verb: Verb, capsys: Capture, kind: str, code: int, text: str
+) -> None:
+    assert verb("probe", "--kind", kind) == code
+    assert capsys.readouterr() == ("", f"facerf: error: {text}\n")
+
+
+def test_the_traceback_is_there_for_who_asks(verb: Verb, capsys: Capture) -> None:
+    assert verb("probe", "--kind", "bug", "-v") == 1
+    assert "Traceback (most recent call last)" in capsys.readouterr().err
+
+
+def test_log_as_json(verb: Verb, capsys: Capture) -> None:
+    assert verb("--log-json", "probe", "--kind", "input") == 1
+    row = json.loads(capsys.readouterr().err)
+    assert row["level"] == "error" and row["message"] == "a.png: is bad" and "time" in row
+
+
+@pytest.mark.parametrize("line", [
+    ["--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q", "probe"],
+    ["probe", "--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q"],
+    ["--seed", "7", "probe", "-q", "--device=cpu", "--checkpoint=a.st"],
+])  # fmt: skip
+def test_global_options_stand_anywhere(verb: Verb, line: list[str]) -> None:
+    assert verb(*line) == 0
+    assert seen[-1] == Settings(-1, False, "cpu", Path("a.st"), 7)
+
+
+def test_nothing_is_moved_from_behind_two_dashes() -> None:
+    line = ["probe", "--seed", "1", "--", "-v", "--seed"]
+    assert main.global_options_first(line) == ["--seed", "1", "probe", "--", "-v", "--seed"]
+
+
+def test_an_option_may_have_a_negative_value(verb: Verb, capsys: Capture) -> None:
+    assert verb("probe", "--pose", "-20,5,0") == 0
+    assert capsys.readouterr().out == "-20,5,0\n"
+
+
+def test_every_global_option_is_known_to_the_mover() -> None:
+    command = typer.main.get_command(main.app)
+    names = {name for option in command.params for name in option.opts} - {"--help", "-h"}
+    completion = {"--install-completion", "--show-completion"}
+    assert names - completion == main.FLAGS | main.VALUED
+
+
+@pytest.mark.parametrize("line", [
+    ["nonsense"], ["--nonsense"], ["doctor", "--nonsense"], ["--seed", "x", "doctor"],
+    ["--device", "abacus", "doctor"], ["-v", "-q", "doctor"], ["--seed"], ["-v"], ["doctor", "extra"],
+])  # fmt: skip
+def test_a_wrong_line_is_one_line_and_code_2(capsys: Capture, line: list[str]) -> None:
+    assert main.main(line) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("facerf: error: ") and err.count("\n") == 1
+
+
+def test_version_and_help(capsys: Capture) -> None:
+    assert main.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"facerf {__version__}\n"
+    for line in ([], ["--help"], ["-h"], ["doctor", "-h"]):
+        assert main.main(line) == 0
+        assert "Usage: facerf" in capsys.readouterr().out
+
+
+def run(code: str, **keywords: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, **keywords)  # type: ignore[call-overload]
+
+
+def test_help_does_not_import_what_is_heavy() -> None:
+    result = run(
+        "import sys\nfrom facerf_cli import main\ncode = main.main(['--help'])\n"
+        "heavy = {'torch', 'numpy', 'OpenImageIO', 'scipy', 'trimesh', 'skimage', 'colour', 'dlib'}\n"
+        "print(code, sorted(heavy & set(sys.modules)), file=sys.stderr)"
+    )
+    assert result.stderr == "0 []\n"
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    result = subprocess.run(
+        f"{sys.executable} -m facerf_cli --help | head -c 1; echo ${{PIPESTATUS[0]}}",
+        shell=True, executable="/bin/bash", capture_output=True, text=True, cwd=ROOT,
+        check=True,
+    )  # fmt: skip
+    assert result.stderr == ""
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shell_completion(shell: str) -> None:
+    protocol = {
+        "_FACERF_COMPLETE": f"complete_{shell}",
+        "_TYPER_COMPLETE_ARGS": "facerf do",
+        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
+        "COMP_WORDS": "facerf do",
+        "COMP_CWORD": "1",
+    }
+    result = run(
+        "import sys; sys.argv = ['facerf']; from facerf_cli.main import run; run()", env=os.environ | protocol
+    )
+    assert "doctor" in result.stdout and result.stderr == ""
