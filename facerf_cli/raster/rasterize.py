@@ -59,15 +59,13 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
         triangle = _visible_triangles(vertices_camera.detach(), triangles, camera)
     height, width = camera.height_px, camera.width_px
     pixel = torch.nonzero(triangle >= 0).squeeze(-1)
-    corners = vertices_camera[triangles[triangle[pixel]]]  # [P, 3, 3]
-    weights = _barycentric(corners.double(), pixel, camera)
-    depth = -(weights * corners[..., 2]).sum(-1)
-    dtype = vertices_camera.dtype
-    flat = torch.zeros(height * width, 3, dtype=dtype, device=corners.device)
-    far = torch.full((height * width,), torch.inf, dtype=dtype, device=corners.device)
+    weights, depth = _hit(vertices_camera, triangles, triangle[pixel], pixel, camera)
+    dtype, device = vertices_camera.dtype, vertices_camera.device
+    nothing = torch.zeros(height * width, 3, dtype=dtype, device=device)
+    far = torch.full((height * width,), torch.inf, dtype=dtype, device=device)
     return Fragments(
         triangle.view(height, width),
-        flat.index_copy(0, pixel, weights.to(dtype)).view(height, width, 3),
+        nothing.index_copy(0, pixel, weights.to(dtype)).view(height, width, 3),
         far.index_copy(0, pixel, depth.to(dtype)).view(height, width),
     )
 
@@ -82,7 +80,8 @@ def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> 
     pixel = torch.nonzero(triangle >= 0).squeeze(-1)
     corners = triangles[triangle[pixel]]  # [P, 3]
     weights = fragments.barycentric.reshape(-1, 3)[pixel].to(attributes.dtype)
-    values = (weights[..., None] * attributes[corners]).sum(1)
+    a, b, c = (weights[:, k, None] * attributes[corners[:, k]] for k in range(3))
+    values = a + b + c
     out = torch.zeros(height * width, attributes.shape[1], dtype=attributes.dtype, device=attributes.device)
     return out.index_copy(0, pixel, values).view(height, width, -1)
 
@@ -192,14 +191,29 @@ def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int
     return (1 / inverse.clamp(low[owner], high[owner])).float()
 
 
-def _barycentric(corners: Tensor, pixel: Tensor, camera: Camera) -> Tensor:
-    """Weights [P, 3] of camera-space corners [P, 3, 3] where the pixel's ray meets them."""
-    a, b, c = corners.unbind(1)
+def _hit(
+    vertices_camera: Tensor, triangles: Tensor, seen: Tensor, pixel: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor]:
+    """Barycentric weights [P, 3] and depth [P], float64, where pixels [P] see triangles `seen` [P].
+
+    With a, b, c the corners and w the weights, w_a a + w_b b + w_c c = depth * ray; by Cramer's rule
+    w_a = depth * ray . (b x c) / (a . (b x c)), and so on round. Float64, since much cancels.
+    """
+    corners = vertices_camera.double().nan_to_num()[triangles].permute(1, 2, 0).contiguous()  # [3, xyz, F]
+    a, b, c = corners
+    cofactors = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)])  # [3, xyz, F]
     column_row = torch.stack([pixel % camera.width_px, pixel // camera.width_px], -1)
-    ray = pixel_rays(column_row.to(corners.dtype) + PIXEL_CENTRE, camera)
-    across = torch.linalg.cross(ray, c - a)
-    along = torch.linalg.cross(b - a, a)
-    determinant = ((b - a) * across).sum(-1)
-    weight_b = -(a * across).sum(-1) / determinant
-    weight_c = (ray * along).sum(-1) / determinant
-    return torch.stack([1 - weight_b - weight_c, weight_b, weight_c], -1)
+    ray = pixel_rays(column_row.double() + PIXEL_CENTRE, camera).T.contiguous()
+    parts = [_dot(cofactor.index_select(1, seen), ray) for cofactor in cofactors]
+    total = parts[0] + parts[1] + parts[2]
+    volume = _dot(a, cofactors[0])
+    return torch.stack([part / total for part in parts], -1), volume[seen] / total
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    """Cross product of [3, N]; an axis at a time is several times faster than along the last."""
+    return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
