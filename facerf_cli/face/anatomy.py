@@ -1,9 +1,10 @@
 """The mean face of the built-in model, from named anatomical measures (millimetres, head frame).
 
-The neutral is a height field over the chart's cylinder: distance from the vertical axis at azimuth and height y.
-A table of section depths gives head, cheeks and jaw without their features; nose, eyes and mouth are laid on it by
-their own few measures; at last the surface is pulled onto the 68 landmarks of `LANDMARKS_M`. Only the picture's
-left half is built, then mirrored.
+The neutral is a height field over the chart's cylinder: distance from the vertical axis at azimuth and
+height. A table of section depths gives head, cheeks and jaw without their features; nose, eyes and mouth are
+laid on it by their own few measures; at last the surface is pulled onto the 68 landmarks of `LANDMARKS_M`.
+Only the picture's left half is built, then mirrored. Depths were measured on the ICT-FaceKit mean face and rounded
+to half a millimetre; none of its vertices are in here.
 """
 
 import numpy as np
@@ -80,8 +81,8 @@ _CORNEA_RADIUS_MM, _CORNEA_RISE_MM = 5.8, 0.9
 _LID_THICKNESS_MM, _CANTHUS_DEPTH_MM = 1.5, 2.5  # the inner corner is no deeper than this
 _FOLD_ABOVE_MM, _FOLD_DEPTH_MM = 4.5, 0.9
 
-# Lips: share of the way from the seam to the vermilion's edge | relief over the sections, upper and lower lip;
-# beyond the edge it falls off over a few millimetres.
+# Lips: share of the way from the seam to the vermilion's edge, and relief over the sections there, upper and
+# lower lip; beyond the edge it falls off over a few millimetres.
 _LIP_SHARES = (0, 0.15, 0.4, 0.7, 1.0)
 _LIP_UPPER_MM, _LIP_LOWER_MM = (0.8, 3.5, 4.7, 4.9, 3.6), (0.8, 3.2, 5.0, 5.4, 4.0)
 _LIP_FALLOFF_MM = (2.8, 3.4)
@@ -147,7 +148,8 @@ def _nose(across: np.ndarray, height: np.ndarray) -> np.ndarray:
     offset = np.stack([across, height], -1) - _ALA_XY_MM
     from_centre = np.linalg.norm(offset / _ALA_HALF_MM, axis=-1)
     wing = _ALA_HEIGHT_MM * np.exp(-(from_centre**3.2))
-    groove = _ALAR_GROOVE_MM * np.exp(-(((from_centre - 1.3) / 0.25) ** 2)) * _step(height, -5, 2) * _step(across, 5, 10)
+    groove = _ALAR_GROOVE_MM * np.exp(-(((from_centre - 1.3) / 0.25) ** 2))
+    groove = groove * _step(height, -5, 2) * _step(across, 5, 10)
     return _soft_maximum(ridge, wing, 1.2) - _soft_maximum(0, 0, 1.2) - groove
 
 
@@ -177,7 +179,9 @@ def _lower_line(column: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     return CubicSpline(u[order], y[order])(column)
 
 
-def _lip(from_seam: np.ndarray, breadth: np.ndarray, relief: tuple[float, ...], falloff_mm: float) -> np.ndarray:
+def _lip(
+    from_seam: np.ndarray, breadth: np.ndarray, relief: tuple[float, ...], falloff_mm: float
+) -> np.ndarray:
     breadth = np.maximum(breadth, 1.5)
     inside = PchipInterpolator(_LIP_SHARES, relief)(np.clip(from_seam / breadth, 0, 1))
     return inside * np.exp(-((np.maximum(from_seam - breadth, 0) / falloff_mm) ** 2))

@@ -1,8 +1,9 @@
-"""The built-in morphable model: our own mean, identities and expressions, no third party's data.
+"""The built-in morphable model: mean, identities and expressions made from tables of measures, not scans.
 
-`python -m facerf_cli.face.builtin` writes it to `assets/builtin_face.npz`. The identity basis is a Gaussian process
-on the mean face (Lüthi et al., 'Gaussian Process Morphable Models'): smooth deformations at three length scales,
-mostly mirror symmetric, without rigid motion and with little change of size, reduced to their largest modes.
+`python -m facerf_cli.face.builtin` writes it to `assets/builtin_face.npz`. The identity basis is a Gaussian
+process on the mean face (Lüthi et al., 'Gaussian Process Morphable Models'): smooth deformations at three
+length scales, mostly mirror symmetric, without rigid motion and with little change of size, reduced to their
+largest modes.
 """
 
 import numpy as np
@@ -15,8 +16,10 @@ from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, sav
 from facerf_cli.face.topology import GRID
 
 IDENTITIES = 80
-_SCALES_MM = ((80.0, 2.6), (35.0, 1.9), (15.0, 0.9))  # length scale, standard deviation along each axis
-_ASYMMETRIC_SHARE = 0.06  # of the variance
+_SCALES_MM = ((80.0, 2.8), (35.0, 1.75))  # length scale, standard deviation along each axis
+_DETAIL_SCALE_MM, _DETAIL_STD_MM = 14.0, (0.4, 1.1)  # the latter at the chart's rim, and about the nose
+_DETAIL_CENTRE_MM, _DETAIL_REACH_MM = np.array([0, 2, 115.0]), 50.0
+_ASYMMETRIC_SHARE = 0.02  # of the variance
 _SIZE_STD = 0.035
 _NODE_STEP = 4  # the process is solved on every fourth vertex each way (Nyström)
 _MIRROR = np.array([-1.0, 1, 1])
@@ -28,8 +31,10 @@ def build() -> MorphableModel:
     shapes = expression_shapes(mean_m)
     identity_m = identity_basis(mean_m * 1000) / 1000
     expression_m = EXPRESSION_STD * np.stack(list(shapes.values()))
-    arrays = (torch.from_numpy(array.astype(np.float32)) for array in (mean_m, identity_m, expression_m))
-    return MorphableModel(BUILTIN, "facerf's own (see LICENSE)", *arrays, tuple(shapes))
+    mean, identity, expression = (
+        torch.from_numpy(array.astype(np.float32)) for array in (mean_m, identity_m, expression_m)
+    )
+    return MorphableModel(BUILTIN, "facerf's own (see LICENSE)", mean, identity, expression, tuple(shapes))
 
 
 def identity_basis(mean_mm: np.ndarray) -> np.ndarray:
@@ -40,11 +45,12 @@ def identity_basis(mean_mm: np.ndarray) -> np.ndarray:
     still = np.eye(len(nodes) * 3) - motions[nodes].reshape(-1, 7) @ fit_motions
     size = _SIZE_STD * motions[..., 6]
     size_nodes = size[nodes].reshape(-1)
-    covariance = still @ _covariance(mean_mm[nodes], mean_mm[nodes]) @ still + np.outer(size_nodes, size_nodes)
+    covariance = still @ _covariance(mean_mm[nodes], mean_mm[nodes]) @ still
+    covariance = covariance + np.outer(size_nodes, size_nodes)
     count = len(covariance)
     variance, modes = eigh(covariance, subset_by_index=(count - IDENTITIES, count - 1))
     variance, modes = variance[::-1], modes[:, ::-1]
-    modes = modes * np.sign(modes[np.abs(modes).argmax(0), np.arange(IDENTITIES)])  # one sign on every machine
+    modes = modes * np.sign(modes[np.abs(modes).argmax(0), range(IDENTITIES)])  # the same on every machine
     parts = np.array_split(mean_mm, 16)
     smooth = np.concatenate([_covariance(part, mean_mm[nodes]) @ (still @ modes) for part in parts])
     smooth = smooth.reshape(-1, 3, IDENTITIES)
@@ -65,8 +71,20 @@ def _covariance(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
 
 
 def _kernel(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
-    squared = (a_mm**2).sum(-1)[:, None] + (b_mm**2).sum(-1) - 2 * a_mm @ b_mm.T
-    return sum(std**2 * np.exp(-squared / (2 * scale**2)) for scale, std in _SCALES_MM)
+    squared = _squared_distance(a_mm, b_mm)
+    broad = sum(std**2 * np.exp(-squared / (2 * scale**2)) for scale, std in _SCALES_MM)
+    return broad + _detail(a_mm)[:, None] * _detail(b_mm) * np.exp(-squared / (2 * _DETAIL_SCALE_MM**2))
+
+
+def _detail(points_mm: np.ndarray) -> np.ndarray:
+    """Standard deviation [N] of fine deformation: features differ more than foreheads."""
+    rim, features = _DETAIL_STD_MM
+    nearness = np.exp(-((points_mm - _DETAIL_CENTRE_MM) ** 2).sum(-1) / (2 * _DETAIL_REACH_MM**2))
+    return rim + (features - rim) * nearness
+
+
+def _squared_distance(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
+    return (a_mm**2).sum(-1)[:, None] + (b_mm**2).sum(-1) - 2 * a_mm @ b_mm.T
 
 
 def _similarity_motions(mean_mm: np.ndarray) -> np.ndarray:

@@ -1,9 +1,9 @@
 """Named regions of the canonical chart, as soft masks in UV.
 
-Outlines are smooth arcs through landmarks of `LANDMARK_UV`; a mask falls from 1 to 0 across its outline over a
-width in millimetres on the mean face. `eyes` (between the lids), `brows`, `lips` (the mouth slit among them),
-`nostrils`, `neck` (below the jaw line) and `skin` sum to one everywhere; `mouth` (the slit) and `face` (inside jaw
-and forehead, for compositing) overlap them.
+Outlines are smooth arcs through landmarks of `LANDMARK_UV`; a mask falls from 1 to 0 across its outline over
+a width in millimetres on the mean face. `eyes` (between the lids), `brows`, `lips` (the mouth slit among
+them), `nostrils`, `neck` (below the jaw line) and `skin` sum to one everywhere; `mouth` (the slit) and `face`
+(inside jaw and forehead, for compositing) overlap them.
 """
 
 from functools import cache
@@ -20,10 +20,10 @@ _PARTS = ("eyes", "brows", "lips", "nostrils", "neck")  # what skin leaves out
 _PAIRED = ("eyes", "brows", "nostrils")  # outlined on the picture's left, then mirrored
 _EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.5, "neck": 5.0, "face": 16.0}
 
-CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at 115 mm from the axis
+CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # where r = 115 mm
 _BROW_ABOVE_MM, _BROW_BELOW_MM = (0.5, 1.5, 2.0, 2.0, 0.5), (1.0, 2.5, 4.0, 5.5, 5.0)  # of landmarks 17 to 21
 _NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4650, 0.5720), (4.2, 2.0), 14.0
-_FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04), (0.32, 0.045), (0.14, 0.075), (0.045, 0.17)]
+_FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04)]  # and mirrored
 
 
 @cache
@@ -72,7 +72,8 @@ def _outline_mm(name: str) -> np.ndarray:
         corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * CHART_MM
         return np.concatenate([_smooth(landmarks[:17]), corners])
     elif name == "face":
-        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *_FOREHEAD_UV, LANDMARK_UV[0]]) * CHART_MM]
+        forehead = [*_FOREHEAD_UV, *((1 - u, v) for u, v in _FOREHEAD_UV[-2::-1])]
+        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *forehead, LANDMARK_UV[0]]) * CHART_MM]
     else:
         raise ValueError(f"no region is called {name!r}; there are {', '.join(REGIONS)}")
     return np.concatenate([_smooth(arc) for arc in arcs])
@@ -81,7 +82,8 @@ def _outline_mm(name: str) -> np.ndarray:
 def _smooth(points: np.ndarray, steps: int = 6) -> np.ndarray:
     """A cubic spline [N, 2] through `points`, by chord length."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
-    at = np.interp(np.linspace(0, len(points) - 1, (len(points) - 1) * steps + 1), np.arange(len(points)), length)
+    knots = np.arange(len(points))
+    at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
     return CubicSpline(length, points)(at)
 
 

@@ -35,7 +35,7 @@ def test_parts_cover_the_chart_once():
         ("brows", LANDMARK_UV[24] + [0, 0.01], LANDMARK_UV[27]),
         ("lips", LANDMARK_UV[[51, 62]].mean(0), LANDMARK_UV[33]),
         ("mouth", LANDMARK_UV[[62, 66]].mean(0), LANDMARK_UV[[57, 66]].mean(0)),
-        ("nostrils", LANDMARK_UV[[31, 33]].mean(0) - [0, 0.012], LANDMARK_UV[30]),
+        ("nostrils", LANDMARK_UV[31] + [0.0145, -0.022], LANDMARK_UV[30]),
         ("neck", LANDMARK_UV[4] + [0, 0.1], LANDMARK_UV[8] - [0, 0.08]),
         ("face", LANDMARK_UV[30], LANDMARK_UV[4] + [-0.08, 0.08]),
         ("skin", (LANDMARK_UV[30] + LANDMARK_UV[2]) / 2, LANDMARK_UV[57] - [0, 0.01]),
