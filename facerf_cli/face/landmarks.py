@@ -59,7 +59,7 @@ class _Attempt:
 
 
 _ATTEMPTS = (
-    _Attempt(1024),
+    _Attempt(1600, enlarge=2.0),
     _Attempt(1600, enlarge=3.0, padding=0.25),
     _Attempt(1024, enlarge=2.0, padding=0.25, brighten=True),
     *(_Attempt(1024, enlarge=2.0, padding=0.25, turns=turns) for turns in (1, 3, 2)),

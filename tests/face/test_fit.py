@@ -1,0 +1,199 @@
+"""The fit finds what made the landmarks, and says so where nothing could."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop, from_landmarks
+from facerf_cli.face.fit import (
+    FitSettings,
+    _basis,
+    fit_batch,
+    fit_landmarks,
+    load_fit,
+    save_fit,
+    trust_inside,
+)
+from facerf_cli.face.gauss_newton import Problem, jacobian, minimise, moved, residuals, weak_perspective
+from facerf_cli.face.landmarks import detect_landmarks
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import CONTOUR, grid_triangles
+from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
+from facerf_cli.raster.rasterize import rasterize
+
+CAMERA = crop_camera(256)
+CROP = Crop(10.0, 20.0, 512.0, 256)
+INNER_ONLY = torch.ones(1, 68).index_fill(1, torch.tensor(CONTOUR), 0)
+POSES = [(0, 0, 0), (25, -10, 5), (-35, 15, -20), (10, 20, 170)]
+WEAK = FitSettings(identity_std=30, expression_std=30, steps=60)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_face_model()
+
+
+def see(model, alpha, beta, pose, translation_m=(0.012, -0.02, -0.95)):
+    """Landmarks [B, 68, 2] in the crop's pixels."""
+    vertices = model.vertices(alpha, beta) @ pose_to_rotation(*pose).mT + torch.tensor(translation_m)
+    return project(model.landmarks(vertices), CAMERA)
+
+
+def coefficients(model, scale, batch=1, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    alpha = scale * torch.randn(batch, len(model.identity), generator=generator)
+    return alpha, scale * torch.randn(batch, len(model.expression), generator=generator)
+
+
+def angle_deg(a, b):
+    """Between rotations; by the chord, for acos is blunt near zero."""
+    return torch.rad2deg(2 * torch.asin((a.double() - b.double()).norm() / 8**0.5)).item()
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_the_pose_of_the_mean_is_found_exactly(model, pose):
+    landmarks_px = see(model, *coefficients(model, 0), pose)
+    fit = fit_batch(model, landmarks_px, CAMERA, FitSettings(steps=40), INNER_ONLY)
+    assert angle_deg(fit.rotation[0], pose_to_rotation(*pose)) < 0.02
+    assert fit.translation_m[0].numpy() == pytest.approx([0.012, -0.02, -0.95], abs=2e-4)
+    assert fit.alpha.abs().max() < 1e-2 and fit.error_iod.item() < 1e-5
+
+
+def test_with_weak_priors_any_shape_is_reached(model):
+    landmarks_px = see(model, *coefficients(model, 0.5), (12, 5, 3))
+    assert fit_batch(model, landmarks_px, CAMERA, WEAK, INNER_ONLY).error_iod.item() < 2e-3
+
+
+def test_strong_priors_keep_the_shape_at_the_mean(model):
+    landmarks_px = see(model, *coefficients(model, 1), (12, 5, 3))
+    weak = fit_batch(model, landmarks_px, CAMERA, WEAK)
+    strong = fit_batch(model, landmarks_px, CAMERA, FitSettings(identity_std=0.01, expression_std=0.01))
+    assert strong.alpha.norm() < 0.02 < 0.1 * weak.alpha.norm()
+
+
+def test_the_jacobian_is_the_derivative(model):
+    basis = _basis(model, FitSettings())
+    target_px = see(model, *coefficients(model, 0.5, batch=2), (20, -8, 10)).double()
+    problem = Problem(basis, target_px, CAMERA, torch.full((2, 68), 0.3).double(), 2.0)
+    state = minimise(problem, weak_perspective(basis, target_px, CAMERA)[0], steps=2)
+    at = residuals(problem, state)
+    analytic = jacobian(problem, state, at)
+    size = analytic.shape[-1]
+
+    def landmarks_px(step):
+        there = moved(state, step)
+        head = basis.mean[at.ids] + (basis.modes[at.ids] @ there.coordinates[:, None, :, None])[..., 0]
+        return project(head @ there.rotation.mT + there.translation_m[:, None], CAMERA)
+
+    for column in [*range(8), size // 2, size - 1]:
+        step = 1e-6 * torch.eye(size, dtype=torch.float64)[column].expand(2, -1)
+        numeric = (landmarks_px(step) - landmarks_px(-step)) / 2e-6
+        assert torch.allclose(analytic[..., column], numeric, rtol=1e-5, atol=1e-5)
+
+
+def test_a_batch_is_its_faces_one_by_one(model):
+    alpha, beta = coefficients(model, 0.4, batch=len(POSES))
+    landmarks_px = torch.cat([see(model, alpha[[i]], beta[[i]], pose) for i, pose in enumerate(POSES)])
+    together = fit_batch(model, landmarks_px, CAMERA)
+    for index in range(len(POSES)):
+        alone = fit_batch(model, landmarks_px[[index]], CAMERA)
+        assert torch.allclose(alone.alpha[0], together.alpha[index], atol=1e-5)
+        assert torch.allclose(alone.translation_m[0], together.translation_m[index], atol=1e-6)
+
+
+def test_steps_never_raise_the_cost_and_more_of_them_settle(model):
+    landmarks_px = see(model, *coefficients(model, 0.8), (20, 5, 0))
+    few, many = (fit_batch(model, landmarks_px, CAMERA, FitSettings(steps=steps)) for steps in (20, 60))
+    assert (few.error_iod - many.error_iod).abs().item() < 2e-3
+    assert angle_deg(few.rotation[0], many.rotation[0]) < 0.5
+
+
+def test_one_wrong_landmark_is_not_believed(model):
+    landmarks_px = see(model, *coefficients(model, 0.2), (5, 0, 0))
+    wrong = landmarks_px.clone()
+    wrong[0, 33] += 40
+    right, off = (fit_batch(model, points, CAMERA) for points in (landmarks_px, wrong))
+    quadratic = fit_batch(model, wrong, CAMERA, FitSettings(huber=1e6))
+    assert angle_deg(right.rotation[0], off.rotation[0]) < 4
+    assert angle_deg(right.rotation[0], off.rotation[0]) < 0.5 * angle_deg(
+        right.rotation[0], quadratic.rotation[0]
+    )
+
+
+def test_a_landmark_without_trust_counts_for_nothing(model):
+    landmarks_px = see(model, *coefficients(model, 0.3), (5, 0, 0))
+    wrong = landmarks_px.clone()
+    wrong[0, :5] += 60
+    trust = torch.ones(1, 68)
+    trust[0, :5] = 0
+    a, b = (fit_batch(model, points, CAMERA, trust=trust) for points in (landmarks_px, wrong))
+    assert torch.allclose(a.alpha, b.alpha, atol=1e-9) and torch.allclose(a.error_iod, b.error_iod)
+
+
+@pytest.mark.parametrize("yaw", [25, -25])
+def test_the_far_jaw_slides_along_the_silhouette(model, yaw):
+    camera = crop_camera(256)
+    rotation, translation = pose_to_rotation(yaw, 0, 0), torch.tensor([0.0, 0.01, -0.95])
+    vertices = model.mean @ rotation.mT + translation
+    seen = rasterize(vertices, grid_triangles(), camera).triangle >= 0
+    start = see(model, *coefficients(model, 0), (yaw, 0, 0), translation.tolist()).double()
+    basis = _basis(model, FitSettings())
+    problem = Problem(basis, start, camera, torch.ones(1, 68).double(), 2.0)
+    state = weak_perspective(basis, start, camera)[0]
+    state = replace(state, rotation=rotation[None].double(), translation_m=translation[None].double())
+    found_px = (residuals(problem, state).difference_px + start)[0]
+    far = range(12, 16) if yaw > 0 else range(1, 5)
+    for landmark in far:
+        x, y = found_px[landmark].tolist()
+        columns = seen[int(y)].nonzero()[:, 0]
+        edge = columns.max().item() + 1 if yaw > 0 else columns.min().item()
+        assert abs(x - edge) < 2, (landmark, x, edge)
+
+
+@pytest.mark.parametrize("bad", [np.full((68, 2), 7.0), np.full((68, 2), np.nan), np.zeros((5, 2))])
+def test_degenerate_landmarks_are_an_input_error(model, bad):
+    with pytest.raises(InputError):
+        fit_landmarks(model, bad, CROP)
+    with pytest.raises(InputError):
+        fit_batch(model, torch.from_numpy(np.stack([bad, bad])), CAMERA)
+
+
+def test_a_fit_survives_its_file(model, tmp_path):
+    fit = fit_landmarks(model, see(model, *coefficients(model, 0.3), (9, 3, 1))[0].numpy(), CROP)
+    save_fit(tmp_path / "fit.npz", fit)
+    again = load_fit(tmp_path / "fit.npz")
+    assert again.crop == fit.crop and again.model == model.name and again.quality == fit.quality
+    assert torch.equal(again.vertices_camera(model), fit.vertices_camera(model))
+
+
+def test_what_is_no_fit_is_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("hello")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name in ("text.npz", "other.npz", "missing.npz"):
+        with pytest.raises(InputError, match=name):
+            load_fit(tmp_path / name)
+
+
+def test_a_fit_knows_its_model_and_its_quality(model):
+    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
+    assert fit.quality == "good"
+    assert [replace(fit, error_iod=error).quality for error in (0.045, 0.06, 0.2)] == ["good", "fair", "poor"]
+    with pytest.raises(ValueError, match="other"):
+        fit.vertices_camera(replace(model, name="other"))
+
+
+def test_jaw_points_at_the_border_of_a_tight_crop_are_dropped():
+    landmarks_px = CROP.to_crop(np.stack([np.linspace(0, 168, 68), np.full(68, 90.0)], -1))
+    trust = trust_inside(landmarks_px, CROP, 192, 168)
+    assert trust[0] == 0 and trust[5] == 1 and trust[17:].all()
+
+
+def test_a_smile_is_followed(model):
+    face = detect_landmarks(skimage.data.astronaut())[0]
+    crop = from_landmarks(face.landmarks_px, 256)
+    fit = fit_landmarks(model, crop.to_crop(face.landmarks_px), crop)
+    assert fit.error_iod <= 0.045
