@@ -128,7 +128,7 @@ def test_a_texel_averages_over_the_pixels_that_it_covers() -> None:
     noise = torch.rand(1, 1600, 2000, generator=torch.Generator().manual_seed(0))
     found, _ = unwrap(noise, head(), TRIANGLES, camera, 64)  # over 20 pixels a texel in each direction
     middle = found[0, 16:48, 16:48]
-    assert float(middle.mean()) == pytest.approx(0.5, abs=0.005) and middle.std() < 0.05
+    assert float(middle.mean()) == pytest.approx(0.5, abs=0.005) and middle.std() < 0.025
 
 
 def test_texels_behind_the_nose_are_hidden_and_those_before_are_not() -> None:
