@@ -1,7 +1,7 @@
 """Morphable models on the canonical topology (paper, 'Reflectance Field Representation')."""
 
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +34,7 @@ class MorphableModel:
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
         """v = mean + M_id alpha + M_exp beta, for alpha [B, Ki] and beta [B, Ke], as [B, V, 3]."""
         offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
-        return self.mean + offset.unflatten(-1, (-1, 3))
+        return self.mean + offset.view(len(offset), -1, 3)
 
     def landmarks(self, vertices: Tensor) -> Tensor:
         """The 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
@@ -43,8 +43,8 @@ class MorphableModel:
 
     def to(self, device: torch.device | str) -> "MorphableModel":
         """The same model with its arrays on `device`."""
-        arrays = (tensor.to(device) for tensor in (self.mean, self.identity, self.expression))
-        return MorphableModel(self.name, self.licence, *arrays, self.expression_names)
+        mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
+        return replace(self, mean=mean, identity=identity, expression=expression)
 
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
@@ -66,17 +66,23 @@ def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
     """The built-in model, or one written by `facerf face-model import`."""
     path = BUILTIN_PATH if str(name_or_path) == BUILTIN else Path(name_or_path)
     if not path.is_file():
-        raise InputError(f"{path}: no such face model; give '{BUILTIN}' or a file that `facerf face-model import` wrote")
+        raise InputError(
+            f"{path}: no such face model; give '{BUILTIN}' or a file that `facerf face-model import` wrote"
+        )
     try:
         with np.load(path, allow_pickle=False) as file:
             return _from_arrays(path, {key: file[key] for key in file.files})
     except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a facerf face model ({error}); import it with `facerf face-model import`") from None
+        raise InputError(
+            f"{path}: not a facerf face model ({error}); import it with `facerf face-model import`"
+        ) from None
 
 
 def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
     if int(arrays["layout_version"]) != LAYOUT_VERSION:
-        raise InputError(f"{path}: made for another UV layout; import the face model again with this version of facerf")
+        raise InputError(
+            f"{path}: made for another UV layout; import the face model again with this version of facerf"
+        )
     vertices = GRID * GRID
     for key in ("identity", "expression"):
         shape = arrays[key].shape

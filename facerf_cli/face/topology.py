@@ -1,7 +1,7 @@
 """The canonical topology that every face model is carried to.
 
-One bilaterally symmetric grid in a cylindrical chart. The head frame is right-handed, in metres: x to the
-picture's right, y up, z out of the face; its origin lies on the chart's vertical axis, inside the head, at the
+One bilaterally symmetric grid in a cylindrical chart. The head frame is right-handed, in metres: x to
+the picture's right, y up, z out of the face; its origin lies on the chart's vertical axis, inside the head, at the
 height of the nose's underside. u runs to the picture's right over +-`HALF_ANGLE_DEG` of azimuth, v runs down
 from the forehead to below the chin. The 68 landmarks (Multi-PIE order) sit at the same (u, v) in every model,
 so a texture learned on one model fits all others. Changing anything here changes `LAYOUT_VERSION`.
@@ -30,9 +30,11 @@ _MEASURES_MM = """
 61 -10   -32.4 121  | 62   0  -32.5 122.5 | 66  0   -34.6 122.5 | 67 -10.5 -34.5 120.5
 """
 MIRROR_68 = np.array(
-    [*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)]
-    + [45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40]
-    + [*range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), 67, 66, 65]
+    [
+        *[*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)],
+        *[45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40],
+        *[*range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), 67, 66, 65],
+    ]
 )
 CONTOUR = tuple(range(17))
 INNER_MOUTH_CORNERS = (60, 64)  # the two that the paper's 66 landmarks leave out
@@ -104,7 +106,9 @@ def locate(uv: np.ndarray) -> tuple[Tensor, Tensor]:
     a, b, c = corners[:, :, 0], corners[:, :, 1], corners[:, :, 2]
     p = fraction[:, None]
     det = _cross(b - a, c - a)
-    weights = np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], -1) / det[..., None]
+    weights = (
+        np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], -1) / det[..., None]
+    )
     best = weights.min(-1).argmax(-1)
     rows = np.arange(len(uv))
     return triangles[rows, best], torch.from_numpy(weights[rows, best]).float()

@@ -1,0 +1,104 @@
+"""`facerf train`: bake synthetic heads, then train the Reflectance Network on them."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from facerf_cli.commands.options import Settings, settings_of
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from facerf_cli.stage.bank import Bank
+
+_UNITS_S = {"s": 1, "m": 60, "h": 3600}
+
+
+def train(
+    context: typer.Context,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the run.")],
+    heads_from: Annotated[
+        str, typer.Option(metavar="NAME|PATH", help="Face model that the synthetic heads are drawn from.")
+    ] = "builtin",
+    fit_with: Annotated[
+        str, typer.Option(metavar="NAME|PATH", help="Face model that they are fitted with, as photos are.")
+    ] = "builtin",
+    heads: Annotated[int, typer.Option(min=16, help="Synthetic heads to bake.")] = 240,
+    views: Annotated[int, typer.Option(min=1, help="Fitted views of each head.")] = 8,
+    bank: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where baked heads are kept.", show_default="DIR/bank")
+    ] = None,
+    max_time: Annotated[str, typer.Option(metavar="TIME", help="Stop after 90s, 45m or 2h.")] = "2h",
+    start_from: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Checkpoint whose weights to begin with.", show_default="none"),
+    ] = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes that bake.")] = 2,
+) -> None:
+    """Train the Reflectance Network on synthetic heads, without a light stage.
+
+    Heads are drawn from a face model and their light transport is baked once; skins, lights and cameras are
+    drawn anew at every step. DIR gets last.safetensors (for --checkpoint), log.jsonl and validation.png.
+    """
+    from facerf_cli.training import TrainSettings
+    from facerf_cli.training import train as run_training
+
+    settings = settings_of(context)
+    training = TrainSettings(max_seconds=_seconds(max_time), seed=settings.seed)
+    filled = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
+    report = _Progress(training.max_seconds, quiet=settings.verbosity < 0)
+    with report:
+        checkpoint = run_training(filled, output, training, start_from=start_from, report=report.row)
+    print(checkpoint)
+
+
+def _seconds(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    if not match:
+        raise UsageError(f"--max-time {text}: write a number and s, m or h, such as 45m")
+    return float(match[1]) * _UNITS_S[match[2]]
+
+
+def _fill_bank(
+    folder: Path, heads_from: str, fit_with: str, heads: int, views: int, jobs: int, settings: Settings
+) -> "Bank":
+    from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.stage.bank import add_views, load_bank
+    from facerf_cli.stage.geometries import build_geometries
+
+    drawn, fitted = load_face_model(heads_from), load_face_model(fit_with)
+    build_geometries(folder / "heads", heads_from, heads, jobs, settings.seed)
+    add_views(folder / "heads", folder / f"views-{fitted.name}", fit_with, views, jobs, settings.seed)
+    provenance = {
+        "heads": f"{heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "fitted_with": f"{fitted.name} ({fitted.licence})",
+        "skin": "procedural (facerf)",
+    }
+    return load_bank(folder / "heads", folder / f"views-{fitted.name}", provenance)
+
+
+class _Progress:
+    """A bar on stderr: time, step, loss, and the share of time spent drawing samples."""
+
+    def __init__(self, total_s: float, quiet: bool) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+        self.bar = Progress(*columns, console=Console(stderr=True), disable=quiet)
+        self.task = self.bar.add_task("training", total=total_s)
+        self.smooth: float | None = None
+
+    def __enter__(self) -> "_Progress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.bar.stop()
+
+    def row(self, row: dict[str, float]) -> None:
+        """Show one row of the log."""
+        self.smooth = row["loss"] if self.smooth is None else 0.98 * self.smooth + 0.02 * row["loss"]
+        text = f"step {row['step']:.0f}  loss {self.smooth:.4f}  drawing {100 * row['drawing']:.0f} %"
+        self.bar.update(self.task, completed=row["seconds"], description=text)

@@ -1,0 +1,154 @@
+"""Light transport baked in the texture's space: what each light brings to each texel, kept apart from skin.
+
+Ray-cast with embree. Everything is in one frame (the head's, for a bake that any pose can use).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from embreex import rtcore_scene
+from embreex.mesh_construction import TriangleMesh
+from scipy.ndimage import gaussian_filter
+from scipy.spatial import cKDTree
+
+_OFFSET_M = 2e-4  # rays start this far off the surface, above float32's step at head scale
+
+
+@dataclass(frozen=True)
+class Transport:
+    """Per light and texel, for lights of rgb 1 in `directions` [L, 3].
+
+    visibility [L, T, T]: the share of the lamp's disc that the texel sees, 0 where it faces away.
+    bounce [L, T, T]: irradiance after one diffuse bounce off surroundings of albedo 1, in units where a
+    surface that faces an unoccluded light receives 1.
+    """
+
+    directions: np.ndarray
+    visibility: np.ndarray
+    bounce: np.ndarray
+
+
+@dataclass(frozen=True)
+class BakeSettings:
+    """Rays per texel: `lamp_samples` over a lamp of `lamp_radius_deg`, `bounce_samples` over the hemisphere.
+
+    A bounce varies slowly over the face, so its noise is smoothed by a Gaussian of `bounce_blur_texels`.
+    """
+
+    lamp_samples: int = 4
+    lamp_radius_deg: float = 1.5
+    bounce_samples: int = 32
+    bounce_blur_texels: float = 1.5
+
+
+def bake_transport(
+    positions: np.ndarray,
+    normals: np.ndarray,
+    vertices: np.ndarray,
+    triangles: np.ndarray,
+    directions: np.ndarray,
+    settings: BakeSettings = BakeSettings(),
+    seed: int = 0,
+) -> Transport:
+    """Bake texels at positions [T, T, 3] (m) with unit normals [T, T, 3], lit from unit directions [L, 3].
+
+    The occluder is the mesh of vertices [V, 3] and triangles [F, 3], with its texture coordinates implied:
+    texel centres are where `positions` were taken, so a bounce looks its hit up by nearest position.
+    """
+    scene = build_scene(vertices, triangles)
+    random = np.random.default_rng(seed)
+    side = positions.shape[0]
+    flat_positions = positions.reshape(-1, 3).astype(np.float32)
+    flat_normals = normals.reshape(-1, 3).astype(np.float32)
+    visibility = _lamp_visibility(scene, flat_positions, flat_normals, directions, settings, random)
+    direct = visibility * np.clip(directions.astype(np.float32) @ flat_normals.T, 0, None)  # [L, N]
+    bounce = _one_bounce(scene, flat_positions, flat_normals, vertices[triangles], direct, settings, random)
+    shape = (len(directions), side, side)
+    blur = settings.bounce_blur_texels
+    smooth_bounce = gaussian_filter(bounce.reshape(shape), (0, blur, blur), mode="nearest")
+    return Transport(directions, visibility.reshape(shape), smooth_bounce)
+
+
+def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.EmbreeScene:
+    """An embree scene of one triangle mesh."""
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, vertices[triangles].astype(np.float32))
+    return scene
+
+
+def occluded(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Whether anything lies along each ray [N, 3]; bool [N]."""
+    hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="OCCLUDED")
+    return np.asarray(hits) != -1
+
+
+def _lamp_visibility(
+    scene: rtcore_scene.EmbreeScene,
+    positions: np.ndarray,
+    normals: np.ndarray,
+    directions: np.ndarray,
+    settings: BakeSettings,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Share of unoccluded lamp samples [L, N]."""
+    visibility = np.zeros((len(directions), len(positions)), np.float32)
+    origins = positions + normals * _OFFSET_M
+    for light, direction in enumerate(directions):
+        facing = np.flatnonzero(normals @ direction.astype(np.float32) > 0)
+        for _ in range(settings.lamp_samples):
+            rays = _within_cone(direction, settings.lamp_radius_deg, len(facing), random)
+            visibility[light, facing] += ~occluded(scene, origins[facing], rays)
+    return visibility / settings.lamp_samples
+
+
+def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.random.Generator) -> np.ndarray:
+    """Unit directions [count, 3] spread evenly over the disc of a lamp; a lamp of radius 0 is a point."""
+    tangent, bitangent = _tangents(axis[None])
+    radius = np.tan(np.radians(radius_deg)) * np.sqrt(random.random((count, 1)))
+    turn = 2 * np.pi * random.random((count, 1))
+    rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
+    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def _one_bounce(
+    scene: rtcore_scene.EmbreeScene,
+    positions: np.ndarray,
+    normals: np.ndarray,
+    corners: np.ndarray,
+    direct: np.ndarray,
+    settings: BakeSettings,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Mean of the direct irradiance [L, N] over what a cosine-weighted hemisphere sees; [L, N]."""
+    nearest_texel = cKDTree(positions)
+    origins = positions + normals * _OFFSET_M
+    bounce = np.zeros_like(direct)
+    for _ in range(settings.bounce_samples):
+        rays = _cosine_hemisphere(normals, random)
+        hits = scene.run(origins, rays, output=True)
+        found = np.flatnonzero(hits["primID"] >= 0)
+        triangles = corners[hits["primID"][found]]
+        u, v = hits["u"][found, None], hits["v"][found, None]
+        points = triangles[:, 0] * (1 - u - v) + triangles[:, 1] * u + triangles[:, 2] * v
+        _, texels = nearest_texel.query(points)
+        # A ray that reaches the shell's inner side has left through its open rim: no light comes back.
+        front = np.einsum("nc,nc->n", rays[found], normals[texels]) < 0
+        bounce[:, found[front]] += direct[:, texels[front]]
+    return bounce / settings.bounce_samples
+
+
+def _cosine_hemisphere(normals: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """One cosine-distributed unit direction about each normal [N, 3]."""
+    tangent, bitangent = _tangents(normals)
+    radius = np.sqrt(random.random((len(normals), 1)))
+    turn = 2 * np.pi * random.random((len(normals), 1))
+    rays = np.sqrt(1 - radius**2) * normals + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
+    return rays.astype(np.float32)
+
+
+def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors [N, 3] each, orthogonal to unit normals [N, 3]."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
+    tangent = np.cross(helper, normals)
+    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+    return tangent, np.cross(normals, tangent)

@@ -1,0 +1,198 @@
+"""From one texture to the texture under any single light (paper, 'Network Architecture').
+
+This `default` form departs from the paper's in three ways that learn faster: the light also enters the
+decoder, as maps in the chart (cosine, half-vector, the mean face's shadow) and as feature-wise modulation;
+the output is `source x gain + bias` in square-root space; and the network works at a fixed side while gain
+and bias are applied at the texture's own. The encoder runs once a face, the decoder once a light.
+"""
+
+from dataclasses import asdict, dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+MEAN_RADIANCE = 0.25  # of the visible face after exposure is taken out
+_MAP_SIDE = 64  # of the mean face's normals and shadows
+_LIGHT_MAPS = 4
+_LIGHT_FEATURES = 12
+_KERNEL_SHARPNESS = 70.0  # of the interpolation between the shadow maps of neighbouring lights
+
+
+@dataclass(frozen=True)
+class ReflectanceSettings:
+    """Width of the encoder and decoder at each halving of the working side [T' = side, side/2, ...]."""
+
+    side: int = 128
+    encoder_widths: tuple[int, ...] = (32, 64, 128, 192, 224, 256)
+    decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
+    template_channels: int = 8
+
+    def as_dict(self) -> dict[str, object]:
+        """For a checkpoint's metadata."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """What the encoder knows of B faces: skip features from fine to coarse, and what the output needs."""
+
+    features: list[Tensor]
+    source_root: Tensor  # [B, 3, T, T] square root of the normalised source
+    exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
+
+
+class ReflectanceNetwork(nn.Module):
+    """T_s, N_s, N_t, light directions -> OLAT textures, scene-linear and non-negative."""
+
+    mean_normals: Tensor
+    mean_visibility: Tensor
+    rig: Tensor
+
+    def __init__(self, settings: ReflectanceSettings = ReflectanceSettings(), rig_lights: int = 150) -> None:
+        super().__init__()
+        self.settings = settings
+        enc, dec = settings.encoder_widths, settings.decoder_widths
+        self.template = nn.Parameter(0.1 * torch.randn(settings.template_channels, 32, 32))
+        widths = (7 + settings.template_channels, *enc)
+        self.down = nn.ModuleList(
+            _Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(widths, enc, strict=False))
+        )
+        self.bottleneck = nn.Conv2d(enc[-1], dec[-1], 3, padding=1)
+        self.light_code = nn.Sequential(
+            nn.Linear(_LIGHT_FEATURES, 96), nn.SiLU(), nn.Linear(96, 96), nn.SiLU()
+        )
+        coarser = (*dec[1:], dec[-1])
+        self.up = nn.ModuleList(
+            _Up(coarser[i], dec[i], enc[i], last=i == len(dec) - 1) for i in range(len(dec))
+        )
+        self.head = nn.Conv2d(dec[0], 6, 3, padding=1)
+        nn.init.normal_(self.head.weight, std=1e-3)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+        self.register_buffer("mean_normals", torch.zeros(3, _MAP_SIDE, _MAP_SIDE))
+        self.register_buffer(
+            "mean_visibility", torch.zeros(rig_lights, _MAP_SIDE, _MAP_SIDE, dtype=torch.uint8)
+        )
+        self.register_buffer("rig", torch.zeros(rig_lights, 3))
+
+    def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
+        """Hold the mean face (head frame): normals [3, T, T], visibility [L, T, T], directions [L, 3]."""
+        size = (_MAP_SIDE, _MAP_SIDE)
+        self.mean_normals.copy_(F.normalize(F.interpolate(normals[None], size, mode="area")[0], dim=0))
+        self.mean_visibility.copy_((F.interpolate(visibility[None], size, mode="area")[0] * 255).round())
+        self.rig.copy_(directions)
+
+    def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> Encoded:
+        """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
+        luminance = (texture.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
+        exposure = luminance / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) / MEAN_RADIANCE
+        exposure = exposure.clamp_min(1e-6)
+        source_root = (texture / exposure).clamp_min(0).sqrt()
+        side = self.settings.side
+        small = [_resize(x, side) for x in (source_root, visible, normals_source)]
+        template = F.interpolate(self.template[None], (side, side), mode="bilinear", align_corners=False)
+        x = torch.cat([*small, template.expand(len(texture), -1, -1, -1)], 1)
+        features = []
+        for down in self.down:
+            x = down(x)
+            features.append(x)
+        return Encoded(features, source_root, exposure)
+
+    def decode(self, encoded: Encoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3] and normals [B, 3, T, T]."""
+        root = self.decode_root(encoded, normals_target, lights)
+        return root.clamp_min(0) ** 2 * encoded.exposure[:, None]
+
+    def decode_root(self, encoded: Encoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """Square roots [B, L, 3, T, T] of the textures at the normalised exposure; may dip below zero."""
+        faces, count, _ = lights.shape
+        maps, base, code = self._light_inputs(normals_target, lights)
+        x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
+        for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
+            x = up(x, skip, maps, code, count)
+        gain, bias = (_resize(y, encoded.source_root.shape[-1]) for y in self.head(x).float().chunk(2, 1))
+        gain = gain + _resize(base, encoded.source_root.shape[-1])
+        root = encoded.source_root.repeat_interleave(count, 0) * gain + bias
+        return root.view(faces, count, *root.shape[1:])
+
+    def _light_inputs(self, normals_target: Tensor, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], modulation code [B*L, 96]."""
+        normals = _resize(normals_target, self.settings.side)
+        head_to_camera = self.head_rotation(normals_target)
+        lights_head = lights @ head_to_camera  # row vectors: R^T w
+        half = F.normalize(lights + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+        cosine = torch.einsum("blc,bcij->blij", lights, normals)
+        gloss = torch.einsum("blc,bcij->blij", half, normals).clamp_min(0) ** 8
+        shadow = _resize(self._mean_shadow(lights_head), self.settings.side)
+        base = (cosine.clamp_min(0) * shadow + 1e-4).sqrt()
+        maps = torch.stack([cosine, gloss, shadow, base], 2).flatten(0, 1)
+        products = (lights_head[..., :, None] * lights_head[..., None, :]).flatten(-2)[
+            ..., [0, 1, 2, 4, 5, 8]
+        ]
+        features = torch.cat([lights, lights_head, products], -1).flatten(0, 1)
+        return maps, base.flatten(0, 1)[:, None], self.light_code(features)
+
+    def _mean_shadow(self, lights_head: Tensor) -> Tensor:
+        """The mean face's visibility [B, L, T'', T''], interpolated between the baked directions."""
+        weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
+        flat = weights @ (self.mean_visibility.to(weights) / 255).flatten(1)
+        return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
+
+    def head_rotation(self, normals: Tensor) -> Tensor:
+        """head_to_camera [B, 3, 3], from the mean face's normals to camera-space normals [B, 3, T, T]."""
+        small = _resize(normals, _MAP_SIDE).double()
+        moment = torch.einsum("bcij,dij->bcd", small, self.mean_normals.double())
+        u, _, vt = torch.linalg.svd(moment)
+        sign = torch.det(u @ vt)
+        flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1))
+        return (u @ flip @ vt).to(normals)
+
+
+class _Down(nn.Module):
+    """Halve the side (but for the first), then two convolutions with a residual."""
+
+    def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
+        self.norm = nn.GroupNorm(4, channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = F.silu(self.norm(self.enter(x)))
+        result: Tensor = x + F.silu(self.inner(x))
+        return result
+
+
+class _Up(nn.Module):
+    """Double the side (but for the last, coarsest), add skip and light maps, modulate by the light's code."""
+
+    def __init__(self, channels_in: int, channels_out: int, skip_channels: int, last: bool) -> None:
+        super().__init__()
+        self.scale = 1 if last else 2
+        self.enter = nn.Conv2d(channels_in, channels_out, 3 if last else 1, padding=1 if last else 0)
+        self.skip = nn.Conv2d(skip_channels, channels_out, 1)
+        self.light = nn.Conv2d(_LIGHT_MAPS, channels_out, 3, padding=1)
+        self.modulation = nn.Linear(96, 2 * channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+        self.outer = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor, skip: Tensor, maps: Tensor, code: Tensor, lights: int) -> Tensor:
+        side = skip.shape[-1]
+        x = self.enter(x)
+        if self.scale == 2:
+            x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        x = x + self.skip(skip).repeat_interleave(lights, 0) + self.light(_resize(maps, side))
+        scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
+        x = F.silu(x * (1 + scale) + shift)
+        x = x + F.silu(self.inner(x))
+        result: Tensor = x + F.silu(self.outer(x))
+        return result
+
+
+def _resize(x: Tensor, side: int) -> Tensor:
+    """Resample [..., C, H, W] to a side: averaged when smaller, bilinear when larger."""
+    if x.shape[-1] == side:
+        return x
+    if x.shape[-1] > side:
+        return F.interpolate(x, (side, side), mode="area")
+    return F.interpolate(x, (side, side), mode="bilinear", align_corners=False)

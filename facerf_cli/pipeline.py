@@ -1,0 +1,143 @@
+"""From one photo to the face under any light, from any head pose: one function an arrow of the method.
+
+photo -> crop_face -> fit_face -> unwrap_face -> predict_olat -> weigh -> render_face -> picture
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop, from_landmarks
+from facerf_cli.face.fit import FaceFit, fit_landmarks
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
+from facerf_cli.files.checkpoints import load_checkpoint
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.raster.camera import Camera
+from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
+
+DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
+_BYTES_PER_LIGHT = 220 * 128 * 128 * 4  # of features that the decoder holds at once, at its working side
+
+
+@dataclass(frozen=True)
+class Models:
+    """The face model and the trained network, on one device."""
+
+    face: MorphableModel
+    network: ReflectanceNetwork
+    checkpoint_name: str
+    metadata: dict[str, Any]
+    device: torch.device
+
+
+@dataclass(frozen=True)
+class FaceTexture:
+    """A photo in the chart: linear texture [3, T, T], unseen texels filled; visible [T, T]; normals [3, T, T].
+
+    `visible` is in 0..1, normals are unit vectors in camera space.
+    """
+
+    texture: Tensor
+    visible: Tensor
+    normals: Tensor
+
+
+def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
+    """Load what the arrows need; `checkpoint` None is the one shipped."""
+    path = checkpoint or DEFAULT_CHECKPOINT
+    tensors, metadata = load_checkpoint(path)
+    if metadata.get("layout_version") != LAYOUT_VERSION:
+        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
+    network = build_network(path, tensors, metadata)
+    return Models(load_face_model(face_model), network.to(device).eval(), path.stem, metadata, device)
+
+
+def build_network(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> ReflectanceNetwork:
+    """The network that a checkpoint describes, with its weights."""
+    try:
+        configuration: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in metadata["network"].items()
+        }
+        network = ReflectanceNetwork(ReflectanceSettings(**configuration))
+        network.load_state_dict(tensors)
+    except (KeyError, TypeError, RuntimeError, ValueError):
+        raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
+    return network
+
+
+def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tuple[Crop, np.ndarray]:
+    """The square crop [size, size, 3] of a linear photo [H, W, 3] around landmarks [68, 2] in its pixels."""
+    crop = from_landmarks(landmarks_px, size_px)
+    return crop, crop.apply(photo)
+
+
+def fit_face(models: Models, crop: Crop, landmarks_px: np.ndarray) -> FaceFit:
+    """Fit the face model to landmarks [68, 2] in photo pixels."""
+    return fit_landmarks(models.face, landmarks_px, crop)
+
+
+def unwrap_face(models: Models, fit: FaceFit, cropped: np.ndarray, texture_side: int) -> FaceTexture:
+    """Unwrap the crop [S, S, 3] into the chart (paper, 'Network Architecture': T_s and N_s)."""
+    vertices = fit.vertices_camera(models.face)
+    picture = torch.from_numpy(cropped).permute(2, 0, 1)
+    texture, visible = unwrap(picture, vertices, grid_triangles(), fit.camera, texture_side)
+    if visible.max() < 0.5:
+        raise InputError("the fitted face lies outside the picture; give its landmarks with --landmarks")
+    return FaceTexture(
+        inpaint(texture, visible), visible, normal_map(vertices, grid_triangles(), texture_side)
+    )
+
+
+@torch.no_grad()
+def predict_olat(
+    models: Models,
+    face: FaceTexture,
+    lights: Tensor,
+    turn: Tensor | None = None,
+    memory_bytes: int = 2 << 30,
+    bf16: bool = False,
+) -> Iterator[Tensor]:
+    """OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T] that fit `memory_bytes`.
+
+    `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s.
+    """
+    device, texels = models.device, face.texture.shape[-1] ** 2
+    batch = max(1, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels))
+    normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
+    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
+        encoded = models.network.encode(
+            face.texture[None].to(device), face.normals[None].to(device), face.visible[None, None].to(device)
+        )
+        for chunk in torch.split(lights, int(batch)):
+            yield (
+                models.network.decode(encoded, normals[None].to(device), chunk[None].to(device))[0]
+                .float()
+                .cpu()
+            )
+
+
+def weigh(olats: Tensor, weights: Tensor) -> Tensor:
+    """Sum of OLATs [L, 3, ...] with rgb weights [M, L, 3]: M pictures [M, 3, ...] (paper, 'Relighting')."""
+    flat = torch.einsum("mlc,lcn->mcn", weights, olats.flatten(2))
+    return flat.view(*flat.shape[:2], *olats.shape[2:])
+
+
+def turned(fit: FaceFit, rotation: Tensor) -> tuple[Tensor, Tensor]:
+    """The turn [3, 3] from the fit's pose to `rotation` (head_to_camera), and the target's translation [3].
+
+    The head turns about its own origin, which stays where it is.
+    """
+    return rotation @ fit.rotation.T, fit.translation_m
+
+
+def render_face(texture: Tensor, vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Picture [H, W, 3] and coverage [H, W] of a texture [3, T, T] on the fitted mesh."""
+    return render_texture(texture, vertices_camera, grid_triangles(), grid_uv(), camera)

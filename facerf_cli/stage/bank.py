@@ -1,0 +1,122 @@
+"""The training bank: baked heads and fitted views of them, held in memory."""
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import GRID, grid_triangles
+from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.stage.views import build_views
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """One baked head (head frame): positions, normals, tangents [3, T, T]; transport in bytes."""
+
+    positions: Tensor
+    normals: Tensor
+    tangents: tuple[Tensor, Tensor]
+    directions: Tensor  # [L, 3]
+    visibility: Tensor  # [L, T, T]
+    bounce: Tensor  # [L, T, T], square roots
+
+
+@dataclass(frozen=True)
+class View:
+    """One fitted view of a head: see stage.views."""
+
+    rotation: Tensor  # [3, 3]
+    warp: Tensor  # [T, T, 2]
+    visible: Tensor  # [1, T, T] in 0..1
+    normals: Tensor  # [3, T, T]
+
+
+@dataclass(frozen=True)
+class Bank:
+    """Heads and their views; head 0 is the mean face."""
+
+    geometries: list[Geometry]
+    views: list[dict[str, Tensor]]
+    provenance: dict[str, Any]
+
+    @property
+    def side(self) -> int:
+        """Texels along a side of every field."""
+        return int(self.geometries[0].normals.shape[-1])
+
+    def draw_view(self, head: int, generator: torch.Generator) -> View:
+        """A random view of a head."""
+        views = self.views[head]
+        index = int(torch.randint(len(views["rotation"]), (), generator=generator))
+        return View(
+            rotation=views["rotation"][index],
+            warp=views["warp"][index].float().permute(1, 2, 0),
+            visible=views["visible"][index][None].float() / 255,
+            normals=F.normalize(views["normals"][index].float(), dim=0),
+        )
+
+    def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of head 0, in the head frame."""
+        mean = self.geometries[0]
+        return mean.normals, mean.visibility.float() / 255, mean.directions
+
+
+def add_views(geometries: Path, views: Path, fitted_with: str, count: int, jobs: int, seed: int) -> None:
+    """Write `count` fitted views of every baked head; finished heads are kept."""
+    views.mkdir(parents=True, exist_ok=True)
+    missing = [path for path in sorted(geometries.glob("*.safetensors")) if not (views / path.name).exists()]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        shards = [missing[job::jobs] for job in range(jobs)]
+        for done in [
+            pool.submit(_add_views_shard, shard, views, fitted_with, count, seed) for shard in shards
+        ]:
+            done.result()
+
+
+def _add_views_shard(heads: list[Path], views: Path, fitted_with: str, count: int, seed: int) -> None:
+    torch.set_num_threads(1)
+    model = load_face_model(fitted_with)
+    for path in heads:
+        head = load_file(path)
+        tensors = build_views(
+            head["vertices"], model, count, head["visibility"].shape[-1], seed + int(path.stem)
+        )
+        partial = views / f"{path.stem}.partial"
+        save_file(tensors, partial, metadata={"fitted_with": model.name})
+        partial.rename(views / path.name)
+
+
+def load_bank(geometries: Path, views: Path, provenance: dict[str, Any]) -> Bank:
+    """All heads that have both a bake and views."""
+    heads = [path for path in sorted(geometries.glob("*.safetensors")) if (views / path.name).exists()]
+    if not heads:
+        raise InputError(f"{geometries}: no baked heads with views; let `facerf train` build them anew")
+    return Bank(
+        [_geometry(load_file(path)) for path in heads],
+        [load_file(views / path.name) for path in heads],
+        provenance,
+    )
+
+
+def _geometry(head: dict[str, Tensor]) -> Geometry:
+    side = head["visibility"].shape[-1]
+    positions = bake_attributes(head["vertices"], GRID, side)
+    normals = normal_map(head["vertices"], grid_triangles(), side)
+    along_u = F.normalize(_central_difference(positions, -1), dim=0)
+    along_v = F.normalize(_central_difference(positions, -2), dim=0)
+    return Geometry(
+        positions, normals, (along_u, along_v), head["directions"], head["visibility"], head["bounce"]
+    )
+
+
+def _central_difference(field: Tensor, dim: int) -> Tensor:
+    return torch.gradient(field, dim=dim)[0]

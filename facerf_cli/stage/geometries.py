@@ -1,0 +1,127 @@
+"""Synthetic heads with baked light transport: the geometry half of the training bank."""
+
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import save_file
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.topology import GRID, grid_triangles
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.transport import BakeSettings, bake_transport
+from facerf_cli.raster.texture import bake_attributes, normal_map
+
+_LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")  # no shape of skin, or correctives of another shape
+_COMMON = ("jawOpen", "mouthSmile")  # photographs show these more than the rest
+
+_BAKE = BakeSettings(lamp_samples=4, bounce_samples=16)
+
+
+@dataclass(frozen=True)
+class GeometrySettings:
+    """How heads are drawn and baked: `side` texels, `lights` in a rig that is turned anew for each head."""
+
+    side: int = 128
+    lights: int = 150
+    identity_std: float = 0.9
+    neutral_share: float = 0.35
+    bake: BakeSettings = _BAKE
+
+
+def build_geometries(
+    folder: Path,
+    face_model: str,
+    count: int,
+    jobs: int,
+    seed: int,
+    settings: GeometrySettings = GeometrySettings(),
+) -> None:
+    """Bake `count` heads into `folder`, 00000 (the mean) and on; finished ones are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [index for index in range(count) if not (folder / f"{index:05d}.safetensors").exists()]
+    shards = [missing[job::jobs] for job in range(jobs)]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for done in [
+            pool.submit(_build_shard, folder, face_model, shard, seed, settings) for shard in shards
+        ]:
+            done.result()
+
+
+def _build_shard(
+    folder: Path, face_model: str, indices: list[int], seed: int, settings: GeometrySettings
+) -> None:
+    torch.set_num_threads(1)
+    model = load_face_model(face_model)
+    for index in indices:
+        tensors = bake_head(model, index, seed, settings)
+        partial = folder / f"{index:05d}.partial"
+        save_file(tensors, partial, metadata={"face_model": model.name})
+        partial.rename(folder / f"{index:05d}.safetensors")
+
+
+def bake_head(model: MorphableModel, index: int, seed: int, settings: GeometrySettings) -> dict[str, Tensor]:
+    """One head: vertices [V, 3] (m, head frame), directions [L, 3], visibility and bounce [L, T, T] as bytes.
+
+    `bounce` is stored as the square root, times 255.
+    """
+    random = np.random.default_rng([seed, index])
+    alpha, beta = draw_coefficients(model, random, settings) if index else mean_coefficients(model)
+    vertices = model.vertices(alpha[None], beta[None])[0]
+    triangles = grid_triangles()
+    positions = bake_attributes(vertices, GRID, settings.side).permute(1, 2, 0).numpy()
+    normals = normal_map(vertices, triangles, settings.side).permute(1, 2, 0).numpy()
+    turn = Rotation.random(random_state=random).as_matrix() if index else np.eye(3)
+    directions = np.asarray(rig_directions(settings.lights)) @ turn.T
+    transport = bake_transport(
+        positions,
+        normals,
+        vertices.numpy(),
+        triangles.numpy(),
+        directions,
+        settings.bake,
+        int(random.integers(1 << 31)),
+    )
+    return {
+        "vertices": vertices.contiguous(),
+        "directions": torch.from_numpy(directions).float(),
+        "visibility": _bytes(transport.visibility),
+        "bounce": _bytes(np.sqrt(transport.bounce)),
+    }
+
+
+def _bytes(values: np.ndarray) -> Tensor:
+    return torch.from_numpy((np.clip(values, 0, 1) * 255).round().astype(np.uint8))
+
+
+def mean_coefficients(model: MorphableModel) -> tuple[Tensor, Tensor]:
+    """alpha [Ki] and beta [Ke] of the mean face."""
+    return torch.zeros(len(model.identity)), torch.zeros(len(model.expression))
+
+
+def draw_coefficients(
+    model: MorphableModel, random: np.random.Generator, settings: GeometrySettings
+) -> tuple[Tensor, Tensor]:
+    """A random person alpha [Ki], and an expression beta [Ke] of a few shapes, mostly alike on both sides."""
+    alpha = torch.from_numpy(random.normal(0, settings.identity_std, len(model.identity))).float()
+    beta = torch.zeros(len(model.expression))
+    if random.random() < settings.neutral_share:
+        return alpha, beta
+    stems = sorted({_stem(name) for name in model.expression_names if not name.startswith(_LEFT_OUT)})
+    chosen = list(random.choice(stems, random.integers(1, 4), replace=False))
+    chosen += [stem for stem in _COMMON if stem in stems and random.random() < 0.4]
+    for stem in chosen:
+        strength = random.uniform(0.2, 2.8) if stem != "jawOpen" else random.uniform(0.1, 1.6)
+        for index, name in enumerate(model.expression_names):
+            if _stem(name) == stem:
+                beta[index] = strength * random.uniform(0.7, 1.0)
+    return alpha, beta
+
+
+def _stem(name: str) -> str:
+    return name.removesuffix("_L").removesuffix("_R")

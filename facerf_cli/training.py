@@ -1,0 +1,177 @@
+"""Training of the Reflectance Network on the synthetic bank, top to bottom."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import FacerfError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.checkpoints import load_checkpoint, save_checkpoint
+from facerf_cli.files.images import write_display
+from facerf_cli.network.losses import root_loss, si_mse
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.stage.bank import Bank
+from facerf_cli.stage.samples import Sample, draw_sample
+
+DEFAULT_NETWORK = ReflectanceSettings()
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """The `default` preset: AdamW under a cosine schedule, and a running average of the weights."""
+
+    batch: int = 4
+    lights: int = 4
+    learning_rate: float = 1.5e-3
+    warmup_steps: int = 150
+    weight_decay: float = 1e-4
+    gradient_clip: float = 1.0
+    ema_decay: float = 0.998
+    max_seconds: float = 3600.0
+    validate_every: int = 500
+    held_out_heads: int = 12
+    bf16: bool = True
+    seed: int = 0
+
+
+def train(
+    bank: Bank,
+    folder: Path,
+    settings: TrainSettings = TrainSettings(),
+    network_settings: ReflectanceSettings = DEFAULT_NETWORK,
+    start_from: Path | None = None,
+    report: Callable[[dict[str, float]], None] = lambda row: None,
+) -> Path:
+    """Train on `bank` until the time is up; returns the checkpoint, `folder/last.safetensors`.
+
+    `start_from` is a checkpoint whose weights to begin with. Rows go to `report` and `folder/log.jsonl`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(settings.seed)
+    generator = torch.Generator().manual_seed(settings.seed)
+    network = ReflectanceNetwork(network_settings)
+    if start_from:
+        network.load_state_dict(load_checkpoint(start_from)[0])
+    network.set_mean_face(*bank.mean_face())
+    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
+    optimizer = torch.optim.AdamW(
+        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.98)
+    )
+    train_heads = torch.arange(settings.held_out_heads + 1, len(bank.geometries))
+    held_out = _held_out_samples(bank, settings)
+    begin, step, drawing = time.monotonic(), 0, 0.0
+    with (folder / "log.jsonl").open("a") as log:
+        while (elapsed := time.monotonic() - begin) < settings.max_seconds:
+            _set_rate(optimizer, settings, step, elapsed)
+            drawn_at = time.monotonic()
+            heads = train_heads[torch.randint(len(train_heads), (settings.batch,), generator=generator)]
+            sample = draw_sample(bank, heads, settings.lights, generator)
+            drawing += time.monotonic() - drawn_at
+            loss = _loss(network, sample, settings.bf16)
+            if not loss.isfinite():
+                where = f"step {step} (heads {heads.tolist()})"
+                raise FacerfError(f"the loss is not finite at {where}; {folder}/last.safetensors is good")
+            optimizer.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_clip)
+            optimizer.step()
+            step += 1
+            _update_average(average, network, min(settings.ema_decay, step / (step + 10)))
+            row = {
+                "step": step,
+                "seconds": elapsed,
+                "loss": float(loss.detach()),
+                "drawing": drawing / (elapsed + 1e-6),
+            }
+            if step % settings.validate_every == 0:
+                row["si_mse"] = _validate(average, network_settings, held_out, folder / "validation.png")
+                _save(folder / "last.safetensors", average, network_settings, settings, bank, row)
+            log.write(json.dumps(row) + "\n")
+            log.flush()
+            report(row)
+    row = {"step": step, "seconds": time.monotonic() - begin}
+    row["si_mse"] = _validate(average, network_settings, held_out, folder / "validation.png")
+    return _save(folder / "last.safetensors", average, network_settings, settings, bank, row)
+
+
+def _set_rate(optimizer: torch.optim.Optimizer, settings: TrainSettings, step: int, elapsed: float) -> None:
+    """Linear warm-up, then a half cosine over the allotted time down to 2 %."""
+    warm = min(1.0, (step + 1) / settings.warmup_steps)
+    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, elapsed / settings.max_seconds)))
+    for group in optimizer.param_groups:
+        group["lr"] = settings.learning_rate * warm * (0.02 + 0.98 * cosine)
+
+
+def _loss(network: ReflectanceNetwork, sample: Sample, bf16: bool) -> Tensor:
+    with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        encoded = network.encode(sample.source, sample.normals_source, sample.visible)
+        root = network.decode_root(encoded, sample.normals_target, sample.lights)
+    # The network divides by its own measure of exposure, which the fill of unseen texels does not enter.
+    return root_loss(root.float(), sample.target / encoded.exposure[:, None], sample.weight)
+
+
+@torch.no_grad()
+def _update_average(average: dict[str, Tensor], network: ReflectanceNetwork, decay: float) -> None:
+    for name, tensor in network.state_dict().items():
+        if tensor.is_floating_point():
+            average[name].lerp_(tensor, 1 - decay)
+
+
+def _held_out_samples(bank: Bank, settings: TrainSettings) -> list[Sample]:
+    generator = torch.Generator().manual_seed(12345)
+    heads = torch.arange(1, settings.held_out_heads + 1)
+    return [draw_sample(bank, chunk, 6, generator) for chunk in heads.view(-1, 4) for _ in range(4)]
+
+
+@torch.no_grad()
+def _validate(
+    weights: dict[str, Tensor], network_settings: ReflectanceSettings, samples: list[Sample], sheet: Path
+) -> float:
+    """Mean Si-MSE of held-out heads, and a contact sheet: source, then truth over prediction a light."""
+    network = ReflectanceNetwork(network_settings)
+    network.load_state_dict(weights)
+    errors, rows = [], []
+    for sample in samples:
+        encoded = network.encode(sample.source, sample.normals_source, sample.visible)
+        predicted = network.decode(encoded, sample.normals_target, sample.lights)
+        errors.append(si_mse(predicted, sample.target, sample.weight).mean())
+        rows.append(_sheet_row(sample, predicted))
+    write_display(sheet, np.concatenate(rows[:5]), exposure=1.0)
+    return float(torch.stack(errors).mean())
+
+
+def _sheet_row(sample: Sample, predicted: Tensor) -> np.ndarray:
+    """Two rows of pictures [2T, (L + 1) T, 3] of a sample's first face."""
+    mask = (sample.weight[0] > 0).float()
+    truth = torch.cat([sample.source[0], *(sample.target[0] * mask)], -1)
+    guess = torch.cat([sample.source[0] * sample.visible[0], *(predicted[0] * mask)], -1)
+    picture: np.ndarray = torch.cat([truth, guess], -2).permute(1, 2, 0).numpy()
+    return picture
+
+
+def _save(
+    path: Path,
+    weights: dict[str, Tensor],
+    network_settings: ReflectanceSettings,
+    settings: TrainSettings,
+    bank: Bank,
+    row: dict[str, float],
+) -> Path:
+    metadata: dict[str, Any] = {
+        "network": network_settings.as_dict(),
+        "layout_version": LAYOUT_VERSION,
+        "provenance": bank.provenance,
+        "training": asdict(settings),
+        "metrics": row,
+    }
+    save_checkpoint(path, weights, metadata)
+    return path
