@@ -24,6 +24,7 @@ _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 # Cone responses of XYZ after Bradford (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _ADOBE_GAMMA = 563 / 256
+_BLOCK_VALUES = 2**18
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # where that percentile of the luminance is put
@@ -126,11 +127,20 @@ def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
     """Values [H, W, 3] in `space` as scene-linear Rec.709; nothing is clipped, so wide gamuts go negative."""
     if space.chromaticities is None:
         return _convert_by_ocio(pixels, space.name)
-    linear = pixels if space.decode is None else space.decode(pixels)
+    linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
     matrix = matrix_to_rec709(space.chromaticities)
     if np.allclose(matrix, np.eye(3), atol=1e-6):
         return linear.astype(np.float32, copy=False)
     return linear @ matrix.T.astype(np.float32)
+
+
+def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
+    """A curve over [H, W, C], some rows at a time: in the processor's cache it is several times faster."""
+    rows = max(1, _BLOCK_VALUES // max(1, pixels[0].size))
+    result = np.empty(pixels.shape, np.float32)
+    for start in range(0, len(pixels), rows):
+        result[start : start + rows] = curve(pixels[start : start + rows])
+    return result
 
 
 def _convert_by_ocio(pixels: np.ndarray, name: str) -> np.ndarray:

@@ -6,7 +6,6 @@ imports torch, OpenImageIO, scipy, trimesh and the rooms that use them inside it
 its top. `facerf --help` stays quick that way, and a test holds it.
 """
 
-import errno
 import logging
 import os
 import signal
@@ -98,11 +97,13 @@ def main(arguments: Sequence[str]) -> int:
         return _fail(error, str(error), 2)
     except FacerfError as error:
         return _fail(error, str(error), 1)
+    except BrokenPipeError:
+        return _end_quietly()
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # typer makes an exit of it
+            return _end_quietly()
+        raise
     except OSError as error:
-        if error.errno == errno.EPIPE:
-            # The reader of our stdout has gone; point it elsewhere so that Python's own flush stays quiet.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 128 + signal.SIGPIPE
         return _fail(error, f"{error.filename or 'system'}: {error.strerror or error}", 1)
     except typer.Abort:
         return _fail(None, "aborted", 1)
@@ -127,6 +128,12 @@ def global_options_first(arguments: Sequence[str]) -> list[str]:
         else:
             kept.append(argument)
     return moved + kept
+
+
+def _end_quietly() -> int:
+    """The reader of our stdout has gone: point it elsewhere, so that Python's last flush stays quiet."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
+    return 128 + signal.SIGPIPE
 
 
 def _see_help(error: Any) -> str:

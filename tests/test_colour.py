@@ -85,6 +85,11 @@ def test_spelling_does_not_matter() -> None:
     assert ours.named_space("DISPLAY-P3") is ours.DISPLAY_P3 and ours.named_space("rec 2020") is ours.REC2020
 
 
+def test_blocks_make_no_seams() -> None:
+    tall = np.random.default_rng(2).random((700, 500, 3)).astype(np.float32)
+    np.testing.assert_array_equal(ours.in_blocks(ours.srgb_to_linear, tall), ours.srgb_to_linear(tall))
+
+
 def test_an_unknown_name_lists_near_ones() -> None:
     with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(near names: ACEScg"):
         ours.named_space("ACEScgg")

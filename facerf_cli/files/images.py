@@ -19,6 +19,7 @@ from facerf_cli.colour import (
     ColourSpace,
     auto_exposure_ev,
     find_space,
+    in_blocks,
     linear_to_srgb,
     matrix_to_rec709,
     named_space,
@@ -261,10 +262,9 @@ def write_display(
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
-    linear = pixels * np.float32(2.0**chosen_ev)
-    if alpha is not None and jpeg:
-        linear = linear * alpha[..., None]
-    data = linear_to_srgb(np.clip(np.nan_to_num(linear), 0, 1))
+    linear = pixels * alpha[..., None] if alpha is not None and jpeg else pixels
+    gain = np.float32(2.0**chosen_ev)
+    data = in_blocks(lambda block: linear_to_srgb(np.clip(np.nan_to_num(block) * gain, 0, 1)), linear)
     if alpha is not None and not jpeg:
         data = np.concatenate([data, alpha[..., None].astype(np.float32)], -1)
     spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], "uint8")

@@ -139,6 +139,10 @@ def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: P
     assert run([photos], out) == 0
     assert (out / "a_copy.bin").read_bytes() == b"mine"
     assert rows(out)["x/a.png"] == before["x/a.png"] and rows(out)["b"]["status"] == "done"
+    assert len((out / "report.jsonl").read_text().splitlines()) == 5  # the older row of b is gone
+    (out / "report.jsonl").unlink()
+    assert run([photos], out) == 0
+    assert [row["status"] for row in rows(out).values()] == ["skipped"] * 5
     assert run([photos], out, overwrite=True) == 0
     assert (out / "a_copy.bin").read_bytes() == b"a.png"
 

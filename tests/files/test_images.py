@@ -286,6 +286,7 @@ def test_exr_round_trip_with_layers_and_provenance(tmp_path: Path) -> None:
     assert set(names) == {*"RGBA", *xyz, "uv.U", "uv.V", "id"}
     planes = stored.get_pixels(oiio.FLOAT)
     np.testing.assert_array_equal(planes[..., names.index("position.Z")], layers["position"][..., 2])
+    np.testing.assert_array_equal(planes[..., names.index("uv.V")], layers["uv"][..., 1])
     np.testing.assert_allclose(planes[..., names.index("normal.Y")], layers["normal"][..., 1], atol=1e-3)
     assert not list(path.parent.glob(".*"))
 
