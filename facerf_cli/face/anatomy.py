@@ -3,8 +3,8 @@
 The neutral is a height field over the chart's cylinder: distance from the vertical axis at azimuth and
 height. A table of section depths gives head, cheeks and jaw without their features; nose, eyes and mouth are
 laid on it by their own few measures; at last the surface is pulled onto the 68 landmarks of `LANDMARKS_M`.
-Only the picture's left half is built, then mirrored. Depths were measured on the ICT-FaceKit mean face and rounded
-to half a millimetre; none of its vertices are in here.
+Only the picture's left half is built, then mirrored. Depths were measured on the ICT-FaceKit mean face and
+rounded to half a millimetre; none of its vertices are in here.
 """
 
 import numpy as np

@@ -99,6 +99,11 @@ def test_identities_neither_move_nor_turn_the_head(model):
     assert shift_mm < 0.3 and turn_deg < 0.1
 
 
+def test_people_are_mostly_symmetric(model):
+    lopsided = torch.stack([mode - mirrored(mode) for mode in model.identity]) / 2
+    assert 1e-3 < lopsided.square().sum() / model.identity.square().sum() < 0.05
+
+
 @pytest.mark.parametrize(
     "name, ends, low_mm, high_mm",
     [
@@ -125,6 +130,13 @@ def test_people_do_not_fold(model):
     normal = triangle_normals(model.mean)
     turned = (torch.stack([triangle_normals(face) for face in faces]) * normal).sum(-1)
     assert (turned < 0).float().mean() < 2e-4
+
+
+def test_expressions_fold_nothing_but_the_lids(model):
+    normal = triangle_normals(model.mean)
+    for name in model.expression_names:
+        turned = (triangle_normals(expressed(model, name)) * normal).sum(-1) < 0
+        assert turned.sum() <= (60 if name.startswith("eye_close") else 4), name
 
 
 def triangle_normals(vertices: torch.Tensor) -> torch.Tensor:
