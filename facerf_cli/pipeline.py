@@ -14,7 +14,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.face.fit import FaceFit, fit_landmarks
+from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
 from facerf_cli.files.checkpoints import load_checkpoint
@@ -39,9 +39,9 @@ class Models:
 
 @dataclass(frozen=True)
 class FaceTexture:
-    """A photo in the chart: linear texture [3, T, T], unseen texels filled; visible [T, T]; normals [3, T, T].
+    """A photo in the chart: texture [3, T, T], unseen texels filled; visible [T, T]; normals [3, T, T].
 
-    `visible` is in 0..1, normals are unit vectors in camera space.
+    The texture is scene-linear, `visible` in 0..1, normals are unit vectors in camera space.
     """
 
     texture: Tensor
@@ -79,14 +79,17 @@ def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tupl
     return crop, crop.apply(photo)
 
 
-def fit_face(models: Models, crop: Crop, landmarks_px: np.ndarray) -> FaceFit:
-    """Fit the face model to landmarks [68, 2] in photo pixels."""
-    return fit_landmarks(models.face, landmarks_px, crop)
+def fit_face(
+    model: MorphableModel, crop: Crop, landmarks_px: np.ndarray, photo_shape: tuple[int, ...]
+) -> FaceFit:
+    """Fit the face model to landmarks [68, 2] in the pixels of a photo [H, W, ...]."""
+    in_crop = crop.to_crop(landmarks_px)
+    return fit_landmarks(model, in_crop, crop, trust=trust_inside(in_crop, crop, *photo_shape[:2]))
 
 
-def unwrap_face(models: Models, fit: FaceFit, cropped: np.ndarray, texture_side: int) -> FaceTexture:
+def unwrap_face(model: MorphableModel, fit: FaceFit, cropped: np.ndarray, texture_side: int) -> FaceTexture:
     """Unwrap the crop [S, S, 3] into the chart (paper, 'Network Architecture': T_s and N_s)."""
-    vertices = fit.vertices_camera(models.face)
+    vertices = fit.vertices_camera(model)
     picture = torch.from_numpy(cropped).permute(2, 0, 1)
     texture, visible = unwrap(picture, vertices, grid_triangles(), fit.camera, texture_side)
     if visible.max() < 0.5:

@@ -1,0 +1,65 @@
+"""Values that verbs read from options: poses, directions of light, sizes of textures. Wrong ones exit 2."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MOST_LIGHTS = 4096
+_LIGHTS_FILE_LIMIT_BYTES = 1 << 20
+_DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
+
+
+def numbers(text: str, counts: tuple[int, ...], option: str) -> list[float]:
+    """Finite numbers separated by commas, as many as one of `counts`."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(map(math.isfinite, values)):
+        wanted = " or ".join(map(str, counts))
+        raise UsageError(f"{option} {text!r}: {wanted} numbers with commas between them are needed")
+    return values
+
+
+def parse_pose(text: str | None) -> "Tensor | None":
+    """`YAW,PITCH,ROLL` in degrees as head_to_camera [3, 3]; None stays None (the photo's own pose)."""
+    from facerf_cli.raster.camera import pose_to_rotation
+
+    if text is None:
+        return None
+    return pose_to_rotation(*numbers(text, (3,), "--pose"))
+
+
+def parse_directions(text: str) -> "Tensor":
+    """`--lights`: unit directions [L, 3] of a rig of N, of 'az,el;az,el', or of a file of such lines."""
+    import torch
+
+    from facerf_cli.light.sphere import azel_to_direction, rig_directions
+
+    if text.isdecimal():
+        if not 1 <= int(text) <= MOST_LIGHTS:
+            raise UsageError(f"--lights {text}: from 1 to {MOST_LIGHTS} lights can be had")
+        return rig_directions(int(text))
+    pairs = _lines(Path(text)) if Path(text).is_file() else [part for part in text.split(";") if part.strip()]
+    if not pairs or "," not in pairs[0]:
+        raise UsageError(f"--lights {text!r}: {_DIRECTIONS_HELP}")
+    if len(pairs) > MOST_LIGHTS:
+        raise UsageError(f"--lights: {len(pairs)} lights; at most {MOST_LIGHTS} can be had")
+    azimuth, elevation = torch.tensor([numbers(pair, (2,), "--lights") for pair in pairs]).T
+    return azel_to_direction(azimuth, elevation)
+
+
+def _lines(path: Path) -> list[str]:
+    """The lines of a text file that are neither empty nor comments."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            text = stream.read(_LIGHTS_FILE_LIMIT_BYTES)
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--lights {path}: cannot be read as text ({error})") from None
+    lines = (line.partition("#")[0].strip() for line in text.splitlines())
+    return [",".join(line.replace(",", " ").split()) for line in lines if line]
