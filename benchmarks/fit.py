@@ -22,7 +22,7 @@ import torch
 
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, FitSettings, fit_batch, fit_landmarks, trust_inside
-from facerf_cli.face.landmarks import detect_landmarks, to_display
+from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.images import read_image
@@ -50,8 +50,9 @@ def look_at(name: str, image: np.ndarray) -> Photo:
     faces = detect_landmarks(np.ascontiguousarray(image))
     if not faces:
         raise SystemExit(f"{name}: no face found")
-    crop = from_landmarks(faces[0].landmarks_px, CROP_PX)
-    landmarks_px = crop.to_crop(faces[0].landmarks_px)
+    (face,) = choose_face(faces, "largest", name)
+    crop = from_landmarks(face.landmarks_px, CROP_PX)
+    landmarks_px = crop.to_crop(face.landmarks_px)
     return Photo(name, image, crop, landmarks_px, trust_inside(landmarks_px, crop, *image.shape[:2]))
 
 

@@ -197,3 +197,6 @@ def test_a_smile_is_followed(model):
     crop = from_landmarks(face.landmarks_px, 256)
     fit = fit_landmarks(model, crop.to_crop(face.landmarks_px), crop)
     assert fit.error_iod <= 0.045
+    assert np.linalg.norm(face.landmarks_px[30] - [222, 133]) < 15  # the nose, not the badge on her arm
+    smile = [fit.beta[i] for i, name in enumerate(model.expression_names) if name.startswith("smile")]
+    assert min(smile) > 0.5
