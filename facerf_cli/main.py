@@ -19,11 +19,12 @@ import typer
 from facerf_cli import __version__
 from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.options import DeviceName, Settings
+from facerf_cli.commands.relight import relight
 from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (train, doctor)
+VERBS: tuple[Callable[..., Any], ...] = (relight, train, doctor)
 GROUPS: dict[str, typer.Typer] = {}  # verbs that have verbs of their own
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
@@ -31,6 +32,8 @@ HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 # Global options by how they are written; these are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})
 VALUED = frozenset({"--device", "--checkpoint", "--seed"})
+# Options that take every file of these kinds that follows them, so that a shell may expand a pattern there.
+SEVERAL = {"--envmap": (".exr", ".hdr")}
 
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(
@@ -88,7 +91,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run one command line and give its exit code; whatever goes wrong becomes one line on stderr."""
     configure_logging()
     try:
-        line = global_options_first(arguments or ["--help"])
+        line = repeat_options(global_options_first(arguments or ["--help"]))
         code = app(args=line, prog_name="facerf", standalone_mode=False)
         sys.stdout.flush()
         if code == 130:  # typer makes an exit code of Ctrl-C
@@ -135,6 +138,23 @@ def _end_quietly() -> int:
     """The reader of our stdout has gone: point it elsewhere, so that Python's last flush stays quiet."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
     return 128 + signal.SIGPIPE
+
+
+def repeat_options(arguments: Sequence[str]) -> list[str]:
+    """`--envmap a.exr b.exr` as `--envmap a.exr --envmap b.exr`: what a pattern in a shell becomes."""
+    line: list[str] = []
+    option, value_next = None, False
+    for argument in arguments:
+        if argument in SEVERAL:
+            option, value_next = argument, True
+        elif value_next:
+            value_next = False
+        elif option and argument.lower().endswith(SEVERAL[option]):
+            line.append(option)
+        else:
+            option = None
+        line.append(argument)
+    return line
 
 
 def _see_help(error: Any) -> str:

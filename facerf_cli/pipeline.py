@@ -3,7 +3,7 @@
 photo -> crop_face -> fit_face -> unwrap_face -> predict_olat -> weigh -> render_face -> picture
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,18 @@ def weigh(olats: Tensor, weights: Tensor) -> Tensor:
     """Sum of OLATs [L, 3, ...] with rgb weights [M, L, 3]: M pictures [M, 3, ...] (paper, 'Relighting')."""
     flat = torch.einsum("mlc,lcn->mcn", weights, olats.flatten(2))
     return flat.view(*flat.shape[:2], *olats.shape[2:])
+
+
+def weigh_batches(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
+    """`weigh` of OLATs [L, 3, T, T] that come in batches, so that they are never all held: [M, 3, T, T].
+
+    Pictures are weighed as textures and rendered after, for a render costs more than a texture's product.
+    """
+    total, done = torch.zeros(()), 0
+    for olats in batches:
+        total = total + weigh(olats, weights[:, done : done + len(olats)])
+        done += len(olats)
+    return total
 
 
 def turned(fit: FaceFit, rotation: Tensor) -> tuple[Tensor, Tensor]:

@@ -38,7 +38,8 @@ class CompositeSettings:
     dark: float = 0.08  # e above, in mean luminances of the source
     feather: float = 0.04  # of the mask's border, inward
     spread: float = 0.04  # standard deviation of the blur of the change of light around the face
-    most: float = 6.0  # hair and background change at most this much more, or less, than the face's mean
+    reach: float = 0.35  # of that change, beyond the face; further off all follows the mean change
+    most: float = 12.0  # hair and background change at most this much more, or less, than the face's mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,8 @@ def change_of_light(
     own = torch.stack([region_mask(name, source.shape[-1]) for name in _OWN_REGIONS]).amax(0)
     trusted = seen * (1 - own)
     gain, offset = _gain_and_offset(source, relit, trusted, settings.dark)
-    around, _ = _gain_and_offset(inpaint(source, trusted), inpaint(relit, trusted), trusted, settings.dark)
+    floor = settings.dark * (source * trusted).sum() / (3 * trusted.sum().clamp(min=_TINY)) + _TINY
+    around = inpaint(relit, trusted) / inpaint(source, trusted).clamp(min=float(floor))
     return torch.lerp(gain, around, own), offset * (1 - own)
 
 
@@ -173,7 +175,7 @@ def composite(
 class Surround:
     """How hair, neck and background follow: the face's change of light, spread outward and blurred.
 
-    Far from the face it becomes the mean change.
+    With distance it becomes the mean change.
     """
 
     def __init__(
@@ -189,7 +191,8 @@ class Surround:
         self._camera = Camera(4.0 * _SURROUND_PX, side, side, side / 2, side / 2)
         self._view = view_face(vertices_camera, self._camera, _SURROUND_PX, settings)
         self._mask = torch.from_numpy(self._view.full(self._view.mask))
-        self._near = self._nearness(side)
+        away_px = torch.from_numpy(distance_transform_edt((self._mask < 0.5).numpy())).float()
+        self._near = 1 - _smooth(away_px / (settings.reach * _SURROUND_PX))
         self._grid = self._photo_grid(crop, height_px, width_px)
 
     def gain(self, source: Tensor, relit: Tensor) -> np.ndarray:
@@ -209,13 +212,6 @@ class Surround:
             field[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
         )
         return spread[0].permute(1, 2, 0).clamp(min=0).numpy()
-
-    @staticmethod
-    def _nearness(side: int) -> Tensor:
-        """1 about the crop, falling to 0 inside the square's border [side, side]."""
-        axis = (torch.arange(side) + 0.5) / _SURROUND_PX - _SURROUND / 2  # in crops, from its centre
-        distance = torch.hypot(axis[:, None], axis[None, :])
-        return 1 - _smooth((distance - 0.6) / (_SURROUND / 2 - 0.7))
 
     @staticmethod
     def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:

@@ -1,0 +1,97 @@
+"""Where relit textures become files: the photo with its face relit, or the face alone."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from facerf_cli.errors import InputError
+from facerf_cli.records import LOGGER_NAME
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from facerf_cli.face.crop import Crop
+    from facerf_cli.files.images import Picture
+    from facerf_cli.pipeline import FaceTexture
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True, eq=False)
+class Backdrop:
+    """The photo [H, W, 3] that a face goes back into, and how."""
+
+    picture: "Picture"
+    surround: bool  # hair and background follow the light
+    matte: "np.ndarray | None"  # [H, W], what the light may change
+
+
+class Canvas:
+    """One face seen by one camera; writes a picture a relit texture.
+
+    With a `backdrop` the picture is the photo with its face relit, else the rendered face with its alpha.
+    """
+
+    def __init__(
+        self,
+        vertices_camera: "Tensor",
+        crop: "Crop",
+        size_px: tuple[int, int],
+        face: "FaceTexture",
+        backdrop: Backdrop | None,
+    ) -> None:
+        from facerf_cli.face.composite import Surround, photo_camera, view_face
+
+        self._face, self._backdrop = face, backdrop
+        self._view = view_face(vertices_camera, photo_camera(crop, *size_px), crop.side_px)
+        follow = backdrop is not None and backdrop.surround
+        self._surround = Surround(vertices_camera, crop, *size_px) if follow else None
+        view = self._view
+        self._mask = view.full(view.mask)
+        places = {"normal": view.normal, "position": view.position_m, "uv": view.uv}
+        self._layers: dict[str, np.ndarray] = {name: view.full(values) for name, values in places.items()}
+
+    def write(self, path: Path, relit: "Tensor", exposure_ev: float, metadata: Mapping[str, Any]) -> None:
+        """Write a relit texture [3, T, T] as an EXR of absolute light and a PNG at an exposure beside it."""
+        from facerf_cli.files.images import write_display, write_exr
+
+        pixels, alpha = self._picture(relit)
+        layers = self._layers if self._backdrop is None else {"face.A": self._mask, **self._layers}
+        write_display(path.with_suffix(".png"), pixels, exposure_ev, alpha, metadata)
+        write_exr(path, pixels, alpha, layers, {"facerf:exposure_ev": exposure_ev, **metadata})
+        log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)
+
+    def _picture(self, relit: "Tensor") -> "tuple[np.ndarray, np.ndarray | None]":
+        """Colour [H, W, 3], not multiplied by the alpha [H, W] beside it."""
+        from facerf_cli.face.composite import composite
+
+        if self._backdrop is None:
+            return self._view.full(self._view.render(relit)), self._mask
+        picture, face = self._backdrop.picture, self._face
+        pixels = composite(
+            picture.pixels,
+            face.texture,
+            relit,
+            face.visible,
+            self._view,
+            self._surround,
+            self._backdrop.matte,
+        )
+        return pixels, picture.alpha
+
+
+def read_matte(path: Path, size_px: tuple[int, int]) -> "np.ndarray":
+    """A matte [H, W] in 0..1 of a photo of that size: the file's alpha, or its values as they stand."""
+    from facerf_cli.files.images import read_image
+
+    picture = read_image(path, "linear")
+    matte = picture.pixels.mean(-1) if picture.alpha is None else picture.alpha
+    if matte.shape != size_px:
+        height, width = matte.shape
+        raise InputError(
+            f"{path}: the matte is {width} x {height}, the photo {size_px[1]} x {size_px[0]} pixels"
+        )
+    return matte.clip(0, 1)
