@@ -12,37 +12,43 @@ from pathlib import Path
 
 import numpy as np
 
+from facerf_cli.face.crop import Crop, from_landmarks
+from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
 
 HERE = Path(__file__).parent
 LIGHTS = ("-75,0", "-35,25", "50,20", "0,60")
+CELL_PX, MARGIN = 360, 0.22  # the margin in sides of the face's crop
 
 
 def sheet(photo: Path, maps: Path) -> np.ndarray:
-    """The sheet [H, W, 3], linear."""
+    """The sheet [2 cells, 5 cells, 3], linear."""
+    names = sorted(path.stem for path in maps.iterdir())[:4]
+    shots = [*names, *(f"light_{light.replace(',', '_')}" for light in LIGHTS)]
+    original = read_image(photo).pixels
+    frame = head(original, photo)
     with tempfile.TemporaryDirectory() as folder:
         lights = [part for light in LIGHTS for part in ("--light", light)]
-        line = ["relight", str(photo), "--envmap", str(maps), "--ball", "-o", folder, *lights]
-        if main(line):
+        if main(["-q", "relight", str(photo), "--envmap", str(maps), "--ball", "-o", folder, *lights]):
             raise SystemExit(1)
-        names = sorted(path.stem for path in maps.iterdir())[:4]
-        lit = [f"{photo.stem}_{name}.png" for name in names]
-        lit += [f"{photo.stem}_light_{light.replace(',', '_')}.png" for light in LIGHTS]
-        pictures = [read_image(Path(folder, name)).pixels for name in lit]
+        lit = [frame.apply(read_image(Path(folder, f"{photo.stem}_{shot}.png")).pixels) for shot in shots]
         balls = [read_image(Path(folder, "balls", f"{name}.png")).pixels for name in names]
-    mirrors = [ball[:, : ball.shape[1] // 2] for ball in balls]
-    grid = np.concatenate([np.concatenate(mirrors[:2], 1), np.concatenate(mirrors[2:], 1)])
-    cell = np.zeros_like(pictures[0])
-    grid = grid[: cell.shape[0], : cell.shape[1]]
-    cell[: grid.shape[0], : grid.shape[1]] = grid
-    rows = [read_image(photo).pixels, *pictures[:4]], [cell, *pictures[4:]]
+    half = [Crop(0, 0, ball.shape[0], CELL_PX // 2).apply(ball) for ball in balls]  # of a pair the mirror
+    grid = np.concatenate([np.concatenate(half[:2], 1), np.concatenate(half[2:], 1)])
+    rows = [frame.apply(original), *lit[:4]], [grid, *lit[4:]]
     return np.concatenate([np.concatenate(row, 1) for row in rows])
+
+
+def head(photo: np.ndarray, path: Path) -> Crop:
+    """The square around the face, with room for hair."""
+    face = from_landmarks(find_faces(photo, str(path))[0].landmarks_px, CELL_PX)
+    room = MARGIN * face.side_px
+    return Crop(face.x0_px - room, face.y0_px - room, face.side_px + 2 * room, CELL_PX)
 
 
 if __name__ == "__main__":
     given = [Path(argument) for argument in sys.argv[1:]]
-    photo, maps, target = (
-        given + [HERE / "astronaut.jpg", HERE / "maps", HERE / "contact_sheet.jpg"][len(given) :]
-    )[:3]
+    defaults = [HERE / "astronaut.jpg", HERE / "maps", HERE / "contact_sheet.jpg"]
+    photo, maps, target = given + defaults[len(given) :]
     write_display(target, sheet(photo, maps))
