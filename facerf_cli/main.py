@@ -19,12 +19,13 @@ import typer
 from facerf_cli import __version__
 from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.options import DeviceName, Settings
+from facerf_cli.commands.predict_olat import predict_olat
 from facerf_cli.commands.relight import relight
 from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (relight, train, doctor)
+VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, train, doctor)
 GROUPS: dict[str, typer.Typer] = {}  # verbs that have verbs of their own
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."

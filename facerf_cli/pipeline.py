@@ -20,7 +20,8 @@ from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
 from facerf_cli.files.checkpoints import load_checkpoint
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.raster.camera import Camera
-from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 _BYTES_PER_LIGHT = 220 * 128 * 128 * 4  # of features that the decoder holds at once, at its working side
@@ -113,18 +114,16 @@ def predict_olat(
     `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s.
     """
     device, texels = models.device, face.texture.shape[-1] ** 2
-    batch = max(1, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels))
+    batch = int(max(1, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels)))
     normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
+    normals = normals[None].to(device)
+    source = (face.texture[None], face.normals[None], face.visible[None, None])
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        encoded = models.network.encode(
-            face.texture[None].to(device), face.normals[None].to(device), face.visible[None, None].to(device)
-        )
-        for chunk in torch.split(lights, int(batch)):
-            yield (
-                models.network.decode(encoded, normals[None].to(device), chunk[None].to(device))[0]
-                .float()
-                .cpu()
-            )
+        encoded = models.network.encode(*(tensor.to(device) for tensor in source))
+    for chunk in torch.split(lights, batch):
+        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):  # not around a yield: it would leak
+            olats = models.network.decode(encoded, normals, chunk[None].to(device))[0]
+        yield olats.float().cpu()
 
 
 def weigh(olats: Tensor, weights: Tensor) -> Tensor:
@@ -153,6 +152,13 @@ def turned(fit: FaceFit, rotation: Tensor) -> tuple[Tensor, Tensor]:
     return rotation @ fit.rotation.T, fit.translation_m
 
 
-def render_face(texture: Tensor, vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Picture [H, W, 3] and coverage [H, W] of a texture [3, T, T] on the fitted mesh."""
-    return render_texture(texture, vertices_camera, grid_triangles(), grid_uv(), camera)
+def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The (u, v) that each pixel of a picture sees [H, W, 2], and the face's coverage [H, W], 0 or 1."""
+    fragments = rasterize(vertices_camera, grid_triangles(), camera)
+    return interpolate(grid_uv(), grid_triangles(), fragments), fragments.covered.float()
+
+
+def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
+    """Pictures [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black beyond it."""
+    pictures = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
+    return pictures.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)

@@ -5,6 +5,7 @@ alone say little about identity and nothing about most of the surface, so the pr
 """
 
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,6 +37,7 @@ _IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])
 _BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _INVISIBLE_M = 1e-4  # a direction of shape that moves no landmark further at one deviation is left out
 _BORDER = 0.01  # of the crop's side: contour landmarks closer to the photo's border are guesses
+_LARGEST_CROP_PX = 8192
 _TENSORS = ("rotation", "translation_m", "alpha", "beta", "landmarks_px")
 
 
@@ -94,8 +96,12 @@ class FaceFit:
 
     def vertices_camera(self, model: MorphableModel) -> Tensor:
         """The mesh in camera space [V, 3]; `model` must be the one that was fitted."""
-        if model.name != self.model:
-            raise ValueError(f"the fit is of the model {self.model!r}, not {model.name!r}")
+        if (model.name, len(model.identity), len(model.expression)) != (
+            self.model,
+            len(self.alpha),
+            len(self.beta),
+        ):
+            raise ValueError(f"the fit is of the face model {self.model!r}, not of {model.name!r}")
         vertices = model.vertices(self.alpha[None], self.beta[None])[0]
         return vertices @ self.rotation.mT + self.translation_m
 
@@ -159,22 +165,37 @@ def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px:
     return trust
 
 
+def fit_to_arrays(fit: FaceFit) -> dict[str, np.ndarray]:
+    """A fit as plain arrays by name, for a file."""
+    tensors = {name: getattr(fit, name).numpy() for name in _TENSORS}
+    numbers = {"error_iod": fit.error_iod, **asdict(fit.crop)}
+    return {"model": np.array(fit.model), **{k: np.array(v) for k, v in numbers.items()}, **tensors}
+
+
+def fit_from_arrays(arrays: Mapping[str, np.ndarray]) -> FaceFit:
+    """The fit of arrays by `fit_to_arrays`; ValueError, TypeError or KeyError where they are none."""
+    tensors = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in _TENSORS}
+    for name, shape in (("rotation", (3, 3)), ("translation_m", (3,)), ("landmarks_px", (68, 2))):
+        if tensors[name].shape != shape:
+            raise ValueError(f"{name} has the shape {tuple(tensors[name].shape)}, not {shape}")
+    x0_px, y0_px, side_px, error_iod = (float(arrays[k]) for k in ("x0_px", "y0_px", "side_px", "error_iod"))
+    crop = Crop(x0_px, y0_px, side_px, int(arrays["size_px"]))
+    if not (0 < side_px < np.inf and 0 < crop.size_px <= _LARGEST_CROP_PX):
+        raise ValueError(f"a crop of {side_px} pixels seen as {crop.size_px}")
+    return FaceFit(str(arrays["model"]), crop, error_iod=error_iod, **tensors)
+
+
 def save_fit(path: Path, fit: FaceFit) -> None:
     """Write a fit as .npz without pickles."""
-    tensors = {name: getattr(fit, name).numpy() for name in _TENSORS}
     with path.open("wb") as file:
-        np.savez(file, model=fit.model, error_iod=fit.error_iod, **asdict(fit.crop), **tensors)
+        np.savez(file, **fit_to_arrays(fit))  # type: ignore[arg-type]
 
 
 def load_fit(path: Path) -> FaceFit:
     """Read a fit that `save_fit` wrote."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-        tensors = {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in _TENSORS}
-        x0_px, y0_px, side_px = (float(arrays[name]) for name in ("x0_px", "y0_px", "side_px"))
-        crop = Crop(x0_px, y0_px, side_px, int(arrays["size_px"]))
-        return FaceFit(str(arrays["model"]), crop, error_iod=float(arrays["error_iod"]), **tensors)
+            return fit_from_arrays({key: file[key] for key in file.files})
     except (ValueError, TypeError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a fit that facerf wrote ({error}); fit the photo again") from None
 

@@ -1,0 +1,230 @@
+"""OLAT stacks: one multi-part OpenEXR, half floats, a part a light; any program that reads EXR opens them.
+
+Part k is named `light000` and so on and says its light's direction (`facerf:direction`, a unit vector toward
+the light in camera space). A last part, `source`, holds what the lights were predicted from: the photo's
+texture (or its render), how well each pixel was seen, and normals in camera space. The first part's
+`facerf:olat` is JSON: the kind of stack, the head's rotation and the fit, so that a stack can be relit
+without its photo.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import OpenImageIO as oiio
+import torch
+from torch import Tensor
+
+from facerf_cli.colour import REC709_CHROMATICITIES
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.images import HALF_MAX, Attributes
+from facerf_cli.records import one_line
+
+FORMAT = "facerf-olat-1"
+COMPRESSION = "zip"  # of the lossless ones the smallest, and the quickest but for none at all
+STACK_LIMIT_BYTES = 16 << 30  # of half floats in memory
+_MOST_PARTS = 4097
+_MOST_HEADER_BYTES = 1 << 20
+_SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
+_HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
+
+
+@dataclass(frozen=True, eq=False)
+class StackHeader:
+    """All of a stack but its lights' pictures; H = W = T, the texture's side, where the kind is 'texture'."""
+
+    kind: Literal["texture", "image"]
+    directions: np.ndarray  # [L, 3] unit, toward the lights, camera space
+    rotation: np.ndarray  # [3, 3] head_to_camera that the lights were predicted for
+    source: np.ndarray  # [H, W, 3] linear: the unwrapped photo, or the face rendered from it
+    seen: np.ndarray  # [H, W] in 0..1: visible texels, or the face's coverage
+    normals: np.ndarray  # [H, W, 3] camera space, of the photo's pose in a texture, of `rotation` in an image
+    layout_version: int  # of the UV chart
+    fit: dict[str, np.ndarray]  # `face.fit.fit_to_arrays`
+    metadata: dict[str, Any] = field(default_factory=dict)  # provenance
+
+
+@dataclass(frozen=True, eq=False)
+class OlatStack:
+    """A stack in memory; olats [L, 3, H, W] float16, linear."""
+
+    header: StackHeader
+    olats: Tensor
+
+
+def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
+    """Write OLATs as they come, in batches [l, 3, H, W] in the order of the header's directions."""
+    specs = _specs(header)
+    pictures = (picture for batch in olats for picture in batch.permute(0, 2, 3, 1).cpu().numpy())
+    with atomic_path(path) as temporary:
+        stream = oiio.ImageOutput.create(str(temporary))
+        assert stream is not None, f"{path}: a stack is an .exr"
+        good = stream.open(str(temporary), tuple(specs))
+        for number, (picture, spec) in enumerate(zip(pictures, specs[:-1], strict=True)):
+            good = good and (number == 0 or stream.open(str(temporary), spec, "AppendSubimage"))
+            good = good and stream.write_image(_as_half(path, picture))
+        good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
+        source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
+        good = good and stream.write_image(_as_half(path, source))
+        complaint = stream.geterror()
+        if not (stream.close() and good):
+            raise FacerfError(f"{path}: cannot write: {one_line(complaint or stream.geterror())}")
+
+
+def is_olat_stack(path: Path) -> bool:
+    """Whether a file is an OLAT stack of ours; False for whatever cannot be opened."""
+    stream = oiio.ImageInput.open(str(path))
+    if stream is None:
+        oiio.geterror()  # or it prints its own words at exit
+        return False
+    found = bool(stream.spec().get_string_attribute(_HEADER))
+    stream.close()
+    return found
+
+
+def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
+    """Read a stack; counts and sizes are checked before any pixels are decoded."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    stream = oiio.ImageInput.open(str(path))
+    if stream is None:
+        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
+    try:
+        return _read_parts(path, stream, limit_bytes)
+    finally:
+        stream.geterror()
+        stream.close()
+
+
+def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
+    """The header of every part."""
+    height, width = header.seen.shape
+    attributes: Attributes = header.metadata
+    specs = []
+    for number, direction in enumerate(header.directions.tolist()):
+        spec = _part(width, height, f"light{number:03d}", ("R", "G", "B"), attributes)
+        spec.attribute(_DIRECTION, oiio.TypeDesc("vector"), tuple(direction))
+        spec.attribute("facerf:light", number)
+        specs.append(spec)
+    content = {
+        "format": FORMAT,
+        "kind": header.kind,
+        "lights": len(specs),
+        "layout_version": header.layout_version,
+        "rotation": header.rotation.tolist(),
+        "fit": {name: value.tolist() for name, value in header.fit.items()},
+    }
+    specs[0].attribute(_HEADER, json.dumps(content))
+    return [*specs, _part(width, height, "source", _SOURCE_CHANNELS, attributes)]
+
+
+def _part(
+    width: int, height: int, name: str, channels: tuple[str, ...], attributes: Attributes
+) -> oiio.ImageSpec:
+    spec = oiio.ImageSpec(width, height, len(channels), "half")
+    spec.channelnames = channels
+    spec.attribute("name", name)
+    spec.attribute("compression", COMPRESSION)
+    spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
+    for key, value in attributes.items():
+        spec.attribute(key, value)
+    return spec
+
+
+def _as_half(path: Path, picture: np.ndarray) -> np.ndarray:
+    if not np.isfinite(picture).all():
+        raise ValueError(f"{path}: some values are NaN or infinite")
+    return np.ascontiguousarray(picture.clip(-HALF_MAX, HALF_MAX), np.float16)
+
+
+def _read_parts(path: Path, stream: oiio.ImageInput, limit_bytes: int) -> OlatStack:
+    spec = stream.spec()
+    content = _header_of(path, spec)
+    height, width, lights = spec.height, spec.width, content["lights"]
+    if not 1 <= lights < _MOST_PARTS or 6 * lights * height * width > limit_bytes:
+        raise InputError(
+            f"{path}: {lights} lights of {width} x {height} pixels are more than can be read "
+            f"({limit_bytes >> 20} MiB)"
+        )
+    olats = np.empty((lights, height, width, 3), np.float16)
+    directions = np.empty((lights, 3))
+    for number in range(lights):
+        olats[number], part = _pixels(path, stream, number, ("R", "G", "B"), (height, width))
+        directions[number] = _direction(path, part)
+    source, _ = _pixels(path, stream, lights, _SOURCE_CHANNELS, (height, width))
+    source = source.astype(np.float32)
+    header = StackHeader(
+        kind=content["kind"],
+        directions=directions,
+        rotation=content["rotation"],
+        source=source[..., :3],
+        seen=source[..., 3],
+        normals=source[..., 4:],
+        layout_version=content["layout_version"],
+        fit=content["fit"],
+        metadata={entry.name: entry.value for entry in spec.extra_attribs if _is_provenance(entry.name)},
+    )
+    return OlatStack(header, torch.from_numpy(olats).permute(0, 3, 1, 2))
+
+
+def _is_provenance(name: str) -> bool:
+    return name in ("Software", "IPTC:DigitalSourceType") or (
+        name.startswith("facerf:") and name not in (_HEADER, _DIRECTION, "facerf:light")
+    )
+
+
+def _header_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
+    """The first part's JSON, each entry of the type that it must have."""
+    text = spec.get_string_attribute(_HEADER)
+    if not text:
+        raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
+    try:
+        content = json.loads(text) if len(text) <= _MOST_HEADER_BYTES else {}
+        if content["format"] != FORMAT or content["kind"] not in ("texture", "image"):
+            raise ValueError(f"format {content['format']!r}, kind {content['kind']!r}")
+        rotation = np.array(content["rotation"], np.float64)
+        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
+            raise ValueError(f"rotation has the shape {rotation.shape}")
+        return {
+            "kind": content["kind"],
+            "lights": int(content["lights"]),
+            "layout_version": int(content["layout_version"]),
+            "rotation": rotation,
+            "fit": {name: np.array(value) for name, value in content["fit"].items()},
+        }
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: damaged OLAT stack, or by another version of facerf ({type(error).__name__}: {error})"
+        ) from None
+
+
+def _direction(path: Path, spec: oiio.ImageSpec) -> np.ndarray:
+    value = spec.getattribute(_DIRECTION)
+    direction = np.array(value if isinstance(value, tuple) else (), np.float64)
+    if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < 0.01:
+        raise InputError(f"{path}: a part of the OLAT stack has no direction of light; write the stack again")
+    return direction / np.linalg.norm(direction)
+
+
+def _pixels(
+    path: Path, stream: oiio.ImageInput, number: int, channels: tuple[str, ...], shape: tuple[int, int]
+) -> tuple[np.ndarray, oiio.ImageSpec]:
+    """The named channels [H, W, C] of a part, and its header."""
+    if not stream.seek_subimage(number, 0):
+        raise InputError(f"{path}: damaged OLAT stack: part {number} is missing")
+    spec = stream.spec()
+    names = list(spec.channelnames)
+    if (spec.height, spec.width) != shape or not set(channels) <= set(names) or len(names) > 16:
+        raise InputError(f"{path}: damaged OLAT stack: part {number} has another size or other channels")
+    values = stream.read_image(number, 0, 0, spec.nchannels, oiio.HALF)
+    if values is None:
+        raise InputError(f"{path}: damaged or cut short: {one_line(stream.geterror())}")
+    values = values[..., [names.index(name) for name in channels]]
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: part {number} of the OLAT stack holds NaN or infinite values")
+    return values, spec
