@@ -169,6 +169,7 @@ def _save(
     metadata: dict[str, Any] = {
         "network": network_settings.as_dict(),
         "layout_version": LAYOUT_VERSION,
+        "licence": bank.provenance["licence"],
         "provenance": bank.provenance,
         "training": asdict(settings),
         "metrics": row,

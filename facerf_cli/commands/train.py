@@ -74,6 +74,7 @@ def _fill_bank(
         "heads": f"{heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
         "fitted_with": f"{fitted.name} ({fitted.licence})",
         "skin": "procedural (facerf)",
+        "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
     return load_bank(folder / "heads", folder / f"views-{fitted.name}", provenance)
 

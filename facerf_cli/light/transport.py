@@ -57,13 +57,12 @@ def bake_transport(
     """
     scene = build_scene(vertices, triangles)
     random = np.random.default_rng(seed)
-    side = positions.shape[0]
     flat_positions = positions.reshape(-1, 3).astype(np.float32)
     flat_normals = normals.reshape(-1, 3).astype(np.float32)
     visibility = _lamp_visibility(scene, flat_positions, flat_normals, directions, settings, random)
     direct = visibility * np.clip(directions.astype(np.float32) @ flat_normals.T, 0, None)  # [L, N]
     bounce = _one_bounce(scene, flat_positions, flat_normals, vertices[triangles], direct, settings, random)
-    shape = (len(directions), side, side)
+    shape = (len(directions), *positions.shape[:2])
     blur = settings.bounce_blur_texels
     smooth_bounce = gaussian_filter(bounce.reshape(shape), (0, blur, blur), mode="nearest")
     return Transport(directions, visibility.reshape(shape), smooth_bounce)
@@ -134,7 +133,7 @@ def _one_bounce(
         # A ray that reaches the shell's inner side has left through its open rim: no light comes back.
         front = np.einsum("nc,nc->n", rays[found], normals[texels]) < 0
         bounce[:, found[front]] += direct[:, texels[front]]
-    return bounce / settings.bounce_samples
+    return bounce / max(1, settings.bounce_samples)
 
 
 def _cosine_hemisphere(normals: np.ndarray, random: np.random.Generator) -> np.ndarray:

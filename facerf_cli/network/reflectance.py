@@ -27,6 +27,7 @@ class ReflectanceSettings:
     encoder_widths: tuple[int, ...] = (32, 64, 128, 192, 224, 256)
     decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
     template_channels: int = 8
+    rig_lights: int = 150  # whose shadows on the mean face it holds
 
     def as_dict(self) -> dict[str, object]:
         """For a checkpoint's metadata."""
@@ -49,10 +50,10 @@ class ReflectanceNetwork(nn.Module):
     mean_visibility: Tensor
     rig: Tensor
 
-    def __init__(self, settings: ReflectanceSettings = ReflectanceSettings(), rig_lights: int = 150) -> None:
+    def __init__(self, settings: ReflectanceSettings = ReflectanceSettings()) -> None:
         super().__init__()
         self.settings = settings
-        enc, dec = settings.encoder_widths, settings.decoder_widths
+        enc, dec, rig_lights = settings.encoder_widths, settings.decoder_widths, settings.rig_lights
         self.template = nn.Parameter(0.1 * torch.randn(settings.template_channels, 32, 32))
         widths = (7 + settings.template_channels, *enc)
         self.down = nn.ModuleList(
@@ -77,6 +78,10 @@ class ReflectanceNetwork(nn.Module):
 
     def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
         """Hold the mean face (head frame): normals [3, T, T], visibility [L, T, T], directions [L, 3]."""
+        if len(directions) != len(self.rig):
+            raise ValueError(
+                f"the network holds the shadows of {len(self.rig)} lights, not of {len(directions)}"
+            )
         size = (_MAP_SIDE, _MAP_SIDE)
         self.mean_normals.copy_(F.normalize(F.interpolate(normals[None], size, mode="area")[0], dim=0))
         self.mean_visibility.copy_((F.interpolate(visibility[None], size, mode="area")[0] * 255).round())

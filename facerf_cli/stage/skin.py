@@ -15,7 +15,8 @@ from facerf_cli.face.regions import region_mask
 from facerf_cli.face.topology import LANDMARK_UV
 
 _DERMIS = (0.86, 0.76, 0.68)  # linear Rec.709
-_MELANIN = (0.62, 0.92, 1.35)  # absorbance at the darkest tone, per channel
+_MELANIN = (0.62, 0.92, 1.35)  # absorbance per channel of one unit; skins hold 0 to `_DARKEST`
+_DARKEST = 2.8
 _HAEMOGLOBIN = (0.05, 0.38, 0.30)
 _HAIR_COLOURS = (
     (0.012, 0.010, 0.009),
@@ -53,7 +54,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
         name: region_mask(name, side)[None, None] for name in ("eyes", "brows", "lips", "nostrils", "neck")
     }
 
-    melanin = uniform(0.05, 1.0) ** 1.3 * 1.9
+    melanin = uniform(0.05, 1.0) ** 1.4 * _DARKEST
     melanin = melanin * (1 + uniform(0.02, 0.14) * coarse + uniform(0.02, 0.08) * middle) + _spots(
         middle, fine, uniform
     )

@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import GRID, grid_triangles
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.transport import BakeSettings, bake_transport, build_scene
+from facerf_cli.light.transport import occluded as embree_occluded
+from facerf_cli.raster.camera import Camera, project
+from facerf_cli.raster.rasterize import rasterize
+from facerf_cli.raster.texture import bake_attributes, normal_map
+from tests.oracles import visibility as oracle
+
+POINT_LAMP = BakeSettings(lamp_samples=1, lamp_radius_deg=0, bounce_samples=0)
+SIDE = 48
+
+
+@pytest.fixture(scope="module")
+def head() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices [V, 3], texel positions and normals [T, T, 3] of the built-in mean face."""
+    vertices = load_face_model().mean
+    positions = bake_attributes(vertices, GRID, SIDE).permute(1, 2, 0)
+    normals = normal_map(vertices, grid_triangles(), SIDE).permute(1, 2, 0)
+    return vertices.numpy(), positions.numpy(), normals.numpy()
+
+
+def test_occlusion_agrees_with_the_brute_force_oracle() -> None:
+    random = np.random.default_rng(0)
+    triangles = random.normal(size=(40, 3, 3))
+    origins = random.normal(size=(300, 3)).astype(np.float32)
+    direction = np.array([0.36, 0.48, 0.8])
+    scene = build_scene(triangles.reshape(-1, 3), np.arange(120).reshape(-1, 3))
+    found = embree_occluded(scene, origins, np.repeat(direction[None], 300, 0).astype(np.float32))
+    assert (found == oracle.occluded(origins, direction, triangles)).mean() > 0.995
+    assert 0.2 < found.mean() < 0.9
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.8, 0.0, 0.6), (-0.5, 0.7, 0.51)])
+def test_shadows_agree_with_the_rasterizer_seen_from_the_lamp(
+    head: tuple[np.ndarray, ...], direction: tuple
+) -> None:
+    vertices, positions, normals = head
+    lamp = np.array(direction) / np.linalg.norm(direction)
+    baked = bake_transport(positions, normals, vertices, grid_triangles().numpy(), lamp[None], POINT_LAMP)
+    facing = normals @ lamp
+    seen = _seen_from(lamp, vertices, positions)
+    clear = np.abs(facing) > 0.25  # grazing texels lie within the depth map's own error
+    assert (seen[clear & (facing > 0)] == (baked.visibility[0][clear & (facing > 0)] > 0.5)).mean() > 0.97
+    assert (baked.visibility[0][facing < 0] == 0).all()
+
+
+def _seen_from(lamp: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Visibility [T, T] by the z-buffer of a far camera that looks along the lamp's light."""
+    right = np.cross([0, 1, 0], lamp) / np.linalg.norm(np.cross([0, 1, 0], lamp))
+    head_to_camera = np.stack([right, np.cross(lamp, right), lamp])
+    camera, distance_m = Camera(1000 * 1500.0, 700, 700, 350, 350), 1000.0
+
+    def to_camera(points: np.ndarray) -> torch.Tensor:
+        moved = points.reshape(-1, 3) @ head_to_camera.T - [0, 0.0, distance_m]
+        return torch.from_numpy(moved.astype(np.float64))
+
+    fragments = rasterize(to_camera(vertices - [0, 0, 0.1]), grid_triangles(), camera)
+    texels = to_camera(positions - [0, 0, 0.1])
+    px = project(texels, camera).floor().long().clamp(0, 699)
+    in_front = fragments.depth_m[px[:, 1], px[:, 0]] < -texels[:, 2] - 0.002
+    return ~in_front.reshape(positions.shape[:2]).numpy()
+
+
+def test_a_sphere_gets_no_bounce_from_itself() -> None:
+    azimuth, height = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(0.8, -0.8, 20))
+    radius = np.sqrt(1 - height**2)
+    points = np.stack([radius * np.sin(azimuth), height, radius * np.cos(azimuth)], -1)
+    cells = np.arange(19 * 20).reshape(19, 20)[:, :19].ravel()
+    triangles = np.concatenate(
+        [np.stack([cells, cells + 20, cells + 21], -1), np.stack([cells, cells + 21, cells + 1], -1)]
+    )
+    settings = BakeSettings(lamp_samples=1, bounce_samples=8)
+    baked = bake_transport(
+        points, points, points.reshape(-1, 3), triangles, np.array([[0.0, 0, 1]]), settings
+    )
+    assert baked.bounce.max() < 0.02
+    assert baked.visibility[0][points[..., 2] > 0.1].mean() > 0.95
+
+
+def test_a_corner_returns_the_form_factor_of_its_other_wall() -> None:
+    # Two walls at a right angle: a point at distance d from the edge sees a strip of height h with the
+    # form factor (1 - 1 / sqrt(1 + (h / d)^2)) / 2, if the strip is long (Howell, C-9 in the limit).
+    depth, long = 1.0, 20.0
+    wall = np.array([[-long, 0, 0], [long, 0, 0], [long, depth, 0], [-long, depth, 0]])
+    floor = np.array([[-long, 0, 0], [long, 0, 0], [long, 0, depth], [-long, 0, depth]])
+    vertices = np.concatenate([floor, wall])
+    triangles = np.array([[0, 3, 2], [0, 2, 1], [4, 5, 6], [4, 6, 7]])
+    across = (np.arange(24) + 0.5) / 24
+    along = np.linspace(-1.5, 1.5, 24)
+    floor_texels = np.stack(np.broadcast_arrays(along[None], 0, across[:, None]), -1)
+    wall_texels = np.stack(np.broadcast_arrays(along[None], across[:, None], 0), -1)
+    positions = np.concatenate([floor_texels, wall_texels], 1)[:, :, :].astype(float)
+    normals = np.zeros_like(positions)
+    normals[:, :24, 1], normals[:, 24:, 2] = 1, 1
+    light = np.array([[0.0, 0.0, 1.0]])  # lights the wall alone, head on
+    settings = BakeSettings(lamp_samples=1, lamp_radius_deg=0, bounce_samples=600, bounce_blur_texels=0)
+    baked = bake_transport(positions, normals, vertices, triangles, light, settings)
+    expected = (1 - 1 / np.sqrt(1 + (depth / across) ** 2)) / 2
+    middle = baked.bounce[0][:, 10:14].mean(1)
+    assert np.abs(middle - expected).max() < 0.04
+
+
+def test_the_same_seed_gives_the_same_bake(head: tuple[np.ndarray, ...]) -> None:
+    vertices, positions, normals = head
+    settings = BakeSettings(lamp_samples=1, bounce_samples=2)
+    lamps = rig_directions(3).numpy()
+    first, second = (
+        bake_transport(positions, normals, vertices, grid_triangles().numpy(), lamps, settings, seed=4)
+        for _ in "ab"
+    )
+    assert (first.visibility == second.visibility).all() and (first.bounce == second.bounce).all()
