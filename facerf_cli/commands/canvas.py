@@ -50,19 +50,16 @@ class Canvas:
         follow = backdrop is not None and backdrop.surround
         self._surround = Surround(vertices_camera, crop, *size_px) if follow else None
         view = self._view
+        self.seen = face.visible
         self._mask = view.full(view.mask)
         places = {"normal": view.normal, "position": view.position_m, "uv": view.uv}
         self._layers: dict[str, np.ndarray] = {name: view.full(values) for name, values in places.items()}
 
     def write(self, path: Path, relit: "Tensor", exposure_ev: float, metadata: Mapping[str, Any]) -> None:
         """Write a relit texture [3, T, T] as an EXR of absolute light and a PNG at an exposure beside it."""
-        from facerf_cli.files.images import write_display, write_exr
-
         pixels, alpha = self._picture(relit)
         layers = self._layers if self._backdrop is None else {"face.A": self._mask, **self._layers}
-        write_display(path.with_suffix(".png"), pixels, exposure_ev, alpha, metadata)
-        write_exr(path, pixels, alpha, layers, {"facerf:exposure_ev": exposure_ev, **metadata})
-        log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)
+        _write(path, pixels, alpha, layers, exposure_ev, metadata)
 
     def _picture(self, relit: "Tensor") -> "tuple[np.ndarray, np.ndarray | None]":
         """Colour [H, W, 3], not multiplied by the alpha [H, W] beside it."""
@@ -81,6 +78,34 @@ class Canvas:
             self._backdrop.matte,
         )
         return pixels, picture.alpha
+
+
+@dataclass(frozen=True, eq=False)
+class ImageCanvas:
+    """For stacks of pictures that are rendered already; seen [H, W] is the face's coverage."""
+
+    seen: "Tensor"
+    normals: "np.ndarray"  # [H, W, 3]
+
+    def write(self, path: Path, relit: "Tensor", exposure_ev: float, metadata: Mapping[str, Any]) -> None:
+        """Write a relit picture [3, H, W] as an EXR and a PNG."""
+        pixels, alpha = relit.permute(1, 2, 0).numpy(), self.seen.numpy()
+        _write(path, pixels, alpha, {"normal": self.normals}, exposure_ev, metadata)
+
+
+def _write(
+    path: Path,
+    pixels: "np.ndarray",
+    alpha: "np.ndarray | None",
+    layers: "Mapping[str, np.ndarray]",
+    exposure_ev: float,
+    metadata: Mapping[str, Any],
+) -> None:
+    from facerf_cli.files.images import write_display, write_exr
+
+    write_display(path.with_suffix(".png"), pixels, exposure_ev, alpha, metadata)
+    write_exr(path, pixels, alpha, layers, {"facerf:exposure_ev": exposure_ev, **metadata})
+    log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)
 
 
 def read_matte(path: Path, size_px: tuple[int, int]) -> "np.ndarray":

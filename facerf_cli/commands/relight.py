@@ -1,16 +1,11 @@
 """`facerf relight`: photos, or stacks of predicted lights, under environment maps and lamps."""
 
-import logging
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated
 
 import typer
 
-from facerf_cli.commands.batch import BatchOptions, Outcome, run_batch
-from facerf_cli.commands.canvas import Backdrop, Canvas, read_matte
-from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.batch import BatchOptions, run_batch
 from facerf_cli.commands.options import (
     DryRunOption,
     FaceModelOption,
@@ -23,127 +18,15 @@ from facerf_cli.commands.options import (
 )
 from facerf_cli.commands.photo import (
     FaceOption,
-    FittedFace,
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
-    facts_of,
-    fit_faces,
     load_models_once,
-    provenance,
-    read_photo,
 )
-from facerf_cli.commands.shots import Sampling, Shot, collect_shots, light_photos, usable, write_balls
+from facerf_cli.commands.relight_item import Composite, Relight
+from facerf_cli.commands.shots import Sampling, collect_shots, usable, write_balls
 from facerf_cli.commands.values import numbers, parse_directions, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.records import LOGGER_NAME
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from facerf_cli.face.fit import FaceFit
-    from facerf_cli.files.images import Picture
-
-Composite = Literal["photo", "face"]
-_HELD = 4  # relit textures are held this many times over while light is added to them
-log = logging.getLogger(LOGGER_NAME)
-
-
-@dataclass(frozen=True)
-class _Relight:
-    """Relights one item under every shot; settings only."""
-
-    photo: PhotoOptions
-    shots: tuple[Shot, ...]
-    rig: str
-    sampling: Sampling
-    pose: str | None
-    composite: Composite
-    surround: bool
-    matte: Path | None
-    exposure_ev: float | None  # None: auto
-    memory_bytes: int
-
-    def outputs_of(self, item: Item) -> list[Path]:
-        """An EXR and a PNG a shot."""
-        tag = self.photo.first_tag
-        return [shot.output(item, tag, suffix) for shot in self.shots for suffix in (".exr", ".png")]
-
-    def __call__(self, item: Item) -> Outcome:
-        """Relight a photo."""
-        picture = read_photo(item, self.photo)
-        faces = fit_faces(item, picture, self.photo)
-        outputs: list[Path] = []
-        exposures_ev: dict[str, float] = {}
-        for face in reversed(faces):
-            for path, exposure_ev in self._relight_face(item, picture, face):
-                outputs += [path, path.with_suffix(".png")]
-                exposures_ev[path.stem] = exposure_ev
-        return Outcome(outputs, facts_of(faces) | {"exposure_ev": exposures_ev})
-
-    def _relight_face(self, item: Item, picture: "Picture", face: FittedFace) -> Iterator[tuple[Path, float]]:
-        """Write every shot of a face; the EXR's path and the PNG's exposure of each."""
-        from facerf_cli.pipeline import predict_olat, weigh_batches
-
-        models = load_models_once(self.photo)
-        size_px = picture.pixels.shape[0], picture.pixels.shape[1]
-        vertices, turn = self._turned(face.fit, face.fit.vertices_camera(models.face))
-        directions, weights = light_photos(self.shots, self.rig, self.sampling)
-        canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(picture, size_px))
-
-        def relit(rows: slice) -> "Tensor":
-            olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes)
-            return weigh_batches(olats, weights[rows])
-
-        metadata = provenance(item, self.photo, models.checkpoint_name)
-        yield from self._write_shots(item, face, canvas, relit, metadata)
-
-    def _turned(self, fit: "FaceFit", vertices: "Tensor") -> "tuple[Tensor, Tensor | None]":
-        """The mesh [V, 3] in the target's pose, and the turn that brings it there, if there is one."""
-        from facerf_cli.pipeline import turned
-
-        rotation = parse_pose(self.pose)
-        if rotation is None:
-            return vertices, None
-        turn, translation_m = turned(fit, rotation)
-        return (vertices - translation_m) @ turn.mT + translation_m, turn
-
-    def _backdrop(self, picture: "Picture", size_px: tuple[int, int]) -> Backdrop | None:
-        if self.composite == "face":
-            return None
-        matte = None if self.matte is None else read_matte(self.matte, size_px)
-        return Backdrop(picture, self.surround, matte)
-
-    def _write_shots(
-        self,
-        item: Item,
-        face: FittedFace,
-        canvas: Canvas,
-        relit: "Callable[[slice], Tensor]",
-        metadata: dict[str, Any],
-    ) -> Iterator[tuple[Path, float]]:
-        """All shots, as many at a time as fit the memory; one prediction serves those."""
-        at_once = max(1, self.memory_bytes // (_HELD * 4 * face.texture.texture.numel()))
-        for first in range(0, len(self.shots), at_once):
-            shots = self.shots[first : first + at_once]
-            textures = relit(slice(first, first + at_once))
-            exposures_ev = self._exposures_ev(shots, textures, face.texture.visible)
-            for shot, texture in zip(shots, textures, strict=True):
-                path = shot.output(item, face.tag, ".exr")
-                canvas.write(path, texture, exposures_ev[shot.name], metadata)
-                yield path, exposures_ev[shot.name]
-
-    def _exposures_ev(self, shots: Iterable[Shot], textures: "Tensor", visible: "Tensor") -> dict[str, float]:
-        """By name of the light: one for all its frames, so that a turning sky does not pump."""
-        from facerf_cli.colour import auto_exposure_ev
-
-        found: dict[str, float] = {}
-        for shot, texture in zip(shots, textures, strict=True):
-            exposure_ev = self.exposure_ev
-            if exposure_ev is None:
-                exposure_ev = auto_exposure_ev(texture.permute(1, 2, 0).numpy(), visible.numpy())
-            found[shot.name] = min(exposure_ev, found.get(shot.name, exposure_ev))
-        return found
 
 
 def relight(
@@ -251,7 +134,7 @@ def relight(
     if not shots:
         raise FacerfError("no map can be used")
     mode: Composite = composite or ("photo" if pose is None else "face")
-    work = _Relight(
+    work = Relight(
         photo,
         shots,
         lights,
@@ -262,6 +145,7 @@ def relight(
         matte,
         exposure_ev,
         int(memory * 2**30),
+        composite == "photo",
     )
     if not dry_run:
         load_models_once(photo)

@@ -28,6 +28,7 @@ _OWN_REGIONS = ("eyes", "mouth")  # the network has seen no gaze and no teeth
 _TINY = 1e-8
 _MASK_SIDE = 512
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
+_UPRIGHT = 0.4  # a step up or down counts for so much: there are hair and neck, to the side is background
 _SURROUND_PX = 64  # along a crop there
 
 
@@ -38,7 +39,7 @@ class CompositeSettings:
     dark: float = 0.08  # e above, in mean luminances of the source
     feather: float = 0.04  # of the mask's border, inward
     spread: float = 0.04  # standard deviation of the blur of the change of light around the face
-    reach: float = 0.35  # of that change, beyond the face; further off all follows the mean change
+    reach: float = 0.22  # of that change to the side; further off all follows the mean change
     most: float = 12.0  # hair and background change at most this much more, or less, than the face's mean
 
 
@@ -191,7 +192,8 @@ class Surround:
         self._camera = Camera(4.0 * _SURROUND_PX, side, side, side / 2, side / 2)
         self._view = view_face(vertices_camera, self._camera, _SURROUND_PX, settings)
         self._mask = torch.from_numpy(self._view.full(self._view.mask))
-        away_px = torch.from_numpy(distance_transform_edt((self._mask < 0.5).numpy())).float()
+        outside = (self._mask < 0.5).numpy()
+        away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
         self._near = 1 - _smooth(away_px / (settings.reach * _SURROUND_PX))
         self._grid = self._photo_grid(crop, height_px, width_px)
 

@@ -1,0 +1,187 @@
+"""What `facerf relight` does with one item: a photo, or an OLAT stack that was predicted before."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from facerf_cli.commands.batch import Outcome
+from facerf_cli.commands.canvas import Backdrop, Canvas, ImageCanvas, read_matte
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.photo import (
+    FittedFace,
+    PhotoOptions,
+    face_model,
+    facts_of,
+    fit_faces,
+    load_models_once,
+    provenance,
+    read_photo,
+)
+from facerf_cli.commands.shots import Sampling, Shot, light_photos, light_stack
+from facerf_cli.commands.values import parse_pose
+from facerf_cli.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from facerf_cli.face.fit import FaceFit
+    from facerf_cli.files.images import Picture
+    from facerf_cli.files.olat_stack import OlatStack
+
+Composite = Literal["photo", "face"]
+_HELD = 4  # relit textures are held this many times over while light is added to them
+_LIGHTS_AT_ONCE = 16  # of a stack, made floats
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Relights one item under every shot; settings only."""
+
+    photo: PhotoOptions
+    shots: tuple[Shot, ...]
+    rig: str
+    sampling: Sampling
+    pose: str | None
+    composite: Composite
+    surround: bool
+    matte: Path | None
+    exposure_ev: float | None  # None: auto
+    memory_bytes: int
+    asked_for_photo: bool  # --composite photo, in so many words
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """An EXR and a PNG a shot."""
+        tag = self.photo.first_tag
+        return [shot.output(item, tag, suffix) for shot in self.shots for suffix in (".exr", ".png")]
+
+    def __call__(self, item: Item) -> Outcome:
+        """Relight a photo or a stack."""
+        from facerf_cli.files.olat_stack import is_olat_stack
+
+        stack = item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
+        written, facts = self._relight_stack(item) if stack else self._relight_photo(item)
+        outputs = [path.with_suffix(suffix) for path in written for suffix in (".exr", ".png")]
+        exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
+        return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
+
+    def _relight_photo(self, item: Item) -> tuple[dict[Path, float], dict[str, Any]]:
+        picture = read_photo(item, self.photo)
+        faces = fit_faces(item, picture, self.photo)
+        written: dict[Path, float] = {}
+        for face in reversed(faces):  # the first one's files say that the photo is finished
+            written.update(self._relight_face(item, picture, face))
+        return written, facts_of(faces)
+
+    def _relight_face(self, item: Item, picture: "Picture", face: FittedFace) -> Iterator[tuple[Path, float]]:
+        """Write every shot of a face; the EXR's path and the PNG's exposure of each."""
+        from facerf_cli.pipeline import predict_olat, weigh_batches
+
+        models = load_models_once(self.photo)
+        size_px = picture.pixels.shape[0], picture.pixels.shape[1]
+        vertices, turn = self._turned(face.fit, face.fit.vertices_camera(models.face))
+        directions, weights = light_photos(self.shots, self.rig, self.sampling)
+        canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(picture, size_px))
+
+        def relit(rows: slice) -> "Tensor":
+            olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes)
+            return weigh_batches(olats, weights[rows])
+
+        metadata = provenance(item, self.photo, models.checkpoint_name)
+        yield from self._write_shots(item, face.tag, canvas, relit, metadata)
+
+    def _turned(self, fit: "FaceFit", vertices: "Tensor") -> "tuple[Tensor, Tensor | None]":
+        """The mesh [V, 3] in the target's pose, and the turn that brings it there, if there is one."""
+        from facerf_cli.pipeline import turned
+
+        rotation = parse_pose(self.pose)
+        if rotation is None:
+            return vertices, None
+        turn, translation_m = turned(fit, rotation)
+        return (vertices - translation_m) @ turn.mT + translation_m, turn
+
+    def _backdrop(self, picture: "Picture", size_px: tuple[int, int]) -> Backdrop | None:
+        if self.composite == "face":
+            return None
+        matte = None if self.matte is None else read_matte(self.matte, size_px)
+        return Backdrop(picture, self.surround, matte)
+
+    def _relight_stack(self, item: Item) -> tuple[dict[Path, float], dict[str, Any]]:
+        import torch
+
+        from facerf_cli.files.olat_stack import read_olat_stack
+        from facerf_cli.pipeline import weigh_batches
+
+        if self.pose is not None or self.asked_for_photo:
+            raise InputError(f"{item.input_path}: a stack is one pose of a face without its photo")
+        stack = read_olat_stack(item.input_path)
+        canvas, facts = self._stack_canvas(item, stack)
+        weights = light_stack(self.shots, torch.from_numpy(stack.header.directions).float(), self.sampling)
+
+        def relit(rows: slice) -> "Tensor":
+            batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
+            return weigh_batches(batches, weights[rows])
+
+        metadata = {name: value for name, value in stack.header.metadata.items() if "facerf" in name}
+        metadata = provenance(item, self.photo) | metadata
+        return dict(self._write_shots(item, "", canvas, relit, metadata)), facts
+
+    def _stack_canvas(self, item: Item, stack: "OlatStack") -> tuple[Canvas | ImageCanvas, dict[str, Any]]:
+        """What a stack's pictures are seen on, the crop's own frame; and what is known of its fit."""
+        import torch
+
+        from facerf_cli.face.crop import Crop
+        from facerf_cli.face.fit import fit_from_arrays
+        from facerf_cli.face.topology import LAYOUT_VERSION
+        from facerf_cli.pipeline import FaceTexture
+
+        header = stack.header
+        if header.kind == "image":
+            return ImageCanvas(torch.from_numpy(header.seen), header.normals), {}
+        try:
+            if header.layout_version != LAYOUT_VERSION:
+                raise ValueError("it has another UV layout")
+            fit = fit_from_arrays(header.fit)
+            posed = replace(fit, rotation=torch.from_numpy(header.rotation).float())
+            vertices = posed.vertices_camera(face_model(self.photo))
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(f"{item.input_path}: the fit in it is of no use: {error}") from None
+        side_px = fit.crop.size_px
+        texture, normals = (torch.from_numpy(x).permute(2, 0, 1) for x in (header.source, header.normals))
+        face = FaceTexture(texture, torch.from_numpy(header.seen), normals)
+        whole = Crop(0.0, 0.0, float(side_px), side_px)
+        return Canvas(vertices, whole, (side_px, side_px), face, None), {
+            "error_iod": round(fit.error_iod, 5),
+            "quality": fit.quality,
+        }
+
+    def _write_shots(
+        self,
+        item: Item,
+        tag: str,
+        canvas: Canvas | ImageCanvas,
+        relit: "Callable[[slice], Tensor]",
+        metadata: dict[str, Any],
+    ) -> Iterator[tuple[Path, float]]:
+        """All shots, as many at a time as fit the memory; one prediction serves those."""
+        at_once = max(1, self.memory_bytes // (_HELD * 12 * canvas.seen.numel()))
+        for first in range(0, len(self.shots), at_once):
+            shots = self.shots[first : first + at_once]
+            textures = relit(slice(first, first + at_once))
+            exposures_ev = self._exposures_ev(shots, textures, canvas.seen)
+            for shot, texture in zip(shots, textures, strict=True):
+                path = shot.output(item, tag, ".exr")
+                canvas.write(path, texture, exposures_ev[shot.name], metadata)
+                yield path, exposures_ev[shot.name]
+
+    def _exposures_ev(self, shots: Iterable[Shot], textures: "Tensor", visible: "Tensor") -> dict[str, float]:
+        """By name of the light: one for all its frames, so that a turning sky does not pump."""
+        from facerf_cli.colour import auto_exposure_ev
+
+        found: dict[str, float] = {}
+        for shot, texture in zip(shots, textures, strict=True):
+            exposure_ev = self.exposure_ev
+            if exposure_ev is None:
+                exposure_ev = auto_exposure_ev(texture.permute(1, 2, 0).numpy(), visible.numpy())
+            found[shot.name] = min(exposure_ev, found.get(shot.name, exposure_ev))
+        return found
