@@ -56,8 +56,11 @@ def collect_shots(
     rotations = parse_rotations(rotate)
     paths = [path for entry in envmaps for path in _expand_glob(entry)]
     shots: list[Shot] = []
-    for item in collect_items(paths, output, MAP_SUFFIXES) if paths else ():
-        name, frame = split_frame(item.name.replace("/", "_"))
+    maps = collect_items(paths, output, MAP_SUFFIXES) if paths else []
+    last_parts = [Path(item.name).name for item in maps]
+    for item, short in zip(maps, last_parts, strict=True):
+        unique = last_parts.count(short) == 1
+        name, frame = split_frame(short if unique else item.name.replace("/", "_"))
         shots += [
             Shot(name + turn, frame + number, item.input_path, degrees) for turn, number, degrees in rotations
         ]

@@ -44,6 +44,13 @@ def test_maps_may_be_files_folders_and_patterns(tmp_path: Path) -> None:
         assert [shot.name for shot in shots] == ["a", "b", "c"]
 
 
+def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    for place in ("day/sky.exr", "night/sky.exr", "night/moon.exr"):
+        write_map(tmp_path / place)
+    shots = collect_shots([str(tmp_path)], None, [], tmp_path / "out")
+    assert [shot.name for shot in shots] == ["day_sky", "moon", "night_sky"]
+
+
 def test_a_pattern_that_the_shell_expanded_stays_with_its_option() -> None:
     line = ["relight", "a.jpg", "--envmap", "x.exr", "y.EXR", "z.hdr", "-o", "out", "stack.exr"]
     expected = ["relight", "a.jpg", *(p for n in ("x.exr", "y.EXR", "z.hdr") for p in ("--envmap", n))]
