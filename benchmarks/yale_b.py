@@ -19,10 +19,17 @@ import torch
 from torch import Tensor
 
 from facerf_cli.face.landmarks import find_faces
-from facerf_cli.face.topology import grid_triangles, grid_uv
-from facerf_cli.pipeline import Models, crop_face, fit_face, load_models, predict_olat, unwrap_face, weigh
+from facerf_cli.pipeline import (
+    Models,
+    crop_face,
+    fit_face,
+    load_models,
+    predict_olat,
+    see_face,
+    unwrap_face,
+    weigh_batches,
+)
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera
-from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, sample_texture
 
 CROP_PX, TEXTURE_SIDE = 256, 256
@@ -97,15 +104,14 @@ def relight(
     crop, cropped = crop_face(photo, landmarks_px, CROP_PX)
     fit = fit_face(models.face, crop, landmarks_px, photo.shape)
     face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE)
-    olats = torch.cat(list(predict_olat(models, face, directions)))
-    textures = weigh(olats, weights[..., None].expand(-1, -1, 3)).mean(1)  # [M, T, T]
+    grey_weights = weights[..., None].expand(-1, -1, 3)
+    textures = weigh_batches(predict_olat(models, face, directions), grey_weights).mean(1)  # [M, T, T]
     height, width = picture.shape
     centre_px = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
     camera = Camera(CROP_FOCAL_PER_SIDE * crop.side_px, width, height, *centre_px)
-    fragments = rasterize(fit.vertices_camera(models.face), grid_triangles(), camera)
-    uv = interpolate(grid_uv(), grid_triangles(), fragments)
+    uv, covered = see_face(fit.vertices_camera(models.face), camera)
     relit = sample_texture(torch.cat([textures, face.texture.mean(0)[None]]), uv).permute(2, 0, 1)
-    return fill_uncovered(relit[:-1], relit[-1], torch.from_numpy(photo[..., 0]), fragments.covered.float())
+    return fill_uncovered(relit[:-1], relit[-1], torch.from_numpy(photo[..., 0]), covered)
 
 
 def fill_uncovered(relit: Tensor, source: Tensor, photo: Tensor, covered: Tensor) -> Tensor:
