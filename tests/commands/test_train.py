@@ -1,0 +1,34 @@
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.main import main
+
+
+@pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])
+def test_a_time_that_is_none_is_refused(
+    tmp_path: Path, time: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), f"--max-time={time}"]) == 2
+    assert capsys.readouterr().err.strip().splitlines() == [
+        f"facerf: error: --max-time {time}: write a number and s, m or h, such as 45m"
+    ]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_face_model_is_named_before_anything_is_baked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "nobody.npz"]) == 1
+    assert "nobody.npz: no such face model" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_bad_start_is_named_before_anything_is_baked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = tmp_path / "start.safetensors"
+    start.write_text("nothing")
+    assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
+    assert "not a facerf checkpoint" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
