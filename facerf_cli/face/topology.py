@@ -1,7 +1,7 @@
 """The canonical topology that every face model is carried to.
 
 One bilaterally symmetric grid in a cylindrical chart. The head frame is right-handed, in metres: x to the
-picture's right, y up, z out of the face; its origin lies on the chart's vertical axis, inside the head, at the
+picture's right, y up, z out of the face; its origin lies on the chart's vertical axis inside the head, at the
 height of the nose's underside. u runs to the picture's right over +-`HALF_ANGLE_DEG` of azimuth, v runs down
 from the forehead to below the chin. The 68 landmarks (Multi-PIE order) sit at the same (u, v) in every model,
 so a texture learned on one model fits all others. Changing anything here changes `LAYOUT_VERSION`.

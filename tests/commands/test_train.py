@@ -6,9 +6,7 @@ from facerf_cli.main import main
 
 
 @pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])
-def test_a_time_that_is_none_is_refused(
-    tmp_path: Path, time: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_time_is_refused(tmp_path: Path, time: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "-o", str(tmp_path / "run"), f"--max-time={time}"]) == 2
     assert capsys.readouterr().err.strip().splitlines() == [
         f"facerf: error: --max-time {time}: write a number and s, m or h, such as 45m"
@@ -24,9 +22,7 @@ def test_a_missing_face_model_is_named_before_anything_is_baked(
     assert not (tmp_path / "run").exists()
 
 
-def test_a_bad_start_is_named_before_anything_is_baked(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_start_is_named_before_baking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = tmp_path / "start.safetensors"
     start.write_text("nothing")
     assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
