@@ -17,7 +17,9 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli import __version__
+from facerf_cli.commands import face_model
 from facerf_cli.commands.doctor import doctor
+from facerf_cli.commands.fit_geometry import fit_geometry
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
 from facerf_cli.commands.relight import relight
@@ -25,8 +27,8 @@ from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, train, doctor)
-GROUPS: dict[str, typer.Typer] = {}  # verbs that have verbs of their own
+VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, fit_geometry, train, doctor)
+GROUPS: dict[str, typer.Typer] = {"face-model": face_model.app}  # verbs that have verbs of their own
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}

@@ -1,11 +1,11 @@
 """Face models that a user brings, carried once to the canonical topology (DESIGN, 'One topology inside')."""
 
-import io
+import lzma
 import re
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,20 +15,33 @@ import trimesh
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, chart_rays, chart_uv, grid_uv
+from facerf_cli.face.topology import (
+    GRID,
+    LANDMARK_UV,
+    LANDMARKS_M,
+    chart_rays,
+    chart_uv,
+    grid_uv,
+    landmark_weights,
+)
+from facerf_cli.records import one_line
 
 EXPRESSION_STD = 0.3  # of a full blendshape: the spread that a coefficient of 1 stands for
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
-_MAX_OBJ_BYTES = 64 << 20
+_PULL_M = 0.005  # how far around a landmark the grid is pulled onto it
+_CANDIDATES = 12  # triangles by their centres, among which the nearest point is sought
+_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, and of all
+_DAMAGED = (OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
 
 _ICT_LANDMARKS = (
-    "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 268 493 1914 2044 1401 "
-    "3615 4240 4114 2734 2509 978 4527 4942 4857 1140 2075 1147 4269 3360 1507 1542 1537 1528 1518 1511 3742 3751 "
-    "3756 3721 3725 3732 5708 5695 2081 0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 "
-    "5517 5966"
+    "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 "
+    "268 493 1914 2044 1401 3615 4240 4114 2734 2509 978 4527 4942 4857 1140 2075 1147 "
+    "4269 3360 1507 1542 1537 1528 1518 1511 3742 3751 3756 3721 3725 3732 5708 5695 2081 "
+    "0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 5517 5966"
 )
 _ICT_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
 _ICT_VERTICES = 26719
@@ -37,7 +50,7 @@ _ICT_LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 
 @dataclass(frozen=True)
 class SourceModel:
-    """A morphable model in its own topology: metres, y up, z out of the face; bases scaled by their deviations.
+    """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
 
     mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface,
     landmarks: the vertex ids of the 68 points.
@@ -60,7 +73,9 @@ def carry_over(source: SourceModel) -> MorphableModel:
     corners, weights = register(mean, source.triangles, mean[source.landmarks])
 
     def carried(field: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.einsum("...vkc,vk->...vc", field[..., corners, :], weights).astype(np.float32))
+        return torch.from_numpy(
+            np.einsum("...vkc,vk->...vc", field[..., corners, :], weights).astype(np.float32)
+        )
 
     return MorphableModel(
         name=source.name,
@@ -79,39 +94,49 @@ def register(mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray) -> 
     """
     warp = RBFInterpolator(LANDMARK_UV, chart_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
     uv = grid_uv().double().numpy()
-    origins, directions = chart_rays(uv + warp(uv))
     mesh = trimesh.Trimesh(mean, triangles, process=False)
-    points, rays, faces = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
-    if len(rays) < len(uv) * 0.98:
-        raise InputError("the face model does not cover the chart: its surface ends inside forehead, cheeks or chin")
-    points, faces = _mend_slipped(mesh, uv, origins, directions, points, rays, faces)
+    points = _cast(mesh, *chart_rays(uv + warp(uv)))
+    points, faces = _nearest(mesh, _pulled(points, landmarks))
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
     weights = np.clip(weights, 0, None)
     return triangles[faces], weights / weights.sum(-1, keepdims=True)
 
 
-def _mend_slipped(
-    mesh: trimesh.Trimesh,
-    uv: np.ndarray,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    points: np.ndarray,
-    rays: np.ndarray,
-    faces: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Surface points [V, 3] and faces [V]; rays that missed or slipped into a slit take the nearest surface."""
-    travelled = np.full(len(uv), np.nan)
+def _cast(mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Where the grid's rays meet the mesh [V, 3]; one that slips into a slit ends where its neighbours do."""
+    points, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    if len(rays) < len(origins) * 0.98:
+        raise InputError(
+            "the face model does not cover the chart: its surface ends inside forehead, cheeks or chin"
+        )
+    travelled = np.full(len(origins), np.inf)
     travelled[rays] = np.linalg.norm(points - origins[rays], axis=-1)
-    usual = median_filter(np.nan_to_num(travelled, nan=np.nanmax(travelled)).reshape(GRID, GRID), 5).ravel()
-    slipped = ~(travelled < usual + _SLIP_M)
-    all_points, all_faces = np.empty((len(uv), 3)), np.empty(len(uv), np.int64)
-    all_points[rays], all_faces[rays] = points, faces
-    if slipped.any():
-        expected = origins[slipped] + directions[slipped] * usual[slipped, None]
-        _, faces_nearby = cKDTree(mesh.triangles_center).query(expected)
-        all_points[slipped] = trimesh.triangles.closest_point(mesh.triangles[faces_nearby], expected)
-        all_faces[slipped] = faces_nearby
-    return all_points, all_faces
+    filled = np.where(np.isfinite(travelled), travelled, travelled[rays].max())
+    usual = median_filter(filled.reshape(GRID, GRID), 5).ravel()
+    return origins + directions * np.where(travelled < usual + _SLIP_M, travelled, usual)[:, None]
+
+
+def _pulled(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """Points [V, 3] moved, smoothly and near landmarks alone, so that the grid's come to lie on the model's.
+
+    Rays cannot do that where a landmark hides from them, as the inner corners of the mouth behind the lips.
+    """
+    corners, weights = (tensor.numpy() for tensor in landmark_weights())
+    reached = (points[corners] * weights[..., None]).sum(1)
+    kernel = np.exp(-((cdist(reached, reached) / _PULL_M) ** 2))
+    strength = np.linalg.solve(kernel + 1e-3 * np.eye(len(reached)), landmarks - reached)
+    return points + np.exp(-((cdist(points, reached) / _PULL_M) ** 2)) @ strength
+
+
+def _nearest(mesh: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh's points [N, 3] nearest to `points` [N, 3], and their faces [N]."""
+    _, nearby = cKDTree(mesh.triangles_center).query(points, _CANDIDATES)
+    closest = np.stack(
+        [trimesh.triangles.closest_point(mesh.triangles[faces], points) for faces in nearby.T]
+    )  # [candidates, N, 3]
+    best = np.linalg.norm(closest - points, axis=-1).argmin(0)
+    rows = np.arange(len(points))
+    return closest[best, rows], nearby[rows, best]
 
 
 def rigid_alignment(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,13 +149,27 @@ def rigid_alignment(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, n
 
 
 def import_ict_facekit(path: Path) -> MorphableModel:
-    """ICT Face Model Light as its authors publish it: a folder, .zip or .tar[.gz|.xz] with `FaceXModel/*.obj`."""
-    with _open_members(path) as (names, read):
-        objects = {Path(name).stem: name for name in names if re.search(r"FaceXModel/[A-Za-z0-9_]+\.obj$", name)}
-        if "generic_neutral_mesh" not in objects:
-            raise InputError(f"{path}: no FaceXModel/generic_neutral_mesh.obj in it; give the ICT-FaceKit folder or archive")
-        raw = {stem: read(name) for stem, name in objects.items()}
-    return carry_over(_ict_source(path, raw))
+    """ICT Face Model Light as its authors publish it: `FaceXModel/*.obj` in a folder, a .zip or a .tar.xz."""
+    raw: dict[str, bytes] = {}
+    try:
+        for name, read in _members(path):
+            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+                raw[found[1]] = read(_MAX_OBJ_BYTES + 1)
+                if len(raw[found[1]]) > _MAX_OBJ_BYTES or sum(map(len, raw.values())) > _MAX_BYTES:
+                    raise InputError(f"{path}: {name} is too large; this is not ICT-FaceKit")
+    except _DAMAGED as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
+        ) from None
+    if "generic_neutral_mesh" not in raw:
+        raise InputError(
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj in it; give ICT-FaceKit's folder or archive"
+        )
+    source = _ict_source(path, raw)
+    try:
+        return carry_over(source)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
@@ -144,7 +183,7 @@ def _ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
     def offsets(stems: list[str]) -> np.ndarray:
         return np.stack([_obj_vertices(path, stem, raw[stem]) - mean for stem in stems])
 
-    triangles = _obj_triangles(neutral)
+    triangles = _obj_triangles(path, neutral)
     outer = np.zeros(_ICT_VERTICES, bool)
     for part in _ICT_SKIN:
         outer[part] = True
@@ -167,50 +206,42 @@ def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
     except ValueError:
         raise InputError(f"{path}: {stem}.obj is damaged; fetch ICT-FaceKit again") from None
     if vertices_cm.shape != (_ICT_VERTICES, 3) or not np.isfinite(vertices_cm).all():
-        raise InputError(f"{path}: {stem}.obj has {len(lines)} vertices, not {_ICT_VERTICES}; fetch ICT-FaceKit again")
+        raise InputError(
+            f"{path}: {stem}.obj has {len(lines)} vertices, not {_ICT_VERTICES}; fetch ICT-FaceKit again"
+        )
     return vertices_cm / 100
 
 
-def _obj_triangles(text: bytes) -> np.ndarray:
+def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
     triangles = []
-    for line in text.splitlines():
-        if line.startswith(b"f "):
-            corners = [int(token.split(b"/")[0]) - 1 for token in line.split()[1:]]
-            triangles += [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
+    try:
+        for line in text.splitlines():
+            if line.startswith(b"f "):
+                corners = [int(token.split(b"/")[0]) - 1 for token in line.split()[1:]]
+                triangles += [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
+    except ValueError:
+        triangles = []
+    if not triangles or not 0 <= np.min(triangles) <= np.max(triangles) < _ICT_VERTICES:
+        raise InputError(f"{path}: the neutral mesh's faces are damaged; fetch ICT-FaceKit again")
     return np.array(triangles)
 
 
-@contextmanager
-def _open_members(path: Path) -> Iterator[tuple[list[str], Callable[[str], bytes]]]:
-    """Names of the files in a folder or archive, and a function that reads one; sizes bounded."""
-    try:
-        if path.is_dir():
-            yield [p.as_posix() for p in path.rglob("*.obj")], lambda name: Path(name).read_bytes()
-        elif zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                yield archive.namelist(), lambda name: _bounded(archive.open(name))
-        elif path.is_file() and tarfile.is_tarfile(path):
-            yield from _tar_members(path)
-        else:
-            raise InputError(f"{path}: give the ICT-FaceKit folder, or its .zip or .tar archive")
-    except (OSError, tarfile.TarError, zipfile.BadZipFile, EOFError) as error:
-        raise InputError(f"{path}: the archive cannot be read ({error}); fetch it again") from None
-
-
-def _tar_members(path: Path) -> Iterator[tuple[list[str], Callable[[str], bytes]]]:
-    # One pass: seeking in a compressed tar would decompress it anew for each of its 150 files.
-    with tarfile.open(path, "r|*") as archive:
-        files = {
-            member.name: _bounded(stream)
-            for member in archive
-            if member.name.endswith(".obj") and (stream := archive.extractfile(member))
-        }
-    yield list(files), files.__getitem__
-
-
-def _bounded(stream: "io.BufferedReader | zipfile.ZipExtFile | object") -> bytes:
-    with stream:  # type: ignore[attr-defined]
-        data: bytes = stream.read(_MAX_OBJ_BYTES + 1)  # type: ignore[attr-defined]
-    if len(data) > _MAX_OBJ_BYTES:
-        raise InputError("an .obj in the archive is larger than 64 MB; this is not ICT-FaceKit")
-    return data
+def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
+    """Each file in a folder or archive: its name, and what reads at most so many bytes of it."""
+    if path.is_dir():
+        for file in sorted(path.rglob("*.obj")):
+            with file.open("rb") as stream:
+                yield file.as_posix(), stream.read
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as member:
+                    yield name, member.read
+    elif path.is_file() and tarfile.is_tarfile(path):
+        # One pass: seeking in a compressed tar would decompress it anew for each of its 150 files.
+        with tarfile.open(path, "r|*") as tar:
+            for entry in tar:
+                if entry.isfile() and (content := tar.extractfile(entry)):
+                    yield entry.name, content.read
+    else:
+        raise InputError(f"{path}: give the ICT-FaceKit folder, or its .zip or .tar archive")

@@ -1,0 +1,60 @@
+"""Textured meshes for other programs: binary glTF and Wavefront OBJ, in metres, y up."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+from facerf_cli.files.atomic import atomic_path
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMesh:
+    """vertices_m, normals [V, 3]; triangles [F, 3]; uv [V, 2], v down; texture_srgb [T, T, 3] uint8."""
+
+    vertices_m: np.ndarray
+    normals: np.ndarray
+    triangles: np.ndarray
+    uv: np.ndarray
+    texture_srgb: np.ndarray
+    metadata: dict[str, Any]
+
+
+def write_glb(path: Path, mesh: TexturedMesh) -> None:
+    """Write one file with the texture in it; a rough dielectric."""
+    image = Image.fromarray(mesh.texture_srgb)
+    material = PBRMaterial("face", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    scene = trimesh.Scene(metadata=mesh.metadata)
+    scene.add_geometry(_with(mesh, material), geom_name="face")
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
+
+
+def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
+    """Write `path`, and beside it an .mtl that names the picture `texture_name` (not written here)."""
+    material = SimpleMaterial(image=Image.new("RGB", (1, 1)), name="face")  # else no uv are exported
+    mtl_path = path.with_suffix(".mtl")
+    header = "; ".join(f"{name}: {value}" for name, value in mesh.metadata.items())
+    text = trimesh.exchange.obj.export_obj(
+        _with(mesh, material), include_normals=True, mtl_name=mtl_path.name, header=header
+    )
+    with atomic_path(mtl_path) as temporary:
+        temporary.write_text(f"newmtl face\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture_name}\n")
+    with atomic_path(path) as temporary:
+        temporary.write_text(text)
+
+
+def _with(mesh: TexturedMesh, material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
+    up = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)  # trimesh counts v upward, as OBJ does
+    return trimesh.Trimesh(
+        mesh.vertices_m,
+        mesh.triangles,
+        vertex_normals=mesh.normals,
+        visual=TextureVisuals(up, material=material),
+        process=False,
+    )
