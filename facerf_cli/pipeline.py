@@ -25,6 +25,7 @@ from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwra
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 _BYTES_PER_LIGHT = 220 * 128 * 128 * 4  # of features that the decoder holds at once, at its working side
+_LIGHTS_ON_CPU = 16  # at once; more only cost memory, and the time to get it
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,8 @@ def predict_olat(
     `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s.
     """
     device, texels = models.device, face.texture.shape[-1] ** 2
-    batch = int(max(1, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels)))
+    most = _LIGHTS_ON_CPU if device.type == "cpu" else len(lights)
+    batch = int(max(1, min(most, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels))))
     normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
     normals = normals[None].to(device)
     source = (face.texture[None], face.normals[None], face.visible[None, None])

@@ -28,6 +28,11 @@ class Backdrop:
     surround: bool  # hair and background follow the light
     matte: "np.ndarray | None"  # [H, W], what the light may change
 
+    @property
+    def kept(self) -> bool:
+        """Some of the photo stays as it was, so a PNG exposes the new light and not the whole picture."""
+        return not self.surround or self.matte is not None
+
 
 class Canvas:
     """One face seen by one camera; writes a picture a relit texture.
@@ -58,8 +63,19 @@ class Canvas:
     def write(self, path: Path, relit: "Tensor", exposure_ev: float, metadata: Mapping[str, Any]) -> None:
         """Write a relit texture [3, T, T] as an EXR of absolute light and a PNG at an exposure beside it."""
         pixels, alpha = self._picture(relit)
+        shown = self._picture(relit * 2**exposure_ev)[0] if self.kept else pixels * 2**exposure_ev
         layers = self._layers if self._backdrop is None else {"face.A": self._mask, **self._layers}
-        _write(path, pixels, alpha, layers, exposure_ev, metadata)
+        _write(path, pixels, shown, alpha, layers, exposure_ev, metadata)
+
+    @property
+    def kept(self) -> bool:
+        """The photo's own light stays in part of the picture."""
+        return self._backdrop is not None and self._backdrop.kept
+
+    def auto_exposure_ev(self, relit: "Tensor") -> float:
+        """The PNG's exposure: the lit face well exposed; beside a kept background as bright as it was."""
+        chosen_ev = _auto_exposure_ev(relit, self.seen)
+        return chosen_ev - _auto_exposure_ev(self._face.texture, self.seen) if self.kept else chosen_ev
 
     def _picture(self, relit: "Tensor") -> "tuple[np.ndarray, np.ndarray | None]":
         """Colour [H, W, 3], not multiplied by the alpha [H, W] beside it."""
@@ -90,12 +106,23 @@ class ImageCanvas:
     def write(self, path: Path, relit: "Tensor", exposure_ev: float, metadata: Mapping[str, Any]) -> None:
         """Write a relit picture [3, H, W] as an EXR and a PNG."""
         pixels, alpha = relit.permute(1, 2, 0).numpy(), self.seen.numpy()
-        _write(path, pixels, alpha, {"normal": self.normals}, exposure_ev, metadata)
+        _write(path, pixels, pixels * 2**exposure_ev, alpha, {"normal": self.normals}, exposure_ev, metadata)
+
+    def auto_exposure_ev(self, relit: "Tensor") -> float:
+        """The PNG's exposure: the lit face well exposed."""
+        return _auto_exposure_ev(relit, self.seen)
+
+
+def _auto_exposure_ev(relit: "Tensor", seen: "Tensor") -> float:
+    from facerf_cli.colour import auto_exposure_ev
+
+    return auto_exposure_ev(relit.permute(1, 2, 0).numpy(), seen.numpy())
 
 
 def _write(
     path: Path,
     pixels: "np.ndarray",
+    shown: "np.ndarray",
     alpha: "np.ndarray | None",
     layers: "Mapping[str, np.ndarray]",
     exposure_ev: float,
@@ -103,8 +130,9 @@ def _write(
 ) -> None:
     from facerf_cli.files.images import write_display, write_exr
 
-    write_display(path.with_suffix(".png"), pixels, exposure_ev, alpha, metadata)
-    write_exr(path, pixels, alpha, layers, {"facerf:exposure_ev": exposure_ev, **metadata})
+    metadata = {**metadata, "facerf:exposure_ev": exposure_ev}  # of the PNG, in both
+    write_display(path.with_suffix(".png"), shown, 0.0, alpha, metadata)
+    write_exr(path, pixels, alpha, layers, metadata)
     log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)
 
 

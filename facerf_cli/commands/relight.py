@@ -88,7 +88,11 @@ def relight(
     ] = None,
     keep_background: Annotated[
         bool,
-        typer.Option("--keep-background", help="Leave hair and background as they are, bit for bit."),
+        typer.Option(
+            "--keep-background",
+            help="Leave hair and background as they are, bit for bit; "
+            "--exposure is then that of the light on the face.",
+        ),
     ] = False,
     matte: Annotated[
         Path | None,

@@ -168,20 +168,20 @@ class Relight:
         for first in range(0, len(self.shots), at_once):
             shots = self.shots[first : first + at_once]
             textures = relit(slice(first, first + at_once))
-            exposures_ev = self._exposures_ev(shots, textures, canvas.seen)
+            exposures_ev = self._exposures_ev(shots, textures, canvas)
             for shot, texture in zip(shots, textures, strict=True):
                 path = shot.output(item, tag, ".exr")
                 canvas.write(path, texture, exposures_ev[shot.name], metadata)
                 yield path, exposures_ev[shot.name]
 
-    def _exposures_ev(self, shots: Iterable[Shot], textures: "Tensor", visible: "Tensor") -> dict[str, float]:
+    def _exposures_ev(
+        self, shots: Iterable[Shot], textures: "Tensor", canvas: Canvas | ImageCanvas
+    ) -> dict[str, float]:
         """By name of the light: one for all its frames, so that a turning sky does not pump."""
-        from facerf_cli.colour import auto_exposure_ev
-
         found: dict[str, float] = {}
         for shot, texture in zip(shots, textures, strict=True):
-            exposure_ev = self.exposure_ev
-            if exposure_ev is None:
-                exposure_ev = auto_exposure_ev(texture.permute(1, 2, 0).numpy(), visible.numpy())
-            found[shot.name] = min(exposure_ev, found.get(shot.name, exposure_ev))
+            chosen_ev = self.exposure_ev
+            if chosen_ev is None:
+                chosen_ev = round(canvas.auto_exposure_ev(texture), 2)
+            found[shot.name] = min(chosen_ev, found.get(shot.name, chosen_ev))
         return found

@@ -24,7 +24,7 @@ from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, sample_texture, vertex_normals
 
-_OWN_REGIONS = ("eyes", "mouth")  # the network has seen no gaze and no teeth
+_OWN_REGIONS = ("eyes", "mouth", "brows")
 _TINY = 1e-8
 _MASK_SIDE = 512
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light

@@ -122,6 +122,8 @@ def test_background_is_kept_bit_for_bit(given: Path, tmp_path: Path) -> None:
     photo = read_image(PHOTO).pixels.astype(np.float16).astype(np.float32)
     same = (relit == photo).all(-1)
     assert 0.9 < same.mean() < 0.99  # the face is small
+    shown = read_image(tmp_path / "astronaut_light_40_10.png").pixels
+    np.testing.assert_allclose(shown[same], read_image(PHOTO).pixels[same], atol=2e-3)
 
 
 def test_pose_gives_the_face_alone(given: Path, tmp_path: Path) -> None:
