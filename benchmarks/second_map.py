@@ -3,7 +3,7 @@
     python benchmarks/second_map.py [--texture-size 256] [--threads 1]
 
 The first map pays for 150 predicted lights; every further map or rotation for its weights, one matrix product
-in the texture's space, and one composite at the photo's resolution. The peer is to predict again for each map.
+in the texture's space, and one composite at the photo's resolution. The peer predicts again for each map.
 """
 
 import argparse

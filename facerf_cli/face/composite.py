@@ -26,7 +26,7 @@ from facerf_cli.raster.texture import inpaint, sample_texture, vertex_normals
 
 _OWN_REGIONS = ("eyes", "mouth", "brows")
 _TINY = 1e-8
-_MASK_SIDE = 512
+_MASK_SIDE, _OWN_SIDE = 256, 128  # of masks; finer ones take seconds to draw
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
 _UPRIGHT = 0.4  # a step up or down counts for so much: there are hair and neck, to the side is background
 _SURROUND_PX = 64  # along a crop there
@@ -40,7 +40,8 @@ class CompositeSettings:
     feather: float = 0.04  # of the mask's border, inward
     spread: float = 0.04  # standard deviation of the blur of the change of light around the face
     reach: float = 0.22  # of that change to the side; further off all follows the mean change
-    most: float = 12.0  # hair and background change at most this much more, or less, than the face's mean
+    darker: float = 12.0  # hair and background follow at most so far below the mean change,
+    brighter: float = 1.6  # and so far above it: a bright rim beside the face reads as a glow
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,8 @@ def change_of_light(
     source, relit [3, T, T] linear; seen [T, T] in 0..1. Eyes and teeth stay the photo's: their gain is that
     of the skin around them, without offset.
     """
-    own = torch.stack([region_mask(name, source.shape[-1]) for name in _OWN_REGIONS]).amax(0)
+    own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
+    own = F.interpolate(own[None, None], source.shape[1:], mode="bilinear", align_corners=False)[0, 0]
     trusted = seen * (1 - own)
     gain, offset = _gain_and_offset(source, relit, trusted, settings.dark)
     floor = settings.dark * (source * trusted).sum() / (3 * trusted.sum().clamp(min=_TINY)) + _TINY
@@ -208,7 +210,7 @@ class Surround:
         floor = self._settings.dark * mean[:3]
         change = mean[3:] / mean[:3].clamp(min=_TINY)
         local = (blurred[3:] + floor * change) / (blurred[:3] + floor).clamp(min=_TINY)
-        local = local.minimum(change * self._settings.most).maximum(change / self._settings.most)
+        local = local.minimum(change * self._settings.brighter).maximum(change / self._settings.darker)
         field = torch.lerp(change.expand_as(local), local, self._near)
         spread = F.grid_sample(
             field[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
