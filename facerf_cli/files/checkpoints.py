@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.atomic import atomic_path
 
 FORMAT = "facerf-checkpoint-1"
 
@@ -17,9 +18,8 @@ FORMAT = "facerf-checkpoint-1"
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
     """Write tensors (floats in half precision) and metadata through a temporary name."""
     stored = {k: (t.half() if t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()}
-    partial = path.with_name(path.name + ".partial")
-    save_file(stored, partial, metadata={"format": FORMAT, "facerf": json.dumps(metadata)})
-    partial.replace(path)
+    with atomic_path(path) as temporary:
+        save_file(stored, temporary, metadata={"format": FORMAT, "facerf": json.dumps(metadata)})
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
