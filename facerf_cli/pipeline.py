@@ -25,6 +25,7 @@ from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwra
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 _BYTES_PER_LIGHT = 220 * 128 * 128 * 4  # of features that the decoder holds at once, at its working side
+_CPU_BATCH = 4  # lights at a time; more of them leave the processor's cache and are slower
 _LIGHTS_ON_CPU = 16  # at once; more only cost memory, and the time to get it
 
 
