@@ -25,6 +25,8 @@ _HAIR_COLOURS = (
     (0.30, 0.21, 0.11),
     (0.25, 0.24, 0.23),
 )
+_HAIR_SHARES = (0.4, 0.25, 0.15, 0.1, 0.1)
+_PAINTED = ("eyes", "brows", "lips", "mouth", "nostrils", "neck")
 _EYE_CORNERS = ((36, 39), (42, 45))
 
 
@@ -72,6 +74,8 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     clothed = masks["neck"] * (uniform(0, 1) < 0.4)
     albedo = albedo * (1 - clothed) + clothed * uniform(0.02, 0.6, channels=3)
     albedo = _random_textures(albedo, coarse, middle, uniform, generator)
+    teeth_or_dark = torch.where(uniform(0, 1) < 0.5, uniform(0.35, 0.7), uniform(0.02, 0.1))
+    albedo = albedo * (1 - masks["mouth"]) + masks["mouth"] * teeth_or_dark
     eye_albedo = _eyes(side, masks["eyes"], uniform)
     albedo = (albedo * (1 - masks["eyes"]) + masks["eyes"] * eye_albedo).clamp(0.005, 0.95)
     return _with_gloss(albedo, hair, masks, middle, fine, uniform)
@@ -148,10 +152,10 @@ def _hair_mask(
     """Cover [B, 1, T, T] of brows, beard, hairline and fringe, and the hair's colour [B, 3, 1, 1]."""
     u, v = _chart(side)
     palette = torch.tensor(_HAIR_COLOURS)
-    index = torch.randint(len(palette), (uniform.faces,), generator=generator)
+    index = torch.multinomial(torch.tensor(_HAIR_SHARES), uniform.faces, True, generator=generator)
     colour = palette[index].view(-1, 3, 1, 1) * uniform(0.7, 1.4)
     streaks = 0.8 + 0.25 * fine + 0.2 * middle
-    brows = masks["brows"] * uniform(0.15, 0.95) * streaks
+    brows = masks["brows"] * uniform(0.3, 1.1) * streaks
     lower = torch.sigmoid(40 * (v - 0.62 - 0.9 * (0.5 - (u - 0.5).abs()).clamp(0, 0.2)))[None, None]
     moustache = _blob(side, 33, 0.06)[None, None] * (v > 0.6)
     grown = (uniform(0, 1) < 0.3) * uniform(0.1, 0.9) ** 2
