@@ -52,9 +52,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     coarse = noise(faces, side, 6, generator)
     middle = noise(faces, side, 24, generator)
     fine = torch.randn(faces, 1, side, side, generator=generator)
-    masks = {
-        name: region_mask(name, side)[None, None] for name in ("eyes", "brows", "lips", "nostrils", "neck")
-    }
+    masks = {name: region_mask(name, side)[None, None] for name in _PAINTED}
 
     melanin = uniform(0.05, 1.0) ** 1.4 * _DARKEST
     melanin = melanin * (1 + uniform(0.02, 0.14) * coarse + uniform(0.02, 0.08) * middle) + _spots(
