@@ -43,7 +43,7 @@ def main() -> None:
     landmarks_px = find_faces(photo, "astronaut")[0].landmarks_px
     crop, cropped = crop_face(photo, landmarks_px, 2 * given.texture_size)
     fit = fit_face(models.face, crop, landmarks_px, photo.shape)
-    face = unwrap_face(models.face, fit, cropped, given.texture_size)
+    face = unwrap_face(models.face, fit, cropped, given.texture_size, photo.shape)
     vertices, size_px = fit.vertices_camera(models.face), photo.shape[:2]
     view = timed("face seen by the photo's camera, once a face",
                  lambda: view_face(vertices, photo_camera(crop, *size_px), crop.side_px))  # fmt: skip

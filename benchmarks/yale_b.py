@@ -103,7 +103,7 @@ def relight(
     photo = np.repeat(picture[..., None], 3, -1).astype(np.float32)
     crop, cropped = crop_face(photo, landmarks_px, CROP_PX)
     fit = fit_face(models.face, crop, landmarks_px, photo.shape)
-    face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE)
+    face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE, photo.shape)
     grey_weights = weights[..., None].expand(-1, -1, 3)
     textures = weigh_batches(predict_olat(models, face, directions), grey_weights).mean(1)  # [M, T, T]
     height, width = picture.shape

@@ -90,16 +90,23 @@ def fit_face(
     return fit_landmarks(model, in_crop, crop, trust=trust_inside(in_crop, crop, *photo_shape[:2]))
 
 
-def unwrap_face(model: MorphableModel, fit: FaceFit, cropped: np.ndarray, texture_side: int) -> FaceTexture:
-    """Unwrap the crop [S, S, 3] into the chart (paper, 'Network Architecture': T_s and N_s)."""
+def unwrap_face(
+    model: MorphableModel,
+    fit: FaceFit,
+    cropped: np.ndarray,
+    texture_side: int,
+    photo_shape: tuple[int, ...],
+) -> FaceTexture:
+    """Unwrap the crop [S, S, 3] of a photo [H, W, ...] into the chart (paper, 'Network Architecture')."""
     vertices = fit.vertices_camera(model)
-    picture = torch.from_numpy(cropped).permute(2, 0, 1)
-    texture, visible = unwrap(picture, vertices, grid_triangles(), fit.camera, texture_side)
+    inside = fit.crop.valid(*photo_shape[:2])  # beyond the photo the crop only repeats its border
+    picture = torch.from_numpy(np.dstack([cropped, inside.astype(np.float32)])).permute(2, 0, 1)
+    unwrapped, visible = unwrap(picture, vertices, grid_triangles(), fit.camera, texture_side)
+    texture, visible = unwrapped[:3], visible * (unwrapped[3] > 0.99)
     if visible.max() < 0.5:
         raise InputError("the fitted face lies outside the picture; give its landmarks with --landmarks")
-    return FaceTexture(
-        inpaint(texture, visible), visible, normal_map(vertices, grid_triangles(), texture_side)
-    )
+    normals = normal_map(vertices, grid_triangles(), texture_side)
+    return FaceTexture(inpaint(texture, visible), visible, normals)
 
 
 @torch.no_grad()

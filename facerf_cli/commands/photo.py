@@ -175,7 +175,7 @@ def _fit_one(
     try:
         crop, cropped = crop_face(picture.pixels, landmarks_px, side * _CROP_PER_TEXTURE)
         fit = fit_face(model, crop, landmarks_px, picture.pixels.shape)
-        texture = unwrap_face(model, fit, cropped, side)
+        texture = unwrap_face(model, fit, cropped, side, picture.pixels.shape)
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
     if fit.quality == "poor":

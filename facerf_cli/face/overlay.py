@@ -41,6 +41,8 @@ def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarr
 def _wires(uv: np.ndarray, line_px: float) -> np.ndarray:
     """Opacity [h, w] in 0..1 of lines of constant u and v, about `line_px` wide on the screen."""
     lines = np.zeros(uv.shape[:2], np.float32)
+    if min(lines.shape) < 2:
+        return lines
     for coordinate in np.moveaxis(_CELLS * uv, -1, 0):
         down, right = np.gradient(coordinate)
         off_px = np.abs(coordinate - np.round(coordinate)) / np.maximum(np.hypot(down, right), 1e-6)
