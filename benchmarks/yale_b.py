@@ -32,7 +32,7 @@ from facerf_cli.pipeline import (
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera
 from facerf_cli.raster.texture import inpaint, sample_texture
 
-CROP_PX, TEXTURE_SIDE = 256, 256
+CROP_PX, TEXTURE_SIDE = 512, 256  # as the verbs have them
 _DARK = 0.02  # keeps ratios finite in the source's shadows
 
 
