@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -19,7 +19,7 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, 
     """Write tensors (floats in half precision) and metadata through a temporary name."""
     stored = {k: (t.half() if t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()}
     with atomic_path(path) as temporary:
-        save_file(stored, temporary, metadata={"format": FORMAT, "facerf": json.dumps(metadata)})
+        temporary.write_bytes(save(stored, {"format": FORMAT, "facerf": json.dumps(metadata)}))
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
