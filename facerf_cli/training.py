@@ -22,6 +22,7 @@ from facerf_cli.stage.bank import Bank
 from facerf_cli.stage.samples import Sample, draw_sample
 
 DEFAULT_NETWORK = ReflectanceSettings()
+CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,13 @@ def train(
     settings: TrainSettings = TrainSettings(),
     network_settings: ReflectanceSettings = DEFAULT_NETWORK,
     start_from: Path | None = None,
+    device: torch.device = CPU,
     report: Callable[[dict[str, float]], None] = lambda row: None,
 ) -> Path:
     """Train on `bank` until the time is up; returns the checkpoint, `folder/last.safetensors`.
 
-    `start_from` is a checkpoint whose weights to begin with. Rows go to `report` and `folder/log.jsonl`.
+    `start_from` is a checkpoint whose weights to begin with. Samples are drawn on the CPU, the network runs
+    on `device`. Rows go to `report` and `folder/log.jsonl`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
@@ -61,7 +64,7 @@ def train(
     if start_from:
         network.load_state_dict(load_checkpoint(start_from)[0])
     network.set_mean_face(*bank.mean_face())
-    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.98)
@@ -76,7 +79,7 @@ def train(
             heads = train_heads[torch.randint(len(train_heads), (settings.batch,), generator=generator)]
             sample = draw_sample(bank, heads, settings.lights, generator)
             drawing += time.monotonic() - drawn_at
-            loss = _loss(network, sample, settings.bf16)
+            loss = _loss(network, sample.to(device), settings.bf16)
             if not loss.isfinite():
                 where = f"step {step} (heads {heads.tolist()})"
                 raise FacerfError(f"the loss is not finite at {where}; {folder}/last.safetensors is good")
@@ -112,7 +115,7 @@ def _set_rate(optimizer: torch.optim.Optimizer, settings: TrainSettings, step: i
 
 
 def _loss(network: ReflectanceNetwork, sample: Sample, bf16: bool) -> Tensor:
-    with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+    with torch.autocast(sample.source.device.type, torch.bfloat16, enabled=bf16):
         encoded = network.encode(sample.source, sample.normals_source, sample.visible)
         root = network.decode_root(encoded, sample.normals_target, sample.lights)
     # The network divides by its own measure of exposure, which the fill of unseen texels does not enter.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from facerf_cli.commands.options import Settings, settings_of
+from facerf_cli.commands.options import Settings, settings_of, torch_device
 from facerf_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,7 +52,9 @@ def train(
     filled = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
     report = _Progress(training.max_seconds, quiet=settings.verbosity < 0)
     with report:
-        checkpoint = run_training(filled, output, training, start_from=start_from, report=report.row)
+        checkpoint = run_training(
+            filled, output, training, start_from=start_from, device=torch_device(settings), report=report.row
+        )
     print(checkpoint)
 
 

@@ -3,7 +3,7 @@
 Skins, lights and the camera are drawn anew for every sample (DESIGN, 'Baked transport').
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
@@ -36,6 +36,10 @@ class Sample:
     lights: Tensor
     target: Tensor
     weight: Tensor
+
+    def to(self, device: torch.device) -> "Sample":
+        """The same sample on `device`."""
+        return Sample(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 def draw_sample(bank: Bank, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
