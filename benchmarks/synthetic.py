@@ -1,6 +1,6 @@
 r"""Si-MSE of a checkpoint on the held-out synthetic heads of its bank, by pose and by the light's angle.
 
-    python benchmarks/synthetic.py --bank RUN/bank --fit-with builtin [--checkpoint RUN/last.safetensors]
+    python benchmarks/synthetic.py --bank RUN/bank [--checkpoint RUN/last.safetensors]
 
 Beside it stands its naive twin: the source's own texture, shaded by Lambert's cosine without shadows.
 """

@@ -1,7 +1,6 @@
-r"""Relight the real faces of Extended Yale B to its real point lights, and score that.
+"""Relight the real faces of Extended Yale B to its real point lights, and score that.
 
-    python benchmarks/yale_b.py --bench ../shared/bench/yale_b \
-        --data ../shared/data/extended_yale_b --out PRED
+    python benchmarks/yale_b.py [--data ../shared/data/extended_yale_b] [--out PRED]
 
 writes PRED/SUBJECT/SOURCE/LIGHT.npy, 168x192, aligned with the source, then runs the benchmark's scorer. The
 pictures are close to linear in light and taken as linear; a subject's sources share its frontal landmarks.
@@ -32,6 +31,7 @@ from facerf_cli.pipeline import (
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera
 from facerf_cli.raster.texture import inpaint, sample_texture
 
+SHARED = Path("../shared")
 CROP_PX, TEXTURE_SIDE = 512, 256  # as the verbs have them
 _DARK = 0.02  # keeps ratios finite in the source's shadows
 
@@ -41,15 +41,15 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--bench", type=Path, required=True, help="folder of the benchmark's yale.py and score.py"
+        "--data", type=Path, default=SHARED / "data/extended_yale_b", help="the yaleBXX folders"
     )
-    parser.add_argument("--data", type=Path, required=True, help="folder of the yaleBXX folders")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the predictions")
+    parser.add_argument(
+        "--bench", type=Path, default=SHARED / "bench/yale_b", help="its yale.py and score.py"
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/yale_b"), help="folder for the predictions")
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--face-model", default="builtin")
-    parser.add_argument(
-        "--subjects", nargs="*", help="only these, such as yaleB05 (scored as an incomplete set)"
-    )
+    parser.add_argument("--subjects", nargs="*", help="only these, such as yaleB05 (an incomplete set)")
     arguments = parser.parse_args()
     yale = load_yale(arguments.bench)
     data = yale.Yale(str(arguments.data))
