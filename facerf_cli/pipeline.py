@@ -24,14 +24,13 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
-_BYTES_PER_LIGHT = 220 * 128 * 128 * 4  # of features that the decoder holds at once, at its working side
-_CPU_BATCH = 4  # lights at a time; more of them leave the processor's cache and are slower
-_LIGHTS_ON_CPU = 16  # at once; more only cost memory, and the time to get it
+_DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
+_LIGHTS_ON_CPU = 4  # at a time; more of them leave the processor's cache and are slower
 
 
 @dataclass(frozen=True)
 class Models:
-    """The face model and the trained network, on one device."""
+    """The face model, on the processor as all geometry is, and the trained network on `device`."""
 
     face: MorphableModel
     network: ReflectanceNetwork
@@ -55,15 +54,15 @@ class FaceTexture:
 def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
     """Load what the arrows need; `checkpoint` None is the one shipped."""
     path = checkpoint or DEFAULT_CHECKPOINT
-    tensors, metadata = load_checkpoint(path)
-    if metadata.get("layout_version") != LAYOUT_VERSION:
-        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
-    network = build_network(path, tensors, metadata)
+    network, metadata = load_network(path)
     return Models(load_face_model(face_model), network.to(device).eval(), path.stem, metadata, device)
 
 
-def build_network(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> ReflectanceNetwork:
-    """The network that a checkpoint describes, with its weights."""
+def load_network(path: Path) -> tuple[ReflectanceNetwork, dict[str, Any]]:
+    """The network that a checkpoint describes, with its weights, and the checkpoint's metadata."""
+    tensors, metadata = load_checkpoint(path)
+    if metadata.get("layout_version") != LAYOUT_VERSION:
+        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
     try:
         configuration: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value
@@ -73,7 +72,7 @@ def build_network(path: Path, tensors: dict[str, Tensor], metadata: dict[str, An
         network.load_state_dict(tensors)
     except (KeyError, TypeError, RuntimeError, ValueError):
         raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
-    return network
+    return network, metadata
 
 
 def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tuple[Crop, np.ndarray]:
@@ -124,7 +123,8 @@ def predict_olat(
     """
     device, texels = models.device, face.texture.shape[-1] ** 2
     most = _LIGHTS_ON_CPU if device.type == "cpu" else len(lights)
-    batch = int(max(1, min(most, memory_bytes // (_BYTES_PER_LIGHT + 4 * 16 * texels))))
+    bytes_per_light = 4 * (_DECODER_CHANNELS * models.network.settings.side**2 + 16 * texels)
+    batch = max(1, min(most, memory_bytes // bytes_per_light))
     normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
     normals = normals[None].to(device)
     source = (face.texture[None], face.normals[None], face.visible[None, None])
@@ -154,12 +154,9 @@ def weigh_batches(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
     return total
 
 
-def turned(fit: FaceFit, rotation: Tensor) -> tuple[Tensor, Tensor]:
-    """The turn [3, 3] from the fit's pose to `rotation` (head_to_camera), and the target's translation [3].
-
-    The head turns about its own origin, which stays where it is.
-    """
-    return rotation @ fit.rotation.T, fit.translation_m
+def turn_to(fit: FaceFit, rotation: Tensor) -> Tensor:
+    """The turn [3, 3] of camera-space vectors that takes the fit's head to `rotation` (head_to_camera)."""
+    return rotation @ fit.rotation.T
 
 
 def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -14,10 +14,11 @@ from torch import Tensor
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.checkpoints import load_checkpoint, save_checkpoint
+from facerf_cli.files.checkpoints import save_checkpoint
 from facerf_cli.files.images import write_display
 from facerf_cli.network.losses import root_loss, si_mse
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.pipeline import load_network
 from facerf_cli.stage.bank import Bank
 from facerf_cli.stage.samples import Sample, draw_sample
 
@@ -54,15 +55,14 @@ def train(
 ) -> Path:
     """Train on `bank` until the time is up; returns the checkpoint, `folder/last.safetensors`.
 
-    `start_from` is a checkpoint whose weights to begin with. Samples are drawn on the CPU, the network runs
-    on `device`. Rows go to `report` and `folder/log.jsonl`.
+    `start_from` is a checkpoint whose weights to begin with, and whose settings hold then. Samples are drawn
+    on the CPU, the network runs on `device`. Rows go to `report` and `folder/log.jsonl`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
     generator = torch.Generator().manual_seed(settings.seed)
-    network = ReflectanceNetwork(network_settings)
-    if start_from:
-        network.load_state_dict(load_checkpoint(start_from)[0])
+    network = load_network(start_from)[0] if start_from else ReflectanceNetwork(network_settings)
+    network_settings = network.settings
     network.set_mean_face(*bank.mean_face())
     network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
@@ -81,8 +81,7 @@ def train(
             drawing += time.monotonic() - drawn_at
             loss = _loss(network, sample.to(device), settings.bf16)
             if not loss.isfinite():
-                where = f"step {step} (heads {heads.tolist()})"
-                raise FacerfError(f"the loss is not finite at {where}; {folder}/last.safetensors is good")
+                raise FacerfError(f"the loss is not finite at step {step} (heads {heads.tolist()})")
             optimizer.zero_grad(set_to_none=True)
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_clip)

@@ -83,11 +83,11 @@ class _PredictOlat:
         """OLATs in batches [l, 3, H, W], textures or pictures; small pictures [l, h, w, 3] go to `tiles`."""
         from torch.nn.functional import avg_pool2d
 
-        from facerf_cli.pipeline import predict_olat, render_face, turned
+        from facerf_cli.pipeline import predict_olat, render_face, turn_to
 
         models = load_models_once(self.photo)
         rotation = parse_pose(self.pose)
-        turn = None if rotation is None else turned(face.fit, rotation)[0]
+        turn = None if rotation is None else turn_to(face.fit, rotation)
         bf16 = self.precision == "bf16"
         large, small = self._see(face), self._see(face, 2 * _TILE_PX)
         for textures in predict_olat(models, face.texture, directions, turn, self.memory_bytes, bf16):
@@ -112,13 +112,13 @@ class _PredictOlat:
         from facerf_cli.face.fit import fit_to_arrays
         from facerf_cli.face.topology import LAYOUT_VERSION
         from facerf_cli.files.olat_stack import StackHeader
-        from facerf_cli.pipeline import render_face, turned
+        from facerf_cli.pipeline import render_face, turn_to
 
         posed, texture = self._posed(face), face.texture
         source, normals, seen = texture.texture, texture.normals, texture.visible
         if self.image:
             uv, seen = self._see(face)
-            turn, _ = turned(face.fit, posed.rotation)
+            turn = turn_to(face.fit, posed.rotation)
             both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
             source, normals = render_face(both, uv, seen)
         metadata = provenance(item, self.photo, load_models_once(self.photo).checkpoint_name)

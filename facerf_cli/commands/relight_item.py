@@ -79,7 +79,8 @@ class Relight:
 
         models = load_models_once(self.photo)
         size_px = picture.pixels.shape[0], picture.pixels.shape[1]
-        vertices, turn = self._turned(face.fit, face.fit.vertices_camera(models.face))
+        fit, turn = self._turned(face.fit)
+        vertices = fit.vertices_camera(models.face)
         directions, weights = light_photos(self.shots, self.rig, self.sampling)
         canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(picture, size_px))
 
@@ -90,15 +91,12 @@ class Relight:
         metadata = provenance(item, self.photo, models.checkpoint_name)
         yield from self._write_shots(item, face.tag, canvas, relit, metadata)
 
-    def _turned(self, fit: "FaceFit", vertices: "Tensor") -> "tuple[Tensor, Tensor | None]":
-        """The mesh [V, 3] in the target's pose, and the turn that brings it there, if there is one."""
-        from facerf_cli.pipeline import turned
+    def _turned(self, fit: "FaceFit") -> "tuple[FaceFit, Tensor | None]":
+        """The fit in the target's pose, and the turn [3, 3] that brings it there, if there is one."""
+        from facerf_cli.pipeline import turn_to
 
         rotation = parse_pose(self.pose)
-        if rotation is None:
-            return vertices, None
-        turn, translation_m = turned(fit, rotation)
-        return (vertices - translation_m) @ turn.mT + translation_m, turn
+        return (fit, None) if rotation is None else (replace(fit, rotation=rotation), turn_to(fit, rotation))
 
     def _backdrop(self, picture: "Picture", size_px: tuple[int, int]) -> Backdrop | None:
         if self.composite == "face":

@@ -41,14 +41,14 @@ def train(
     Heads are drawn from a face model and their light transport is baked once; skins, lights and cameras are
     drawn anew at every step. DIR gets last.safetensors (for --checkpoint), log.jsonl and validation.png.
     """
-    from facerf_cli.files.checkpoints import load_checkpoint
+    from facerf_cli.pipeline import load_network
     from facerf_cli.training import TrainSettings
     from facerf_cli.training import train as run_training
 
     settings = settings_of(context)
     training = TrainSettings(max_seconds=_seconds(max_time), seed=settings.seed)
     if start_from:
-        load_checkpoint(start_from)  # a bad file is named before hours of baking
+        load_network(start_from)  # a bad file is named before hours of baking
     filled = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
     report = _Progress(training.max_seconds, quiet=settings.verbosity < 0)
     with report:

@@ -2,6 +2,8 @@ from pathlib import Path
 
 import pytest
 
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.checkpoints import save_checkpoint
 from facerf_cli.main import main
 
 
@@ -27,4 +29,14 @@ def test_a_bad_start_is_named_before_baking(tmp_path: Path, capsys: pytest.Captu
     start.write_text("nothing")
     assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
     assert "not a facerf checkpoint" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = tmp_path / "start.safetensors"
+    save_checkpoint(start, {}, {"layout_version": LAYOUT_VERSION, "network": {"side": 64}})
+    assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
+    assert f"{start}: its weights do not fit" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -3,9 +3,8 @@ from pathlib import Path
 
 import torch
 
-from facerf_cli.files.checkpoints import load_checkpoint
 from facerf_cli.network.reflectance import ReflectanceSettings
-from facerf_cli.pipeline import build_network
+from facerf_cli.pipeline import load_network
 from facerf_cli.stage.bank import Bank
 from facerf_cli.training import TrainSettings, train
 
@@ -23,8 +22,7 @@ def test_training_lowers_the_loss_and_writes_a_checkpoint_that_loads(bank: Bank,
     losses = torch.tensor([row["loss"] for row in rows])
     assert len(losses) > 20
     assert losses[-10:].mean() < 0.9 * losses[:10].mean()
-    tensors, metadata = load_checkpoint(path)
-    network = build_network(path, tensors, metadata)
+    network, metadata = load_network(path)
     assert network.settings == NETWORK and metadata["metrics"]["si_mse"] > 0
     assert metadata["licence"] == "MIT"
     assert (tmp_path / "validation.png").stat().st_size > 1000
