@@ -1,6 +1,7 @@
-"""Values that verbs read from options: poses, directions of light, sizes of textures. Wrong ones exit 2."""
+"""Values that verbs read from options: numbers, poses, directions of light. Wrong ones exit 2."""
 
 import math
+import os.path
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,7 +46,8 @@ def parse_directions(text: str) -> "Tensor":
         if not 1 <= int(text) <= MOST_LIGHTS:
             raise UsageError(f"--lights {text}: from 1 to {MOST_LIGHTS} lights can be had")
         return rig_directions(int(text))
-    pairs = _lines(Path(text)) if Path(text).is_file() else [part for part in text.split(";") if part.strip()]
+    is_file = os.path.isfile(text)  # Path's own raises where a long list is no possible name
+    pairs = _lines(Path(text)) if is_file else [part for part in text.split(";") if part.strip()]
     if not pairs or "," not in pairs[0]:
         raise UsageError(f"--lights {text!r}: {_DIRECTIONS_HELP}")
     if len(pairs) > MOST_LIGHTS:

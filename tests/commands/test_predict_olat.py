@@ -109,6 +109,12 @@ def test_lights_from_a_file(given: Path, tmp_path: Path) -> None:
     assert len(stack.header.directions) == 2 and stack.header.directions[1, 0] < 0
 
 
+def test_a_long_list_of_lights_is_no_file_name(given: Path, tmp_path: Path) -> None:
+    many = ";".join(f"{azimuth_deg},{azimuth_deg / 4}" for azimuth_deg in range(60))
+    assert len(many) > 256
+    assert predict(given, tmp_path, "--lights", many, "--dry-run") == 0
+
+
 def test_all_faces_get_a_number_and_finished_ones_are_skipped(given: Path, tmp_path: Path) -> None:
     line = ["--lights", "1", "--face", "all"]
     assert predict(given, tmp_path, *line) == 0
