@@ -61,7 +61,7 @@ class FitBatch:
     translation_m: Tensor  # [B, 3]
     alpha: Tensor  # [B, Ki]
     beta: Tensor  # [B, Ke]
-    error_iod: Tensor  # [B], mean distance of the landmarks over that of the outer eye corners
+    error_iod: Tensor  # [B], mean distance of the trusted landmarks over that of the outer eye corners
 
     def vertices_camera(self, model: MorphableModel) -> Tensor:
         """The mesh in camera space [B, V, 3], float32."""
@@ -80,7 +80,7 @@ class FaceFit:
     alpha: Tensor  # [Ki]
     beta: Tensor  # [Ke]
     landmarks_px: Tensor  # [68, 2], as given, in the crop's pixels
-    error_iod: float  # mean distance of the landmarks over that of the outer eye corners
+    error_iod: float  # mean distance of the trusted landmarks over that of the outer eye corners
 
     @property
     def camera(self) -> Camera:
@@ -178,10 +178,16 @@ def fit_from_arrays(arrays: Mapping[str, np.ndarray]) -> FaceFit:
     for name, shape in (("rotation", (3, 3)), ("translation_m", (3,)), ("landmarks_px", (68, 2))):
         if tensors[name].shape != shape:
             raise ValueError(f"{name} has the shape {tuple(tensors[name].shape)}, not {shape}")
+    if tensors["alpha"].ndim != 1 or tensors["beta"].ndim != 1:
+        raise ValueError("alpha and beta are no lists of coefficients")
     x0_px, y0_px, side_px, error_iod = (float(arrays[k]) for k in ("x0_px", "y0_px", "side_px", "error_iod"))
     crop = Crop(x0_px, y0_px, side_px, int(arrays["size_px"]))
     if not (0 < side_px < np.inf and 0 < crop.size_px <= _LARGEST_CROP_PX):
         raise ValueError(f"a crop of {side_px} pixels seen as {crop.size_px}")
+    if not (
+        all(tensor.isfinite().all() for tensor in tensors.values()) and np.isfinite([x0_px, y0_px]).all()
+    ):
+        raise ValueError("it holds values that are not finite")
     return FaceFit(str(arrays["model"]), crop, error_iod=error_iod, **tensors)
 
 

@@ -13,7 +13,9 @@ from facerf_cli.face.fit import (
     FitSettings,
     _basis,
     fit_batch,
+    fit_from_arrays,
     fit_landmarks,
+    fit_to_arrays,
     load_fit,
     save_fit,
     trust_inside,
@@ -176,6 +178,19 @@ def test_what_is_no_fit_is_refused(tmp_path):
     for name in ("text.npz", "other.npz", "missing.npz"):
         with pytest.raises(InputError, match=name):
             load_fit(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("alpha", np.zeros((80, 2))), ("rotation", np.full((3, 3), np.nan)), ("x0_px", np.inf)],
+)
+def test_arrays_that_are_no_fit_are_refused(model, name, value):
+    arrays = fit_to_arrays(
+        fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
+    )
+    assert fit_from_arrays(arrays).crop == CROP
+    with pytest.raises(ValueError, match=r"coefficients|finite"):
+        fit_from_arrays(arrays | {name: np.asarray(value)})
 
 
 def test_a_fit_knows_its_model_and_its_quality(model):
