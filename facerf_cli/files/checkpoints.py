@@ -31,6 +31,8 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
         metadata = json.loads(header["facerf"])
+        if not isinstance(metadata, dict):
+            raise ValueError("its metadata is no JSON object")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(
             f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"

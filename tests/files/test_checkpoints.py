@@ -24,7 +24,7 @@ class _Bomb:
         return (print, ("a pickle was loaded",))
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "pickle", "truncated", "foreign"])
+@pytest.mark.parametrize("kind", ["missing", "text", "pickle", "truncated", "foreign", "list"])
 def test_what_is_no_checkpoint_is_refused_in_one_line(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -38,6 +38,8 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(
         path.write_bytes(path.read_bytes()[:-60])
     elif kind == "foreign":
         save_file({"w": torch.zeros(2)}, path)
+    elif kind == "list":
+        save_file({"w": torch.zeros(2)}, path, {"format": "facerf-checkpoint-1", "facerf": "[]"})
     with pytest.raises(InputError, match=r"b\.safetensors") as caught:
         load_checkpoint(path)
     assert "\n" not in str(caught.value)
