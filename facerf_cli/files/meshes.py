@@ -44,9 +44,9 @@ def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
         _with(mesh, material), include_normals=True, mtl_name=mtl_path.name, header=header
     )
     with atomic_path(mtl_path) as temporary:
-        temporary.write_text(f"newmtl face\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture_name}\n")
+        temporary.write_text(f"newmtl face\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture_name}\n", "utf-8")
     with atomic_path(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, "utf-8")
 
 
 def _with(mesh: TexturedMesh, material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
