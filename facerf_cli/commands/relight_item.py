@@ -161,25 +161,36 @@ class Relight:
         relit: "Callable[[slice], Tensor]",
         metadata: dict[str, Any],
     ) -> Iterator[tuple[Path, float]]:
-        """All shots, as many at a time as fit the memory; one prediction serves those."""
+        """All shots, as many at a time as fit the memory; one prediction serves those.
+
+        Where they do not fit at once, automatic exposure costs a round of its own.
+        """
         at_once = max(1, self.memory_bytes // (_HELD * 12 * canvas.seen.numel()))
-        for first in range(0, len(self.shots), at_once):
-            shots = self.shots[first : first + at_once]
-            textures = relit(slice(first, first + at_once))
-            exposures_ev = self._exposures_ev(shots, textures, canvas)
-            for shot, texture in zip(shots, textures, strict=True):
+        parts = [slice(first, first + at_once) for first in range(0, len(self.shots), at_once)]
+        whole = relit(parts[0]) if len(parts) == 1 else None
+
+        def textures_of(part: slice) -> "Tensor":
+            return relit(part) if whole is None else whole
+
+        exposures_ev = self._exposures_ev(parts, textures_of, canvas)
+        for part in parts:
+            for shot, texture in zip(self.shots[part], textures_of(part), strict=True):
                 path = shot.output(item, tag, ".exr")
                 canvas.write(path, texture, exposures_ev[shot.name], metadata)
                 yield path, exposures_ev[shot.name]
 
     def _exposures_ev(
-        self, shots: Iterable[Shot], textures: "Tensor", canvas: Canvas | ImageCanvas
+        self,
+        parts: Iterable[slice],
+        textures_of: "Callable[[slice], Tensor]",
+        canvas: Canvas | ImageCanvas,
     ) -> dict[str, float]:
         """By name of the light: one for all its frames, so that a turning sky does not pump."""
+        if self.exposure_ev is not None:
+            return dict.fromkeys((shot.name for shot in self.shots), self.exposure_ev)
         found: dict[str, float] = {}
-        for shot, texture in zip(shots, textures, strict=True):
-            chosen_ev = self.exposure_ev
-            if chosen_ev is None:
+        for part in parts:
+            for shot, texture in zip(self.shots[part], textures_of(part), strict=True):
                 chosen_ev = round(canvas.auto_exposure_ev(texture), 2)
-            found[shot.name] = min(chosen_ev, found.get(shot.name, chosen_ev))
+                found[shot.name] = min(chosen_ev, found.get(shot.name, chosen_ev))
         return found

@@ -91,6 +91,16 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     assert len(predicted) == 1  # finished already
 
 
+def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.commands.relight_item._HELD", 1 << 30)  # so that one frame fits
+    line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
+    assert relight(given, tmp_path, *line) == 0
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert len(row["exposure_ev"]) == 3 and len(set(row["exposure_ev"].values())) == 1
+
+
 def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
     assert relight(given, tmp_path, "--light", "40,10") == 0
     stream = oiio.ImageInput.open(str(tmp_path / "astronaut_light_40_10.exr"))
