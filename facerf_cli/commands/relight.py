@@ -139,17 +139,17 @@ def relight(
         raise FacerfError("no map can be used")
     mode: Composite = composite or ("photo" if pose is None else "face")
     work = Relight(
-        photo,
-        shots,
-        lights,
-        envmap_sampling,
-        pose,
-        mode,
-        not keep_background,
-        matte,
-        exposure_ev,
-        int(memory * 2**30),
-        composite == "photo",
+        photo=photo,
+        shots=shots,
+        rig=lights,
+        sampling=envmap_sampling,
+        pose=pose,
+        composite=mode,
+        surround=not keep_background,
+        matte=matte,
+        exposure_ev=exposure_ev,
+        memory_bytes=int(memory * 2**30),
+        asked_for_photo=composite == "photo",
     )
     if not dry_run:
         load_models_once(photo)
