@@ -145,8 +145,8 @@ class ReflectanceNetwork(nn.Module):
 
     def head_rotation(self, normals: Tensor) -> Tensor:
         """head_to_camera [B, 3, 3], from the mean face's normals to camera-space normals [B, 3, T, T]."""
-        small = _resize(normals, _MAP_SIDE).double()
-        moment = torch.einsum("bcij,dij->bcd", small, self.mean_normals.double())
+        small = _resize(normals, _MAP_SIDE).cpu().double()  # Apple's GPUs have no doubles
+        moment = torch.einsum("bcij,dij->bcd", small, self.mean_normals.cpu().double())
         u, _, vt = torch.linalg.svd(moment)
         sign = torch.det(u @ vt)
         flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1))
