@@ -20,7 +20,7 @@ from torch import Tensor
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.regions import region_mask
 from facerf_cli.face.topology import grid_triangles, grid_uv
-from facerf_cli.raster.camera import Camera
+from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, sample_texture, vertex_normals
 
@@ -34,9 +34,9 @@ _SURROUND_PX = 64  # along a crop there
 
 @dataclass(frozen=True)
 class CompositeSettings:
-    """Lengths are shares of the crop's side."""
+    """Lengths (feather, spread, reach) are shares of the crop's side."""
 
-    dark: float = 0.08  # e above, in mean luminances of the source
+    dark: float = 0.08  # e above, a share of the source's mean
     feather: float = 0.04  # of the mask's border, inward
     spread: float = 0.04  # standard deviation of the blur of the change of light around the face
     reach: float = 0.22  # of that change to the side; further off all follows the mean change
@@ -110,9 +110,8 @@ def view_face(
 
 def _window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
     """First row and column of the part of the picture that holds the mesh, a pixel to spare; its camera."""
-    depth = -vertices_camera[:, 2].clamp(max=-_TINY)
-    x = camera.cx_px + camera.focal_px * vertices_camera[:, 0] / depth
-    y = camera.cy_px - camera.focal_px * vertices_camera[:, 1] / depth
+    in_front = torch.cat([vertices_camera[:, :2], vertices_camera[:, 2:].clamp(max=-_TINY)], 1)
+    x, y = project(in_front, camera).T
     left, right = (int(v.floor().clamp(0, camera.width_px - 1)) for v in (x.min() - 1, x.max() + 1))
     top, bottom = (int(v.floor().clamp(0, camera.height_px - 1)) for v in (y.min() - 1, y.max() + 1))
     width, height = right + 1 - left, bottom + 1 - top
@@ -191,8 +190,8 @@ class Surround:
     ) -> None:
         side = _SURROUND * _SURROUND_PX
         self._settings = settings
-        self._camera = Camera(4.0 * _SURROUND_PX, side, side, side / 2, side / 2)
-        self._view = view_face(vertices_camera, self._camera, _SURROUND_PX, settings)
+        camera = Camera(CROP_FOCAL_PER_SIDE * _SURROUND_PX, side, side, side / 2, side / 2)
+        self._view = view_face(vertices_camera, camera, _SURROUND_PX, settings)
         self._mask = torch.from_numpy(self._view.full(self._view.mask))
         outside = (self._mask < 0.5).numpy()
         away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
@@ -220,6 +219,6 @@ class Surround:
     @staticmethod
     def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:
         """Where each pixel of the photo lies in the square, for grid_sample [1, H, W, 2]."""
-        x = ((torch.arange(width_px) + 0.5 - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
-        y = ((torch.arange(height_px) + 0.5 - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
+        x = ((torch.arange(width_px) + PIXEL_CENTRE - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
+        y = ((torch.arange(height_px) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
         return torch.stack([x.expand(height_px, -1), y[:, None].expand(-1, width_px)], -1)[None].float()

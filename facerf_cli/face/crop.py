@@ -106,7 +106,7 @@ def _resampler(length: int, start_px: float, side_px: float, size_px: int) -> cs
     """Weights [size, length] of a one-dimensional Catmull-Rom resampling with replicated ends."""
     step = side_px / size_px
     width = max(step, 1.0)  # photo pixels in a unit of the kernel
-    centres_px = start_px + (np.arange(size_px) + 0.5) * step
+    centres_px = start_px + (np.arange(size_px) + PIXEL_CENTRE) * step
     taps = math.ceil(4 * width) + 1
     index = np.floor(centres_px - PIXEL_CENTRE - 2 * width).astype(np.int64)[:, None] + np.arange(taps + 1)
     weights = _catmull_rom((index + PIXEL_CENTRE - centres_px[:, None]) / width)
