@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
-from facerf_cli.raster.rasterize import Fragments, interpolate, rasterize
+from facerf_cli.raster.rasterize import interpolate, rasterize
 
 _TINY = 1e-12
 
@@ -87,13 +87,7 @@ def render_texture(
 
     `uv` [V, 2] are the vertices'. Differentiable in the texture and, by the interpolation, in the vertices.
     """
-    return shade_texture(texture, triangles, uv, rasterize(vertices_camera, triangles, camera))
-
-
-def shade_texture(
-    texture: Tensor, triangles: Tensor, uv: Tensor, fragments: Fragments
-) -> tuple[Tensor, Tensor]:
-    """`render_texture` of a mesh that is rasterized already, so that many textures share one z-buffer."""
+    fragments = rasterize(vertices_camera, triangles, camera)
     coverage = fragments.covered.to(texture.dtype)
     picture = sample_texture(texture, interpolate(uv, triangles, fragments))
     return picture * coverage[..., None], coverage
