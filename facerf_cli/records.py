@@ -13,14 +13,11 @@ from rich.console import Console
 
 from facerf_cli import __version__
 
-# IPTC's vocabulary of digital sources (cv.iptc.org/newscodes/digitalsourcetype): a photo changed by a trained
-# model, and a picture that came out of a trained model alone.
+# IPTC's vocabulary of digital sources (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model.
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
-SYNTHETIC_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/trainedAlgorithmicMedia"
 
-STDERR = Console(
-    stderr=True
-)  # shared by the log and the progress bar, so that they do not overwrite each other
+# Shared by the log and the progress bars, so that they do not overwrite each other.
+STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
 
 
@@ -32,7 +29,6 @@ class Provenance:
     checkpoint_name: str = ""
     face_model_name: str = ""
     face_model_licence: str = ""
-    source_type: str = COMPOSITE_SOURCE_TYPE
 
     def attributes(self) -> dict[str, str | int]:
         """Metadata for a file's header; empty fields are left out."""
@@ -40,7 +36,7 @@ class Provenance:
             "Software": f"facerf {__version__}",
             "facerf:version": __version__,
             "facerf:synthetic": 1,
-            "IPTC:DigitalSourceType": self.source_type,
+            "IPTC:DigitalSourceType": COMPOSITE_SOURCE_TYPE,
             "facerf:input": self.input_name,
             "facerf:checkpoint": self.checkpoint_name,
             "facerf:face_model": self.face_model_name,
