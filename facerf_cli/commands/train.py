@@ -1,6 +1,7 @@
 """`facerf train`: bake synthetic heads, then train the Reflectance Network on them."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,6 +9,7 @@ import typer
 
 from facerf_cli.commands.options import Settings, settings_of, torch_device
 from facerf_cli.errors import UsageError
+from facerf_cli.records import STDERR
 
 if TYPE_CHECKING:
     from facerf_cli.stage.bank import Bank
@@ -50,7 +52,7 @@ def train(
     if start_from:
         load_network(start_from)  # a bad file is named before hours of baking
     filled = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
-    report = _Progress(training.max_seconds, quiet=settings.verbosity < 0)
+    report = _Progress(training.max_seconds, settings)
     with report:
         checkpoint = run_training(
             filled, output, training, start_from=start_from, device=torch_device(settings), report=report.row
@@ -75,24 +77,25 @@ def _fill_bank(
     drawn, fitted = load_face_model(heads_from), load_face_model(fit_with)
     build_geometries(folder / "heads", heads_from, heads, jobs, settings.seed)
     add_views(folder / "heads", folder / f"views-{fitted.name}", fit_with, views, jobs, settings.seed)
+    filled = load_bank(folder / "heads", folder / f"views-{fitted.name}", {})
     provenance = {
-        "heads": f"{heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "heads": f"{len(filled.geometries)} synthetic heads drawn from {drawn.name} ({drawn.licence})",
         "fitted_with": f"{fitted.name} ({fitted.licence})",
         "skin": "procedural (facerf)",
         "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
-    return load_bank(folder / "heads", folder / f"views-{fitted.name}", provenance)
+    return replace(filled, provenance=provenance)
 
 
 class _Progress:
-    """A bar on stderr: time, step, loss, and the share of time spent drawing samples."""
+    """A bar on stderr where that is a terminal: time, step, loss, and the share of time that drawing takes."""
 
-    def __init__(self, total_s: float, quiet: bool) -> None:
-        from rich.console import Console
+    def __init__(self, total_s: float, settings: Settings) -> None:
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        self.bar = Progress(*columns, console=Console(stderr=True), disable=quiet)
+        shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+        self.bar = Progress(*columns, console=STDERR, disable=not shown)
         self.task = self.bar.add_task("training", total=total_s)
         self.smooth: float | None = None
 

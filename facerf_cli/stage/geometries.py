@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from safetensors import safe_open
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sphere import rig_directions
@@ -42,8 +44,12 @@ def build_geometries(
     seed: int,
     settings: GeometrySettings = GeometrySettings(),
 ) -> None:
-    """Bake `count` heads into `folder`, 00000 (the mean) and on; finished ones are kept."""
+    """Bake `count` heads into `folder`, 00000 (the mean) and on; finished ones are kept.
+
+    Heads of another face model are an InputError: they would be trained on under this one's name and licence.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    _require_heads_of(load_face_model(face_model).name, folder)
     missing = [index for index in range(count) if not (folder / f"{index:05d}.safetensors").exists()]
     shards = [missing[job::jobs] for job in range(jobs)]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
@@ -51,6 +57,14 @@ def build_geometries(
             pool.submit(_build_shard, folder, face_model, shard, seed, settings) for shard in shards
         ]:
             done.result()
+
+
+def _require_heads_of(name: str, folder: Path) -> None:
+    for path in sorted(folder.glob("*.safetensors")):
+        with safe_open(path, framework="pt") as file:
+            found = (file.metadata() or {}).get("face_model")
+        if found != name:
+            raise InputError(f"{path}: a head of the face model {found}, not of {name}; give another --bank")
 
 
 def _build_shard(

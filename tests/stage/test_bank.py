@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,7 +7,7 @@ import torch
 from safetensors.torch import load_file
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.bank import Bank, load_bank
 from facerf_cli.stage.geometries import bake_head, build_geometries, draw_coefficients
@@ -26,6 +27,12 @@ def test_finished_heads_are_kept_and_a_lost_one_comes_back_the_same(bank_folder:
     build_geometries(bank_folder / "heads", "builtin", 6, jobs=1, seed=1, settings=TINY)
     assert [path.read_bytes() for path in sorted((bank_folder / "heads").iterdir())] == before
     assert paths[0].stat().st_mtime_ns == kept
+
+
+def test_heads_of_another_model_are_not_taken_for_this_ones(bank_folder: Path, tmp_path: Path) -> None:
+    save_face_model(tmp_path / "other.npz", replace(load_face_model(), name="other"))
+    with pytest.raises(InputError, match="a head of the face model builtin, not of other"):
+        build_geometries(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
 
 
 def test_head_zero_is_the_mean_face_under_the_unturned_rig() -> None:
