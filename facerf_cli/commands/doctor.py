@@ -16,7 +16,6 @@ from facerf_cli.commands.options import Settings, settings_of, torch_device
 from facerf_cli.errors import FacerfError
 from facerf_cli.records import json_line
 
-ASSETS = Path(__file__).parents[1] / "assets"
 _WIDTH = 100
 MISSING = "MISSING"
 
@@ -36,6 +35,9 @@ def doctor(
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:
     """Everything that the doctor looks at, by section."""
+    from facerf_cli.face.morphable import BUILTIN_PATH
+    from facerf_cli.pipeline import DEFAULT_CHECKPOINT
+
     return {
         "facerf": {
             "version": __version__,
@@ -45,8 +47,8 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
         "packages": _packages(),
         "device": _device(settings),
         "assets": {
-            "face model": _face_model(ASSETS / "builtin_face.npz"),
-            "checkpoint": _checkpoint(settings.checkpoint or _default_checkpoint()),
+            "face model": _face_model(BUILTIN_PATH),
+            "checkpoint": _checkpoint(settings.checkpoint or DEFAULT_CHECKPOINT),
             "landmarks": _landmark_model(),
         },
         "colour": _colour_configuration(),
@@ -111,10 +113,6 @@ def _face_model(path: Path) -> dict[str, str]:
             return {"name": str(arrays["name"]), "licence": str(arrays["licence"]), "size": _size(path)}
     except (ValueError, OSError, KeyError) as error:
         return {"name": f"{MISSING}: damaged, {error}", "file": str(path)}
-
-
-def _default_checkpoint() -> Path:
-    return next(iter(sorted(ASSETS.glob("*.safetensors"))), ASSETS / "default.safetensors")
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
