@@ -130,9 +130,11 @@ def relight(
         raise UsageError("--pose turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
     parse_directions(lights)
-    exposure_ev = None if exposure == "auto" else numbers(exposure, (1,), "--exposure")[0]
+    exposure_ev = None if exposure == "auto" else numbers(exposure, ("EV or auto",), "--exposure")[0]
     photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, texture_size)
     photo.check()
+    if matte is not None and not matte.is_file():
+        raise UsageError(f"--matte {matte}: no such file")
     asked = collect_shots(envmap or (), rotate, light or (), output)
     shots = usable(asked)
     if not shots:
@@ -153,8 +155,8 @@ def relight(
     )
     if not dry_run:
         load_models_once(photo)
-        if ball:
-            write_balls(shots, output, exposure_ev, overwrite)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch("relight", inputs, work, work.outputs_of, options, settings)
+    if ball and not dry_run:
+        write_balls(shots, output, exposure_ev, overwrite)
     raise typer.Exit(max(code, int(len(shots) < len(asked))))

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from facerf_cli.commands.inputs import Item, collect_items
-from facerf_cli.commands.values import numbers, parse_directions
+from facerf_cli.commands.values import azel, numbers, parse_directions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import LOGGER_NAME, Provenance
 
@@ -78,10 +78,10 @@ def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
     if text is None:
         return [("", "", 0.0)]
     if ":" not in text:
-        degrees = numbers(text, (1,), "--rotate")[0]
+        degrees = numbers(text, ("DEG or FROM:TO:N",), "--rotate")[0]
         return [(f"_rot{degrees:g}", "", degrees)]
     try:
-        start, end, count = numbers(text.replace(":", ","), (3,), "--rotate")
+        start, end, count = numbers(text.replace(":", ","), ("FROM,TO,N",), "--rotate")
     except UsageError:
         count = 0.0
     if not (count.is_integer() and 1 <= count <= _MOST_FRAMES):
@@ -174,7 +174,7 @@ def _expand_glob(entry: str) -> list[str]:
 def _lamp_shot(text: str) -> Shot:
     """`az,el[,r,g,b][;...]`: lamps that shine together."""
     parts = [part for part in text.split(";") if part.strip()] or [""]
-    given = [numbers(part, (2, 5), "--light") for part in parts]
+    given = [azel(part, ("AZ,EL", "AZ,EL,R,G,B"), "--light") for part in parts]
     name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
     lamps = tuple(tuple(values) if len(values) == 5 else (*values, 1.0, 1.0, 1.0) for values in given)
     return Shot(f"light_{name}", lamps=lamps)

@@ -15,15 +15,25 @@ _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 
 
-def numbers(text: str, counts: tuple[int, ...], option: str) -> list[float]:
-    """Finite numbers separated by commas, as many as one of `counts`."""
+def numbers(text: str, forms: tuple[str, ...], option: str) -> list[float]:
+    """Finite numbers separated by commas, as many as one of `forms` ("AZ,EL") has names."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = []
-    if len(values) not in counts or not all(map(math.isfinite, values)):
-        wanted = " or ".join(map(str, counts))
-        raise UsageError(f"{option} {text!r}: {wanted} numbers with commas between them are needed")
+    if len(values) not in [form.count(",") + 1 for form in forms] or not all(map(math.isfinite, values)):
+        kind = "numbers with commas between them" if "," in forms[0] else "a number"
+        raise UsageError(f"{option} {text!r}: give {' or '.join(forms)}, {kind}")
+    return values
+
+
+def azel(text: str, forms: tuple[str, ...], option: str) -> list[float]:
+    """`numbers` that begin with azimuth and elevation in degrees; colours, if any, follow."""
+    values = numbers(text, forms, option)
+    if abs(values[1]) > 90:
+        raise UsageError(f"{option} {text!r}: an elevation is from -90 (below) to 90 (above)")
+    if min(values[2:], default=0) < 0:
+        raise UsageError(f"{option} {text!r}: a light's colour is not negative")
     return values
 
 
@@ -33,7 +43,7 @@ def parse_pose(text: str | None) -> "Tensor | None":
 
     if text is None:
         return None
-    return pose_to_rotation(*numbers(text, (3,), "--pose"))
+    return pose_to_rotation(*numbers(text, ("YAW,PITCH,ROLL",), "--pose"))
 
 
 def parse_directions(text: str) -> "Tensor":
@@ -52,7 +62,8 @@ def parse_directions(text: str) -> "Tensor":
         raise UsageError(f"--lights {text!r}: {_DIRECTIONS_HELP}")
     if len(pairs) > MOST_LIGHTS:
         raise UsageError(f"--lights: {len(pairs)} lights; at most {MOST_LIGHTS} can be had")
-    azimuth, elevation = torch.tensor([numbers(pair, (2,), "--lights") for pair in pairs]).T
+    option = f"--lights {text}:" if is_file else "--lights"
+    azimuth, elevation = torch.tensor([azel(pair, ("AZ,EL",), option) for pair in pairs]).T
     return azel_to_direction(azimuth, elevation)
 
 

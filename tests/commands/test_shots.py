@@ -18,6 +18,7 @@ from facerf_cli.commands.shots import (
     usable,
     write_balls,
 )
+from facerf_cli.commands.values import parse_directions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
@@ -84,10 +85,20 @@ def test_wrong_rotations(text: str) -> None:
         parse_rotations(text)
 
 
-@pytest.mark.parametrize("text", ["", ";", "1", "1,2,3", "a,b", "1,2,3,4,5,6", "1,inf"])
+@pytest.mark.parametrize("text", ["", ";", "1", "1,2,3", "a,b", "1,2,3,4,5,6", "1,inf", "0,91", "0,0,1,-1,0"])
 def test_wrong_lamps(text: str) -> None:
     with pytest.raises(UsageError, match="--light"):
         collect_shots([], None, [text], Path("out"))
+
+
+def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,R,G,B, numbers with commas"):
+        collect_shots([], None, ["60"], Path("out"))
+    with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
+        parse_rotations("left")
+    (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
+    with pytest.raises(UsageError, match=r"rig\.txt: '0,100': an elevation is from -90"):
+        parse_directions(str(tmp_path / "rig.txt"))
 
 
 def test_no_light_and_the_same_light_twice() -> None:
