@@ -80,7 +80,8 @@ def run_batch(
         return _say_what_would_be_done(todo, finished, outputs_of)
     report = _open_report(options.output / REPORT_NAME, verb, todo, finished, outputs_of)
     if finished:
-        log.info("%d of %d already finished (--overwrite makes them anew)", len(finished), len(items))
+        advice = "--overwrite makes them anew, as other options would have them"
+        log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
     work = _Work(process)
     parallel = options.jobs > 1 and len(todo) > 1
     results = in_processes(work, todo, options.jobs, _broken) if parallel else map(work, todo)
@@ -158,7 +159,11 @@ def _open_report(
         with atomic_path(path) as temporary:
             temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
     except FacerfError as error:
-        raise UsageError(f"output folder {error}") from error
+        cause = error.__cause__
+        reason = cause.strerror if isinstance(cause, OSError) else error
+        raise UsageError(
+            f"-o {path.parent}: cannot write to such a folder ({reason}); give another one"
+        ) from error
     return path
 
 

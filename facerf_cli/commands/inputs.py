@@ -9,7 +9,9 @@ from pathlib import Path
 
 from facerf_cli.errors import UsageError
 
-PHOTO_SUFFIXES = frozenset({".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
+PHOTO_SUFFIXES = frozenset(
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+)
 
 
 @dataclass(frozen=True, order=True)

@@ -70,11 +70,14 @@ def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
             f"{path}: no such face model; give '{BUILTIN}' or a file that `facerf face-model import` wrote"
         )
     try:
+        if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
+            raise ValueError("it is no .npz")
         with np.load(path, allow_pickle=False) as file:
             return _from_arrays(path, {key: file[key] for key in file.files})
     except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
         raise InputError(
-            f"{path}: not a facerf face model ({error}); import it with `facerf face-model import`"
+            f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
         ) from None
 
 

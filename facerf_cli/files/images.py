@@ -1,6 +1,7 @@
 """Pictures on disk: any encoding in, scene-linear float32 Rec.709 inside; EXR and display pictures out."""
 
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,14 +86,15 @@ def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
     """All channels [H, W, C] of the first part as float32, integers scaled to 0..1."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder, not a picture")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    if not path.is_file() or not path.stat().st_size:
+        raise InputError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
     require_whole_png(path)
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(str(path), settings)
     if stream is None:
-        raise InputError(f"{path}: not a picture that can be read: {_reason(path, oiio.geterror())}")
+        advice = f"save it anew as EXR, PNG or JPEG ({_reason(path, oiio.geterror())})"
+        raise InputError(f"{path}: not a picture that can be read; {advice}")
     try:
         spec = stream.spec()
         size_px = max(spec.width * spec.height, spec.full_width * spec.full_height)
@@ -106,15 +108,17 @@ def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
     finally:
         stream.close()
     if values is None or "premature end" in complaint.lower():  # a JPEG cut short decodes to grey
-        raise InputError(f"{path}: damaged or cut short: {complaint or 'no pixels in it'}")
+        raise InputError(f"{path}: damaged or cut short; copy it anew ({complaint or 'no pixels in it'})")
     if complaint:
         log.warning("%s: %s", path, complaint)
     return np.asarray(values, np.float32).reshape(spec.height, spec.width, spec.nchannels), spec
 
 
 def _reason(path: Path, complaint: str) -> str:
-    """OpenImageIO's complaint in one line, without the path that our line begins with."""
-    return one_line(complaint.replace(f'"{path}"', "it").replace(f" ({path})", ""))
+    """The first line of OpenImageIO's complaint, without the path that our line begins with."""
+    line = (complaint.strip().splitlines() or [""])[0]
+    line = re.sub(r' \("?' + re.escape(str(path)) + r'"?\)', "", line).replace(f'"{path}"', "it")
+    return one_line(re.sub(r"\bEXR_ERR_\w+ |: magic 0x.*| Is it a file format .*", "", line))
 
 
 def _pick_channels(names: list[str], alpha_channel: int) -> tuple[list[int], int | None]:
@@ -211,14 +215,18 @@ def write_exr(
     [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z and uv.U/V in float, others by R, G, B in half. Values
     beyond half's range (65504) are set to it, with a warning.
     """
-    names, kinds, planes = zip(*_exr_channels(pixels, alpha, layers or {}), strict=True)
-    data = np.stack(planes, -1).astype(np.float32)  # [H, W, C]
-    if bad := int(np.sum(~np.isfinite(data))):
+    channels = list(_exr_channels(pixels, alpha, layers or {}))
+    names, kinds, _ = zip(*channels, strict=True)
+    data = np.empty((*pixels.shape[:2], len(channels)), np.float32)
+    bad = count = 0
+    for index, (_, kind, values) in enumerate(channels):  # one at a time: all of a large photo are gigabytes
+        bad += int(np.sum(~np.isfinite(values)))
+        count += int(np.sum(np.abs(values) > HALF_MAX)) if kind == "half" else 0
+        data[..., index] = values.clip(-HALF_MAX, HALF_MAX) if kind == "half" else values
+    if bad:
         raise ValueError(f"{path}: {bad} values are NaN or infinite")
-    beyond = (np.abs(data) > HALF_MAX) & np.array([kind == "half" for kind in kinds])
-    if count := int(beyond.sum()):
+    if count:
         log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
-        data = np.where(beyond, np.copysign(np.float32(HALF_MAX), data), data)
     spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], "half")
     spec.channelnames = names
     spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)

@@ -168,8 +168,9 @@ def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: py
 
 def test_an_output_folder_that_cannot_be(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="cannot write"):
-        run([photos], tmp_path / "file" / "out")
+    for folder in (tmp_path / "file", tmp_path / "file" / "out"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot write .*; give another"):
+            run([photos], folder)
 
 
 def test_half_a_line_in_an_old_report_is_passed_over(photos: Path, tmp_path: Path) -> None:

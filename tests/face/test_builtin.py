@@ -1,11 +1,13 @@
 """The built-in model is in step with its recipe, symmetric, on its landmarks, and a face to a detector."""
 
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM
 from facerf_cli.face.builtin import IDENTITIES, build
 from facerf_cli.face.expressions import EXPRESSION_STD
@@ -183,3 +185,13 @@ def test_a_face_detector_finds_the_mean_and_its_landmarks(model):
     error = ((found_px - wanted_px).norm(dim=-1) / between_eyes_px).mean()
     print(f"mean landmark error {error:.2%} of the inter-ocular distance")
     assert error < 0.05
+
+
+@pytest.mark.parametrize("kind", ["text", "other"])
+def test_what_is_no_face_model_is_refused_in_one_line(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "a.npz"
+    path.write_text("hello") if kind == "text" else np.savez(path, a=1)
+    reason = "it is no .npz" if kind == "text" else "it lacks 'layout_version'"
+    with pytest.raises(InputError, match=reason) as caught:
+        load_face_model(path)
+    assert "pickle" not in str(caught.value) and "face-model import" in str(caught.value)

@@ -232,6 +232,15 @@ def test_a_text_file_is_no_picture(tmp_path: Path, name: str, capfd: pytest.Capt
     assert capfd.readouterr() == ("", "")
 
 
+def test_an_unreadable_picture_says_what_to_do_without_the_library_s_codes(tmp_path: Path) -> None:
+    (tmp_path / "a.exr").write_text("hello, I am text\n")
+    with pytest.raises(InputError, match=r"save it anew as .* \(EXR Error: File is not an OpenEXR file\)$"):
+        read_image(tmp_path / "a.exr")
+    (tmp_path / "b.jpg").touch()
+    with pytest.raises(InputError, match="the file is empty"):
+        read_image(tmp_path / "b.jpg")
+
+
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_image(tmp_path / "a.png")
