@@ -33,6 +33,8 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         metadata = json.loads(header["facerf"])
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is no JSON object")
+        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+            raise ValueError("it holds values that are not finite")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise InputError(
             f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"

@@ -24,7 +24,7 @@ class _Bomb:
         return (print, ("a pickle was loaded",))
 
 
-@pytest.mark.parametrize("kind", ["missing", "text", "pickle", "truncated", "foreign", "list"])
+@pytest.mark.parametrize("kind", ["missing", "text", "pickle", "truncated", "foreign", "list", "nan"])
 def test_what_is_no_checkpoint_is_refused_in_one_line(
     tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -40,6 +40,8 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(
         save_file({"w": torch.zeros(2)}, path)
     elif kind == "list":
         save_file({"w": torch.zeros(2)}, path, {"format": "facerf-checkpoint-1", "facerf": "[]"})
+    elif kind == "nan":
+        save_checkpoint(path, {"w": torch.tensor([1.0, torch.nan])}, {})
     with pytest.raises(InputError, match=r"b\.safetensors") as caught:
         load_checkpoint(path)
     assert "\n" not in str(caught.value)
