@@ -88,7 +88,7 @@ def _fill_bank(
 
 
 class _Progress:
-    """A bar on stderr where that is a terminal: time, step, loss, and the share of time that drawing takes."""
+    """A bar on stderr where that is a terminal: time, step, loss, and the share of time spent drawing."""
 
     def __init__(self, total_s: float, settings: Settings) -> None:
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
