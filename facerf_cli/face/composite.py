@@ -128,8 +128,8 @@ def change_of_light(
 ) -> tuple[Tensor, Tensor]:
     """Gain and offset [3, T, T] that take the photo's pixels to the relit ones: P -> gain P + offset.
 
-    source, relit [3, T, T] linear; seen [T, T] in 0..1. Eyes and teeth stay the photo's: their gain is that
-    of the skin around them, without offset.
+    source, relit [3, T, T] linear; seen [T, T] in 0..1. Eyes, brows and teeth stay the photo's: their gain is
+    that of the skin around them, without offset.
     """
     own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
     own = F.interpolate(own[None, None], source.shape[1:], mode="bilinear", align_corners=False)[0, 0]
