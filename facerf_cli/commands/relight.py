@@ -124,6 +124,8 @@ def relight(
     Each picture is an EXR of absolute, scene-linear light, with the layers face.A (the face's soft mask),
     normal, position (camera space; metres) and uv, and a PNG at --exposure. One prediction serves all maps
     and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay there.
+
+    A stack is relit by its own lights: --lights does not apply, and --light takes the nearest of them.
     """
     settings = settings_of(context)
     if pose is not None and composite == "photo":
