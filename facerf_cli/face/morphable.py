@@ -16,7 +16,7 @@ BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 _MAX_COEFFICIENTS = 500
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # caches know it by identity
 class MorphableModel:
     """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
 
