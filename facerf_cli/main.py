@@ -19,6 +19,7 @@ import typer
 from facerf_cli import __version__
 from facerf_cli.commands import face_model
 from facerf_cli.commands.doctor import doctor
+from facerf_cli.commands.envmap import envmap
 from facerf_cli.commands.fit_geometry import fit_geometry
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
@@ -27,7 +28,7 @@ from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, fit_geometry, train, doctor)
+VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, fit_geometry, train, envmap, doctor)
 GROUPS: dict[str, typer.Typer] = {"face-model": face_model.app}  # verbs that have verbs of their own
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
