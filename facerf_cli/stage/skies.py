@@ -126,8 +126,9 @@ def _room(grid: Grid, lights: np.ndarray, random: Random, wall: tuple[float, flo
     turned = grid.directions @ _turn(random.uniform(0, 90))
     distances = half / np.maximum(np.abs(turned), 1e-6)
     side = distances.argmin(-1)
-    wall_rgb = random.uniform(*wall) * np.array([1.0, 0.96, 0.9]) ** random.uniform(0, 2)
-    floor_rgb = _albedo(random)
+    grey = np.exp(random.uniform(*np.log(wall)))
+    wall_rgb = grey * np.array([1.0, 0.96, 0.9]) ** random.uniform(0, 2)
+    floor_rgb = grey * random.uniform(0.3, 1) * np.array([1.0, 0.85, 0.7]) ** random.uniform(0, 2)
     albedo = np.where((side == 1)[..., None], np.where(turned[..., 1:2] < 0, floor_rgb, wall_rgb), wall_rgb)
     power = lights * grid.solid_angles_sr[..., None]
     mean = (power.sum(-1)[..., None] * grid.directions).sum((0, 1))
@@ -135,7 +136,7 @@ def _room(grid: Grid, lights: np.ndarray, random: Random, wall: tuple[float, flo
     corner = np.sort(distances, -1)
     occlusion = 0.6 + 0.4 * np.clip((corner[..., 1] - corner[..., 0]) / corner[..., 0], 0, 1)
     level = power.sum((0, 1)) / (4 * np.pi)
-    return np.asarray(albedo * level * (nearness * occlusion)[..., None] / (1 - np.clip(wall[1], 0, 0.6)))
+    return np.asarray(albedo * level * (nearness * occlusion)[..., None] / (1 - grey))
 
 
 def _turn(angle_deg: float) -> np.ndarray:
@@ -167,8 +168,8 @@ def studio(grid: Grid, random: Random) -> np.ndarray:
         lights += paint(box, _warmth(random, 0.1, 0.5) * level)
     for _ in range(random.integers(0, 3)):
         lamp = disc(grid, toward(random.uniform(-180, 180), random.uniform(0, 70)), random.uniform(0.5, 3))
-        lights += paint(lamp, _warmth(random, 0.2, 0.9) * np.exp(random.uniform(5, 8)))
-    return lights + _room(grid, lights, random, (0.03, 0.6))
+        lights += paint(lamp, _warmth(random, 0.2, 0.9) * np.exp(random.uniform(5, 9)))
+    return lights + _room(grid, lights, random, (0.001, 0.6))
 
 
 def night(grid: Grid, random: Random) -> np.ndarray:
@@ -200,7 +201,7 @@ def stage(grid: Grid, random: Random) -> np.ndarray:
         rgb = 0.05 + random.dirichlet([0.5, 0.5, 0.5])
         lamp = disc(grid, toward(random.uniform(-180, 180), random.uniform(-10, 75)), random.uniform(1, 10))
         lights += paint(lamp, rgb * np.exp(random.uniform(3, 6)))
-    return lights + _room(grid, lights, random, (0.03, 0.25))
+    return lights + _room(grid, lights, random, (0.005, 0.25))
 
 
 KINDS: dict[str, Callable[[Grid, Random], np.ndarray]] = {
