@@ -38,6 +38,7 @@ class TrainSettings:
     gradient_clip: float = 1.0
     ema_decay: float = 0.998
     max_seconds: float = 3600.0
+    max_steps: int = 1_000_000  # whichever of the two comes first; the rate falls toward it
     validate_every: int = 500
     held_out_heads: int = 12
     bf16: bool = True
@@ -73,7 +74,7 @@ def train(
     held_out = _held_out_samples(bank, settings)
     begin, step, drawing = time.monotonic(), 0, 0.0
     with (folder / "log.jsonl").open("a") as log:
-        while (elapsed := time.monotonic() - begin) < settings.max_seconds:
+        while (elapsed := time.monotonic() - begin) < settings.max_seconds and step < settings.max_steps:
             _set_rate(optimizer, settings, step, elapsed)
             drawn_at = time.monotonic()
             heads = train_heads[torch.randint(len(train_heads), (settings.batch,), generator=generator)]
@@ -106,9 +107,10 @@ def train(
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, settings: TrainSettings, step: int, elapsed: float) -> None:
-    """Linear warm-up, then a half cosine over the allotted time down to 2 %."""
+    """Linear warm-up, then a half cosine over the allotted time or steps down to 2 %."""
     warm = min(1.0, (step + 1) / settings.warmup_steps)
-    cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, elapsed / settings.max_seconds)))
+    done = min(1.0, max(elapsed / settings.max_seconds, step / settings.max_steps))
+    cosine = 0.5 * (1 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
         group["lr"] = settings.learning_rate * warm * (0.02 + 0.98 * cosine)
 

@@ -1,5 +1,6 @@
 """Synthetic heads with baked light transport: the geometry half of the training bank."""
 
+import re
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -20,7 +21,8 @@ from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.texture import bake_attributes, normal_map
 
 _LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")  # no shape of skin, or correctives of another shape
-_COMMON = ("jawOpen", "mouthSmile")  # photographs show these more than the rest
+_COMMON = ("jawOpen", "jaw_open", "mouthSmile", "smile")  # photographs show these more than the rest
+_SIDE = re.compile(r"(?<!jaw)_(L|R|left|right)$")  # a jaw that goes left does not go right as well
 
 _BAKE = BakeSettings(lamp_samples=4, bounce_samples=16)
 
@@ -126,16 +128,13 @@ def draw_coefficients(
     beta = torch.zeros(len(model.expression))
     if random.random() < settings.neutral_share:
         return alpha, beta
-    stems = sorted({_stem(name) for name in model.expression_names if not name.startswith(_LEFT_OUT)})
+    names = [name for name in model.expression_names if not name.startswith(_LEFT_OUT)]
+    stems = sorted({_SIDE.sub("", name) for name in names})
     chosen = list(random.choice(stems, random.integers(1, 4), replace=False))
     chosen += [stem for stem in _COMMON if stem in stems and random.random() < 0.4]
     for stem in chosen:
-        strength = random.uniform(0.2, 2.8) if stem != "jawOpen" else random.uniform(0.1, 1.6)
+        strength = random.uniform(0.1, 1.6) if stem in _COMMON[:2] else random.uniform(0.2, 2.8)
         for index, name in enumerate(model.expression_names):
-            if _stem(name) == stem:
+            if _SIDE.sub("", name) == stem:
                 beta[index] = strength * random.uniform(0.7, 1.0)
     return alpha, beta
-
-
-def _stem(name: str) -> str:
-    return name.removesuffix("_L").removesuffix("_R")

@@ -52,6 +52,17 @@ def test_expressions_differ_and_some_heads_are_neutral() -> None:
     assert max(float(beta.max()) for beta in drawn) <= 2.8
 
 
+def test_expressions_come_on_both_sides_and_a_jaw_goes_one_way() -> None:
+    model = load_face_model()
+    index = {name: position for position, name in enumerate(model.expression_names)}
+    drawn = torch.stack([draw_coefficients(model, np.random.default_rng(s), TINY)[1] for s in range(60)])
+    smiles = drawn[:, [index["smile_left"], index["smile_right"]]] > 0
+    assert (smiles[:, 0] == smiles[:, 1]).all() and smiles.float().mean() > 0.2
+    jaw = drawn[:, [index["jaw_left"], index["jaw_right"]]] > 0
+    assert (jaw[:, 0] != jaw[:, 1]).any()
+    assert drawn[:, index["jaw_open"]].max() <= 1.6
+
+
 def test_a_neutral_head_seen_without_error_is_unwrapped_almost_in_place() -> None:
     model = load_face_model()
     views = build_views(model.mean, model, 1, 64, seed=2, settings=EXACT)
