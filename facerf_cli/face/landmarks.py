@@ -31,7 +31,7 @@ _BOX_PX, _CHIP_PX = 256, 640  # the face's box, and the picture around it, that 
 # The predictor's answer depends on its box: these shifts and growths (shares of the box) are averaged.
 _JITTER = ((0.0, 0.0, 0.0), (0.03, 0.03, 0.0), (-0.03, -0.03, 0.0), (0.0, 0.0, 0.06), (0.0, 0.0, -0.06))
 # Tight crops of real faces score this low, and so do badges and curtains: kept only where nothing is surer.
-_DOUBTFUL_SCORE = 0.2
+_DOUBTFUL_SCORE = 0.3
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,14 @@ def find_faces(pixels_linear: np.ndarray, name: str, which: str = "largest") -> 
 
 
 def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
-    """Of faces in the order from left to right: the largest, all, or the one at an index from 0."""
+    """Of faces in the order from left to right: the largest, all, or the one at an index from 0.
+
+    The detector's score counts as much as the size: a badge on a sleeve may be as large as the face above it.
+    """
     if which == "all":
         return faces
     if which == "largest":
-        return [max(faces, key=lambda face: face.area_px)]
+        return [max(faces, key=lambda face: face.area_px * face.score)]
     if not which.isdecimal():
         raise UsageError(f"--face takes largest, all or a number from 0, not {which!r}")
     if int(which) >= len(faces):

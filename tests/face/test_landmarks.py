@@ -1,16 +1,25 @@
 """Faces are found where they are: small, dark, turned, in tight crops and large pictures; files are read."""
 
+import io
 import json
 
 import numpy as np
 import pytest
 import skimage.data
 import skimage.transform
+from PIL import Image
 
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.landmark_files import read_landmarks
-from facerf_cli.face.landmarks import choose_face, detect_landmarks, find_faces, predictor_path, to_display
+from facerf_cli.face.landmarks import (
+    Face,
+    choose_face,
+    detect_landmarks,
+    find_faces,
+    predictor_path,
+    to_display,
+)
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
 
 PHOTO = skimage.data.astronaut()[:400, 40:400]  # not square
@@ -57,6 +66,18 @@ def test_turned_photos(landmarks_px, turns):
 def test_a_badge_beside_a_sure_face_is_no_face(landmarks_px):
     (face,) = detect_landmarks(skimage.data.astronaut())  # whose sleeve badge alone the detector would take
     assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.02
+
+
+def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(landmarks_px):
+    buffer = io.BytesIO()
+    Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
+    (face,) = detect_landmarks(np.array(Image.open(buffer)))
+    assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
+
+
+def test_of_two_faces_of_one_size_the_surer_is_the_largest(landmarks_px):
+    doubtful, sure = (Face(landmarks_px, (0, 0, side, side), score) for side, score in ((50, 0.4), (49, 1.2)))
+    assert choose_face([doubtful, sure], "largest", "p") == [sure]
 
 
 def test_a_small_face(landmarks_px):
