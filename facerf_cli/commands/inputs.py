@@ -12,6 +12,7 @@ from facerf_cli.errors import UsageError
 PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 )
+_STACK, _SHEET = "_olat.exr", "_olat.png"  # a stack's contact sheet beside it is no photo
 
 
 @dataclass(frozen=True, order=True)
@@ -71,7 +72,8 @@ def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator
             name for name in folders if name[0] != "." and (Path(here) / name).resolve() != output_real
         ]
         for name in files:
-            if name[0] != "." and Path(name).suffix.lower() in suffixes:
+            sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files
+            if name[0] != "." and Path(name).suffix.lower() in suffixes and not sheet:
                 yield Path(here) / name
 
 

@@ -92,6 +92,13 @@ def test_outputs_inside_the_input_folder_are_not_inputs(photos: Path) -> None:
         collect_items([str(photos)], photos, PHOTO_SUFFIXES)
 
 
+def test_the_contact_sheet_beside_a_stack_is_no_input(tmp_path: Path) -> None:
+    for name in ("a_olat.exr", "a_olat.png", "b_olat.png"):
+        (tmp_path / name).touch()
+    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["a_olat", "b_olat"]
+
+
 def test_a_list_on_stdin(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
     names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
