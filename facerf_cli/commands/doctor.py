@@ -1,7 +1,6 @@
 """`facerf doctor`: what is installed and what it may be used for, on one screen."""
 
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -116,15 +115,12 @@ def _face_model(path: Path) -> dict[str, str]:
 
 
 def _checkpoint(path: Path) -> dict[str, Any]:
-    from safetensors import SafetensorError, safe_open
+    from facerf_cli.files.checkpoints import load_checkpoint
 
-    if not path.is_file():
-        return {"name": MISSING, "file": str(path)}
     try:
-        with safe_open(path, framework="np") as stream:
-            metadata = json.loads((stream.metadata() or {}).get("facerf", "{}"))
-    except (SafetensorError, OSError, ValueError) as error:
-        return {"name": f"{MISSING}: not a facerf checkpoint, {error}", "file": str(path)}
+        _, metadata = load_checkpoint(path)
+    except FacerfError as error:
+        return {"name": f"{MISSING}: {error}"}
     made_from = metadata.get("provenance", {})
     return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **made_from}
 

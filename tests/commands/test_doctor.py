@@ -39,6 +39,9 @@ def test_the_same_as_json(checkpoint: Path, capsys: pytest.CaptureFixture[str]) 
 def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--checkpoint", str(tmp_path / "gone.safetensors")]) == 1
     assert "MISSING" in capsys.readouterr().out
+    save_file({}, tmp_path / "list.safetensors", {"format": "facerf-checkpoint-1", "facerf": "[]"})
+    assert main(["doctor", "--checkpoint", str(tmp_path / "list.safetensors")]) == 1
+    assert "its metadata is no JSON object" in " ".join(capsys.readouterr().out.split())
     (tmp_path / "text.safetensors").write_text("no checkpoint")
     assert main(["doctor", "--checkpoint", str(tmp_path / "text.safetensors")]) == 1
     assert "not a facerf checkpoint" in " ".join(capsys.readouterr().out.split())
