@@ -1,8 +1,7 @@
 """The training bank: baked heads and fitted views of them, held in memory."""
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.stage.shards import in_shards
 from facerf_cli.stage.views import build_views
 
 
@@ -74,15 +74,10 @@ def add_views(geometries: Path, views: Path, fitted_with: str, count: int, jobs:
     """Write `count` fitted views of every baked head; finished heads are kept."""
     views.mkdir(parents=True, exist_ok=True)
     missing = [path for path in sorted(geometries.glob("*.safetensors")) if not (views / path.name).exists()]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        shards = [missing[job::jobs] for job in range(jobs)]
-        for done in [
-            pool.submit(_add_views_shard, shard, views, fitted_with, count, seed) for shard in shards
-        ]:
-            done.result()
+    in_shards(partial(_add_views_shard, views, fitted_with, count, seed), missing, jobs)
 
 
-def _add_views_shard(heads: list[Path], views: Path, fitted_with: str, count: int, seed: int) -> None:
+def _add_views_shard(views: Path, fitted_with: str, count: int, seed: int, heads: list[Path]) -> None:
     torch.set_num_threads(1)
     model = load_face_model(fitted_with)
     for path in heads:
@@ -90,9 +85,9 @@ def _add_views_shard(heads: list[Path], views: Path, fitted_with: str, count: in
         tensors = build_views(
             head["vertices"], model, count, head["visibility"].shape[-1], seed + int(path.stem)
         )
-        partial = views / f"{path.stem}.partial"
-        save_file(tensors, partial, metadata={"fitted_with": model.name})
-        partial.rename(views / path.name)
+        unfinished = views / f"{path.stem}.partial"
+        save_file(tensors, unfinished, metadata={"fitted_with": model.name})
+        unfinished.rename(views / path.name)
 
 
 def load_bank(geometries: Path, views: Path, provenance: dict[str, Any]) -> Bank:

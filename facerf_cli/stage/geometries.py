@@ -1,9 +1,8 @@
 """Synthetic heads with baked light transport: the geometry half of the training bank."""
 
 import re
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.stage.shards import in_shards
 
 _LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")  # no shape of skin, or correctives of another shape
 _COMMON = ("jawOpen", "jaw_open", "mouthSmile", "smile")  # photographs show these more than the rest
@@ -53,12 +53,7 @@ def build_geometries(
     folder.mkdir(parents=True, exist_ok=True)
     _require_heads_of(load_face_model(face_model).name, folder)
     missing = [index for index in range(count) if not (folder / f"{index:05d}.safetensors").exists()]
-    shards = [missing[job::jobs] for job in range(jobs)]
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for done in [
-            pool.submit(_build_shard, folder, face_model, shard, seed, settings) for shard in shards
-        ]:
-            done.result()
+    in_shards(partial(_build_shard, folder, face_model, seed, settings), missing, jobs)
 
 
 def _require_heads_of(name: str, folder: Path) -> None:
@@ -70,15 +65,15 @@ def _require_heads_of(name: str, folder: Path) -> None:
 
 
 def _build_shard(
-    folder: Path, face_model: str, indices: list[int], seed: int, settings: GeometrySettings
+    folder: Path, face_model: str, seed: int, settings: GeometrySettings, indices: list[int]
 ) -> None:
     torch.set_num_threads(1)
     model = load_face_model(face_model)
     for index in indices:
         tensors = bake_head(model, index, seed, settings)
-        partial = folder / f"{index:05d}.partial"
-        save_file(tensors, partial, metadata={"face_model": model.name})
-        partial.rename(folder / f"{index:05d}.safetensors")
+        unfinished = folder / f"{index:05d}.partial"
+        save_file(tensors, unfinished, metadata={"face_model": model.name})
+        unfinished.rename(folder / f"{index:05d}.safetensors")
 
 
 def bake_head(model: MorphableModel, index: int, seed: int, settings: GeometrySettings) -> dict[str, Tensor]:
