@@ -9,7 +9,6 @@ unfitted neutral mean in the fit's pose. `--sweep` uses Yale B's development sub
 """
 
 import argparse
-import importlib.util
 import itertools
 import time
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import skimage.data
 import torch
+from yale_b import load_yale
 
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, FitSettings, fit_batch, fit_landmarks, trust_inside
@@ -65,15 +65,6 @@ def photos(shared: Path) -> list[Photo]:
 
 def fit(model: MorphableModel, photo: Photo, settings: FitSettings) -> FaceFit:
     return fit_landmarks(model, photo.landmarks_px, photo.crop, settings, photo.trust)
-
-
-def load_yale(shared: Path) -> Any:
-    path = shared / "bench/yale_b/yale.py"
-    spec = importlib.util.spec_from_file_location("yale", path)
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module, module.Yale(str(shared / "data/extended_yale_b"))
 
 
 def least_squares(values: np.ndarray, lights: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -186,7 +177,8 @@ def main() -> None:
     options = parser.parse_args()
     model = load_face_model(options.face_model)
     pictures = photos(options.shared)
-    module, data = load_yale(options.shared)
+    module = load_yale(options.shared / "bench/yale_b")
+    data = module.Yale(str(options.shared / "data/extended_yale_b"))
     subjects = (
         data.subjects
         if options.all

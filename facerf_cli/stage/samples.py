@@ -76,7 +76,7 @@ class _Face:
     tangents: tuple[Tensor, Tensor]
     view_source: Tensor
     view_target: Tensor
-    visibility: Tensor  # [L150, T, T]
+    visibility: Tensor  # [L150, T, T] bytes, as is the bounce: floats only of the lights that a sample uses
     bounce: Tensor
     directions: Tensor  # [L150, 3]
     source_weights: Tensor  # [L150, 3]
@@ -107,8 +107,8 @@ def _draw_face(bank: Bank, head: int, lights: int, generator: torch.Generator) -
         tangents=geometry.tangents,
         view_source=_views(geometry.positions, rotation_source),
         view_target=view_target,
-        visibility=geometry.visibility.float() / 255,
-        bounce=(geometry.bounce.float() / 255) ** 2,
+        visibility=geometry.visibility,
+        bounce=geometry.bounce,
         directions=directions,
         source_weights=draw_light(directions @ rotation_source.T, generator),
         chosen=chosen,
@@ -150,7 +150,7 @@ def _shade_face(face: _Face, skin: Skin) -> tuple[Tensor, Tensor]:
     needed = face.source_weights.sum(-1) > 0.004 * face.source_weights.sum(-1).max()
     used = torch.cat([needed.nonzero()[:, 0], face.chosen])
     cosines = torch.einsum("lc,cij->lij", face.directions[used], normals[0])
-    visibility, bounce = face.visibility[used], face.bounce[used]
+    visibility, bounce = face.visibility[used].float() / 255, (face.bounce[used].float() / 255) ** 2
     split = len(used) - len(face.chosen)
     albedo = skin.albedo[0]
     irradiance = [
@@ -165,13 +165,12 @@ def _shade_face(face: _Face, skin: Skin) -> tuple[Tensor, Tensor]:
     scattered = scatter(torch.stack(irradiance), skin.scattering_texels.expand(len(irradiance), 3))
     radiance = albedo * scattered
     bright = face.source_weights.sum(-1).topk(min(_SOURCE_HIGHLIGHTS, split)).indices
-    gloss = (
-        highlights(normals, face.view_source[None], face.directions[bright][None], skin)[0]
-        * face.visibility[bright]
+    gloss = highlights(normals, face.view_source[None], face.directions[bright][None], skin)[0] * (
+        face.visibility[bright].float() / 255
     )
     source = radiance[0] + torch.einsum("lc,lij->cij", face.source_weights[bright], gloss)
     gloss = highlights(normals, face.view_target[None], face.directions[face.chosen][None], skin)[0]
-    target = radiance[1:] + (gloss * face.visibility[face.chosen])[:, None]
+    target = radiance[1:] + (gloss * visibility[split:])[:, None]
     return source, target
 
 

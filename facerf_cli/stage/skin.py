@@ -13,6 +13,7 @@ from torch import Tensor
 
 from facerf_cli.face.regions import region_mask
 from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.raster.texture import texel_centres_uv
 
 _DERMIS = (0.86, 0.76, 0.68)  # linear Rec.709
 _MELANIN = (0.62, 0.92, 1.35)  # absorbance per channel of one unit; skins hold 0 to `_DARKEST`
@@ -105,14 +106,8 @@ def _pigmented(melanin: Tensor, blood: Tensor) -> Tensor:
     return dermis * torch.exp(-melanin.clamp_min(0) * mel - blood.clamp_min(0) * haem)
 
 
-def _chart(side: int) -> tuple[Tensor, Tensor]:
-    centre = (torch.arange(side) + 0.5) / side
-    v, u = torch.meshgrid(centre, centre, indexing="ij")
-    return u, v
-
-
 def _blob(side: int, landmark: int | tuple[float, float], radius: float) -> Tensor:
-    u, v = _chart(side)
+    u, v = texel_centres_uv(side).unbind(-1)
     at = LANDMARK_UV[landmark] if isinstance(landmark, int) else landmark
     return torch.exp(-(((u - at[0]) / radius) ** 2 + ((v - at[1]) / radius) ** 2))
 
@@ -148,7 +143,7 @@ def _hair_mask(
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Cover [B, 1, T, T] of brows, beard, hairline and fringe, and the hair's colour [B, 3, 1, 1]."""
-    u, v = _chart(side)
+    u, v = texel_centres_uv(side).unbind(-1)
     palette = torch.tensor(_HAIR_COLOURS)
     index = torch.multinomial(torch.tensor(_HAIR_SHARES), uniform.faces, True, generator=generator)
     colour = palette[index].view(-1, 3, 1, 1) * uniform(0.7, 1.4)
@@ -182,7 +177,7 @@ def _random_textures(
 
 def _eyes(side: int, mask: Tensor, uniform: _Uniform) -> Tensor:
     """Sclera, iris and pupil, with one gaze for both eyes [B, 3, T, T]."""
-    u, v = _chart(side)
+    u, v = texel_centres_uv(side).unbind(-1)
     iris_colour = (
         uniform(0.01, 0.22) * torch.tensor([1.0, 0.85, 0.75]).view(1, 3, 1, 1) * uniform(0.6, 1.4, channels=3)
     )
