@@ -1,8 +1,9 @@
 """The contract of every verb that walks folders (DESIGN): what is read, skipped, written, reported.
 
-A verb hands `run_batch` two functions: `outputs_of(item)` names the files that an item will have when it is
-finished, and `process(item)` makes them. `process` raises `InputError` for an item that is at fault (the run
-goes on); any other `FacerfError` concerns the whole run and ends it.
+A verb hands `run_batch` (files) or `run_items` (whatever else it walks) two functions: `outputs_of(item)`
+names the files that an item will have when it is finished, and `process(item)` makes them. `process` raises
+`InputError` for an item that is at fault (the run goes on); any other `FacerfError` concerns the whole run
+and ends it.
 """
 
 import json
@@ -67,12 +68,24 @@ def run_batch(
     settings: Settings,
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
 ) -> int:
-    """Work through the inputs and give the exit code: 0 all done, 1 some failed.
-
-    Raises `UsageError` (exit 2) where there is nothing to work on or the output folder cannot be used. With
-    `jobs` > 1 `process` runs in spawned processes and must be picklable.
-    """
+    """Work through the files that `inputs` name: `run_items` over `collect_items`."""
     items = collect_items(inputs, options.output, suffixes)
+    return run_items(verb, items, _OfFile(process), outputs_of, options, settings)
+
+
+def run_items(
+    verb: str,
+    items: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> int:
+    """Work through the items and give the exit code: 0 all done, 1 some failed.
+
+    Raises `UsageError` (exit 2) where the output folder cannot be used. With `jobs` > 1 `process` runs in
+    spawned processes and must be picklable.
+    """
     finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
     done = set(finished)
     todo = [item for item in items if item not in done]
@@ -98,6 +111,18 @@ def run_batch(
 
 
 @dataclass(frozen=True)
+class _OfFile:
+    """`process`, for items that are files."""
+
+    process: Callable[[Item], Outcome]
+
+    def __call__(self, item: Item) -> Outcome:
+        if not item.input_path.exists():
+            raise InputError(f"{item.input_path}: no such file")
+        return self.process(item)
+
+
+@dataclass(frozen=True)
 class _Work:
     """Runs `process` on an item and turns whatever happens into a `_Result`."""
 
@@ -110,8 +135,6 @@ class _Work:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
-            if not item.input_path.exists():
-                raise InputError(f"{item.input_path}: no such file")
             return result(outcome=self.process(item))
         except InputError as error:
             return result(error=str(error), trace=traceback.format_exc())
