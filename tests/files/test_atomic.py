@@ -1,0 +1,42 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.errors import FacerfError
+from facerf_cli.files.atomic import atomic_path
+
+
+def _dead_process() -> int:
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) -> None:
+    dead, alive = _dead_process(), os.getppid()
+    (tmp_path / f".a.part-{dead}.exr").write_text("half")
+    (tmp_path / f".folder.part-{dead}").mkdir()
+    kept = [
+        tmp_path / f".a.part-{alive}.exr",
+        tmp_path / f".ab.part-{dead}.exr",
+        tmp_path / f".a.part-{dead}.txt",
+    ]
+    for path in kept:
+        path.write_text("not ours to remove")
+    with atomic_path(tmp_path / "a.exr") as temporary:
+        temporary.write_text("whole")
+    with atomic_path(tmp_path / "folder") as temporary:
+        temporary.mkdir()
+    assert sorted(tmp_path.iterdir()) == sorted([*kept, tmp_path / "a.exr", tmp_path / "folder"])
+
+
+def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), atomic_path(tmp_path / "a.exr") as temporary:
+        temporary.write_text("half")
+        raise KeyError
+    with pytest.raises(FacerfError, match="could not be written"), atomic_path(tmp_path / "a.exr"):
+        pass
+    assert not list(tmp_path.iterdir())
