@@ -233,6 +233,7 @@ def write_exr(
     spec.alpha_channel = names.index("A") if "A" in names else -1
     spec.attribute("compression", "zip")
     spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+    spec.attribute("DateTime", "")  # or OpenImageIO writes the hour, and no two runs give the same bytes
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
     _write(path, spec, data, metadata)
     return count

@@ -130,6 +130,7 @@ def _part(
     spec.attribute("name", name)
     spec.attribute("compression", COMPRESSION)
     spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+    spec.attribute("DateTime", "")  # or OpenImageIO writes the hour, and no two runs give the same bytes
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
     for key, value in attributes.items():
         spec.attribute(key, value)

@@ -350,3 +350,8 @@ def test_real_files(shared_data: Path) -> None:
     assert sky.pixels.shape == (512, 1024, 3) and sky.pixels.max() > 2
     face = read_image(shared_data / "extended_yale_b" / "yaleB02" / "yaleB02_P00A+000E+00.pgm")
     assert face.pixels.shape == (192, 168, 3) and face.colourspace_name == "sRGB"
+
+
+def test_no_hour_is_written_so_that_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", VALUES[..., :3])
+    assert b"capDate" not in (tmp_path / "a.exr").read_bytes()

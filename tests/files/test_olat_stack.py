@@ -148,3 +148,7 @@ def test_a_part_without_direction_is_refused(path: Path, monkeypatch: pytest.Mon
 def written_with(path: Path, **changes: object) -> Path:
     write_olat_stack(path, replace(header(), **changes), iter([OLATS]))
     return path
+
+
+def test_no_hour_is_written_so_that_two_runs_give_the_same_bytes(path: Path) -> None:
+    assert b"capDate" not in path.read_bytes()
