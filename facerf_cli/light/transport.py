@@ -1,17 +1,26 @@
-"""Light transport baked in the texture's space: what each light brings to each texel, kept apart from skin.
+"""Light transport baked over a surface: what each light brings to each texel or vertex, kept apart from skin.
 
-Ray-cast with embree. Everything is in one frame (the head's, for a bake that any pose can use).
+`bake_transport` bakes the chart's texels for the training bank, `bake_mesh` the vertices of a whole head for
+the synthetic stage. Ray-cast with embree. Everything is in one frame (the head's, for a bake that any pose
+can use).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from scipy.ndimage import gaussian_filter
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-_OFFSET_M = 2e-4  # rays start this far off the surface, above float32's step at head scale
+_OFFSET_M = 2e-4  # rays start this far off the surface, above float32's step at head scale;
+_MESH_OFFSET_M = 3e-5  # from a vertex, where no facet has to be cleared, so much and
+_RISE_SHARE = 0.5  # this share of its neighbours' rise, up to as much again as from a texel
+_BLUR_NEIGHBOURS = 16
+_SAME_SURFACE_COSINE = 0.6  # of two normals, for near vertices to share their view of the surroundings
+_NO_WEIGHT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -32,13 +41,15 @@ class Transport:
 class BakeSettings:
     """Rays per texel: `lamp_samples` over a lamp of `lamp_radius_deg`, `bounce_samples` over the hemisphere.
 
-    A bounce varies slowly over the face, so its noise is smoothed by a Gaussian of `bounce_blur_texels`.
+    A bounce varies slowly over the face, so its noise is smoothed by a Gaussian of `bounce_blur_texels`, or
+    on a mesh of `bounce_blur_m` over the nearest vertices of the same surface.
     """
 
     lamp_samples: int = 4
     lamp_radius_deg: float = 1.5
     bounce_samples: int = 32
     bounce_blur_texels: float = 1.5
+    bounce_blur_m: float = 0.0015
 
 
 def bake_transport(
@@ -66,6 +77,203 @@ def bake_transport(
     blur = settings.bounce_blur_texels
     smooth_bounce = gaussian_filter(bounce.reshape(shape), (0, blur, blur), mode="nearest")
     return Transport(directions, visibility.reshape(shape), smooth_bounce)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshTransport:
+    """Per light and vertex, for lights of rgb 1 in `directions` [L, 3].
+
+    visibility [L, V] float32: the share of the lamp's disc that a vertex sees, 0 where it faces away.
+    gather [V, V]: irradiance that each vertex receives from its surroundings' radiosity; a row sums to the
+    share of the cosine-weighted hemisphere that other surfaces' outsides cover.
+    baked [V] bool: where the two were traced; both are 0 elsewhere.
+    """
+
+    directions: np.ndarray
+    visibility: np.ndarray
+    gather: csr_matrix
+    baked: np.ndarray
+
+
+def bake_mesh(
+    vertices: np.ndarray,
+    normals: np.ndarray,
+    triangles: np.ndarray,
+    directions: np.ndarray,
+    settings: BakeSettings = BakeSettings(),
+    seed: int = 0,
+    wanted: np.ndarray | None = None,
+    all_round: np.ndarray | None = None,
+) -> MeshTransport:
+    """Bake the vertices [V, 3] (m) with unit normals [V, 3] of a mesh, lit from unit directions [L, 3].
+
+    Only `wanted` [V] bool vertices are baked, and for the lights alone those that light bounces from.
+    `all_round` [V] bool ones (hair) are lit on both sides, at a single ray a lamp: they are many and finer
+    than any penumbra.
+    """
+    random = np.random.default_rng(seed)
+    nothing = np.zeros(len(vertices), bool)
+    baked = ~nothing if wanted is None else wanted
+    surface = _Surface.of(vertices, normals, triangles, nothing if all_round is None else all_round)
+    gather = _gather(surface, baked, settings, random)
+    sources = np.bincount(gather.indices, minlength=len(vertices)) > 0
+    visibility = np.zeros((len(directions), len(vertices)), np.float32)
+    for light, direction in enumerate(directions):
+        visibility[light] = _lamp_share(surface, direction, baked | sources, settings, random)
+    return MeshTransport(directions, visibility, gather, baked)
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """A mesh to cast rays from and at; edges [E, 2], each once."""
+
+    scene: rtcore_scene.EmbreeScene
+    vertices: np.ndarray
+    normals: np.ndarray
+    triangles: np.ndarray
+    all_round: np.ndarray
+    edges: np.ndarray
+    offset_m: np.ndarray  # [V, 1] of ray origins off the surface
+
+    @classmethod
+    def of(
+        cls, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, all_round: np.ndarray
+    ) -> "_Surface":
+        vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
+        pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        keys = np.unique(pairs[:, 0].astype(np.int64) * len(vertices) + pairs[:, 1])
+        edges = np.stack([keys // len(vertices), keys % len(vertices)], -1)
+        return cls(
+            build_scene(vertices, triangles),
+            vertices,
+            normals,
+            triangles,
+            all_round,
+            edges,
+            _mesh_offset_m(vertices, normals, edges)[:, None],
+        )
+
+
+def _mesh_offset_m(vertices: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """How far [V] rays start off the surface: beyond what its facets stand out of their smooth surface.
+
+    Where a vertex lies in a hollow, its neighbours rise above its tangent plane, and flat facets between them
+    would shadow grazing light that the smooth surface, with these normals, lets through.
+    """
+    span = vertices[edges[:, 1]] - vertices[edges[:, 0]]
+    rise = np.zeros(len(vertices), np.float32)
+    np.maximum.at(rise, edges[:, 0], np.einsum("ec,ec->e", span, normals[edges[:, 0]]))
+    np.maximum.at(rise, edges[:, 1], -np.einsum("ec,ec->e", span, normals[edges[:, 1]]))
+    return _MESH_OFFSET_M + np.minimum(_RISE_SHARE * rise, _OFFSET_M)
+
+
+def _lamp_share(
+    surface: _Surface,
+    direction: np.ndarray,
+    traced: np.ndarray,
+    settings: BakeSettings,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """The share [V] of one lamp that each vertex sees; 0 where it is not traced or faces away.
+
+    One ray each; where neighbours disagree there is a shadow's edge, and they and theirs get the rest.
+    """
+    facing = surface.normals @ direction.astype(np.float32)
+    lit = traced & ((facing > 0) | surface.all_round)
+    share = np.zeros(len(lit), np.float32)
+    first = np.flatnonzero(lit)
+    share[first] = _lamp_rays(surface, first, facing, direction, settings, random)
+    samples = 1 if settings.lamp_radius_deg == 0 else settings.lamp_samples
+    if samples == 1:
+        return share
+    edge = _beside(surface.edges, share, lit)
+    edge = np.flatnonzero(edge & lit & ~surface.all_round)
+    for _ in range(samples - 1):
+        share[edge] += _lamp_rays(surface, edge, facing, direction, settings, random)
+    share[edge] /= samples
+    return share
+
+
+def _lamp_rays(
+    surface: _Surface,
+    chosen: np.ndarray,
+    facing: np.ndarray,
+    direction: np.ndarray,
+    settings: BakeSettings,
+    random: np.random.Generator,
+) -> np.ndarray:
+    """Whether one ray from each of the chosen vertices [N] reaches the lamp; bool [N]."""
+    side = np.where(facing[chosen] < 0, np.float32(-1), np.float32(1))[:, None]  # of a strand
+    origins = surface.vertices[chosen] + surface.normals[chosen] * (side * surface.offset_m[chosen])
+    rays = _within_cone(direction, settings.lamp_radius_deg, len(chosen), random)
+    return ~occluded(surface.scene, origins, rays)
+
+
+def _beside(edges: np.ndarray, share: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """Vertices [V] bool at edges whose ends disagree in their share [V], and the neighbours of those."""
+    start, end = edges.T
+    found = np.zeros(len(share), bool)
+    differ = (share[start] != share[end]) & lit[start] & lit[end]
+    for _ in range(2):
+        found[start[differ]] = found[end[differ]] = True
+        differ = found[start] != found[end]
+    return found
+
+
+def _gather(
+    surface: _Surface, baked: np.ndarray, settings: BakeSettings, random: np.random.Generator
+) -> csr_matrix:
+    """See `MeshTransport.gather`: what hemisphere rays hit, as barycentric weights of its corners."""
+    count, samples = len(baked), settings.bounce_samples
+    if samples == 0:
+        return csr_matrix((count, count), dtype=np.float32)
+    smooth, strands = np.flatnonzero(baked & ~surface.all_round), np.flatnonzero(baked & surface.all_round)
+    blocks = [*_hemisphere_hits(surface, smooth, samples, random)]
+    blocks += _hemisphere_hits(surface, strands, max(1, samples // 4), random)
+    rows, columns, values = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    hits = csr_matrix((values, (rows, columns)), shape=(count, count), dtype=np.float32)
+    return _neighbour_means(surface, smooth, settings.bounce_blur_m) @ hits
+
+
+def _hemisphere_hits(
+    surface: _Surface, chosen: np.ndarray, samples: int, random: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Row, column and value of what each round of one ray from every chosen vertex hits."""
+    normals = surface.normals[chosen]
+    origins = surface.vertices[chosen] + normals * surface.offset_m[chosen]
+    a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
+    outward = np.cross(b - a, c - a)
+    strand = surface.all_round[surface.triangles[:, 0]]
+    for _ in range(samples):
+        rays = _cosine_hemisphere(normals, random)
+        hits = surface.scene.run(origins, rays, output=True)
+        triangle = hits["primID"]
+        front = np.einsum("nc,nc->n", rays, outward[triangle]) < 0
+        # A ray that reaches an inside has left through some open rim: no light comes back.
+        found = np.flatnonzero((triangle >= 0) & (front | strand[triangle]))
+        u, v = hits["u"][found], hits["v"][found]
+        weights = np.stack([1 - u - v, u, v], -1) / samples
+        columns = surface.triangles[triangle[found]]
+        yield chosen[found].repeat(3), columns.ravel(), weights.astype(np.float32).ravel()
+
+
+def _neighbour_means(surface: _Surface, chosen: np.ndarray, sigma_m: float) -> csr_matrix:
+    """A Gaussian mean [V, V] over near vertices of the same surface for the chosen ones; others stay."""
+    count = len(surface.vertices)
+    other = np.setdiff1d(np.arange(count), chosen)
+    if sigma_m == 0 or len(chosen) == 0:
+        return csr_matrix((np.ones(count, np.float32), (np.arange(count),) * 2), shape=(count, count))
+    points, normals = surface.vertices[chosen], surface.normals[chosen]
+    distance, near = cKDTree(points).query(points, k=min(_BLUR_NEIGHBOURS, len(chosen)))
+    distance, near = distance.reshape(len(chosen), -1), near.reshape(len(chosen), -1)
+    alike = np.einsum("nc,nkc->nk", normals, normals[near]) > _SAME_SURFACE_COSINE
+    weights = np.exp(-0.5 * (distance / sigma_m) ** 2) * alike + (distance == 0)
+    weights /= weights.sum(1, keepdims=True)
+    row = np.concatenate([chosen.repeat(near.shape[1]), other])
+    column = np.concatenate([chosen[near].ravel(), other])
+    value = np.concatenate([weights.ravel(), np.ones(len(other))])
+    kept = value > _NO_WEIGHT
+    return csr_matrix((value[kept], (row[kept], column[kept])), shape=(count, count), dtype=np.float32)
 
 
 def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.EmbreeScene:
