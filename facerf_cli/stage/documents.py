@@ -1,0 +1,129 @@
+"""JSON that a user brings: read within bounds, and every entry checked, with one line that says where."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.atomic import atomic_path
+
+_LIMIT_BYTES = 64 << 20
+# Names become parts of paths: no separators, nothing hidden, nothing that climbs out of a folder.
+_NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")
+_LARGEST = 1e12
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value in a JSON document, and where it stands there."""
+
+    where: str  # the file, and the way to the value
+    value: Any
+
+    def wrong(self, wanted: str) -> InputError:
+        """The error that says what should stand here."""
+        text = json.dumps(self.value, default=str)
+        shown = text if len(text) <= 60 else text[:57] + "..."
+        return InputError(f"{self.where} is {shown}; {wanted} is needed")
+
+    def __getitem__(self, key: str) -> "Node":
+        found = self.get(key)
+        if found is None:
+            raise InputError(f"{self.where} has no {key!r}")
+        return found
+
+    def get(self, key: str) -> "Node | None":
+        """An object's entry, or None where it has none of that key."""
+        if not isinstance(self.value, dict):
+            raise self.wrong("an object { }")
+        return Node(f"{self.where}: {key}", self.value[key]) if key in self.value else None
+
+    def text(self) -> str:
+        """A string."""
+        if not isinstance(self.value, str):
+            raise self.wrong("a text")
+        return self.value
+
+    def name(self) -> str:
+        """A string that can stand in a file's name, such as a subject's or a camera's."""
+        if not _NAME.fullmatch(self.text()) or self.text().endswith((" ", ".")):
+            raise self.wrong("a name of letters, digits, - and _")
+        return self.text()
+
+    def whole(self, low: int, high: int) -> int:
+        """A whole number from `low` to `high`."""
+        if type(self.value) is not int or not low <= self.value <= high:
+            raise self.wrong(f"a whole number from {low} to {high}")
+        return self.value
+
+    def array(self, *shape: int) -> np.ndarray:
+        """Finite numbers of that shape, float64; without a shape, one number."""
+        kind = " x ".join(map(str, shape)) + " finite numbers" if shape else "a finite number"
+        try:
+            array = np.array(self.value)
+        except ValueError:
+            raise self.wrong(kind) from None
+        if array.shape != shape or array.dtype.kind not in "if" or not (np.abs(array) < _LARGEST).all():
+            raise self.wrong(kind)
+        return array.astype(np.float64)
+
+    def items(self, most: int) -> "list[Node]":
+        """A list's entries, `most` of them or fewer."""
+        if not isinstance(self.value, list):
+            raise self.wrong("a list [ ]")
+        if len(self.value) > most:
+            raise InputError(f"{self.where} has {len(self.value)} entries; {most} are the most")
+        return [Node(f"{self.where}[{index}]", entry) for index, entry in enumerate(self.value)]
+
+    def entries(self, most: int) -> "dict[str, Node]":
+        """An object's entries by key, each key a `name`, `most` of them or fewer."""
+        if not isinstance(self.value, dict):
+            raise self.wrong("an object { }")
+        if len(self.value) > most:
+            raise InputError(f"{self.where} has {len(self.value)} entries; {most} are the most")
+        return {
+            Node(f"{self.where}: a key", key).name(): Node(f"{self.where}: {key}", entry)
+            for key, entry in self.value.items()
+        }
+
+
+def read_document(path: Path, missing: str) -> Node:
+    """The JSON document in a file; `missing` says what to do where there is none."""
+    try:
+        size = path.stat().st_size
+        text = path.read_text(encoding="utf-8") if size <= _LIMIT_BYTES else ""
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {missing}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not JSON (it is no text in UTF-8)") from None
+    if size > _LIMIT_BYTES:
+        raise InputError(f"{path}: {size >> 20} MiB are too many for a description")
+    try:
+        return Node(str(path), json.loads(text))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error})") from None
+
+
+def write_document(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON for people and programs, whole or not at all; NaN is a ValueError."""
+    text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=1)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def unique_ids(nodes: list[Node]) -> list[str]:
+    """The ids of objects in a list, each a name and none of them twice."""
+    ids = [node["id"].name() for node in nodes]
+    seen: set[str] = set()
+    for node, name in zip(nodes, ids, strict=True):
+        if name in seen:
+            raise node["id"].wrong("an id that no other entry has")
+        seen.add(name)
+    return ids
