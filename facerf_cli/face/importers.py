@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.head_model import HEAD_PARTS, HeadModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import (
     GRID,
@@ -25,6 +26,7 @@ from facerf_cli.face.topology import (
     LANDMARKS_M,
     chart_rays,
     chart_uv,
+    grid_triangles,
     grid_uv,
     landmark_weights,
 )
@@ -33,6 +35,7 @@ from facerf_cli.records import one_line
 EXPRESSION_STD = 0.3  # of a full blendshape: the spread that a coefficient of 1 stands for
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
 _PULL_M = 0.005  # how far around a landmark the grid is pulled onto it
+_LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and the angle at which eye textures show it
 _CANDIDATES = 12  # triangles by their centres, among which the nearest point is sought
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, and of all
 _DAMAGED = (OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
@@ -45,7 +48,26 @@ _ICT_LANDMARKS = (
 )
 _ICT_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
 _ICT_VERTICES = 26719
+_ICT_PARTS = {  # first and last vertex; an eyeball is its sclera, which wraps the iris and bulges as a cornea
+    "skin": ((0, 11247),),
+    "mouth": ((11248, 13293), (14062, 17038)),  # socket; gums and tongue
+    "teeth": ((17039, 21450),),
+    "eye": ((21451, 22220), (23021, 23790)),
+}
 _ICT_LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
+
+
+@dataclass(frozen=True)
+class SourceHead:
+    """What of a model's own mesh makes its whole head.
+
+    triangles [F, 3] in the source's vertex ids; part [N] uint8 into `HEAD_PARTS`; eyes: the vertex ids of
+    each ball, a closed surface whose cornea looks along the gaze.
+    """
+
+    triangles: np.ndarray
+    part: np.ndarray
+    eyes: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -64,6 +86,7 @@ class SourceModel:
     expression_names: tuple[str, ...]
     triangles: np.ndarray
     landmarks: np.ndarray
+    head: SourceHead | None = None
 
 
 def carry_over(source: SourceModel) -> MorphableModel:
@@ -84,7 +107,75 @@ def carry_over(source: SourceModel) -> MorphableModel:
         identity=carried(source.identity @ rotation.T),
         expression=carried(source.expression @ rotation.T),
         expression_names=source.expression_names,
+        head=None if source.head is None else _carried_head(source, source.head, carried(mean).numpy()),
     )
+
+
+def _carried_head(source: SourceModel, head: SourceHead, canonical: np.ndarray) -> HeadModel:
+    """The source's own head in the head frame, its skin in the chart of the canonical mean [V, 3]."""
+    rotation, translation = rigid_alignment(source.mean[source.landmarks], LANDMARKS_M)
+    mean = source.mean @ rotation.T + translation
+    uv = chart_uv(mean)
+    skin = np.flatnonzero(head.part == HEAD_PARTS.index("skin"))
+    uv[skin] = _skin_uv(mean[skin], canonical)
+    for eye in head.eyes:
+        uv[eye] = _eye_uv(mean[eye])
+    used, triangles = np.unique(head.triangles, return_inverse=True)
+
+    def kept(field: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(field[..., used, :].astype(np.float32))
+
+    return HeadModel(
+        mean=kept(mean),
+        identity=kept(source.identity @ rotation.T),
+        expression=kept(source.expression @ rotation.T),
+        triangles=torch.from_numpy(triangles.reshape(-1, 3)),
+        part=torch.from_numpy(head.part[used]),
+        uv=kept(uv),
+    )
+
+
+def _skin_uv(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
+    """(u, v) [N, 2] of skin: that of the nearest canonical point, and around the chart its formula.
+
+    What the formula is off by at the chart's border fades into what lies beyond, so that nothing jumps.
+    """
+    grid = grid_uv().double().numpy()
+    mesh = trimesh.Trimesh(canonical, grid_triangles().numpy(), process=False)
+    nearest, faces = _nearest(mesh, points)
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], nearest)
+    inner = (weights[..., None] * grid[mesh.faces[faces]]).sum(1)
+    formula = chart_uv(points)
+    inside = ((inner > 1e-3) & (inner < 1 - 1e-3) & (np.abs(formula - 0.5) < 0.7)).all(-1)
+    border = ((grid == 0) | (grid == 1)).any(-1)
+    at = chart_uv(canonical[border])
+    pull = 1 / (cdist(formula, at) ** 4 + 1e-12)  # inverse distance: exact at the border, smooth beyond
+    beyond = formula + (pull @ (grid[border] - at)) / pull.sum(-1, keepdims=True)
+    return np.where(inside[:, None], inner, beyond)
+
+
+def _eye_uv(points: np.ndarray) -> np.ndarray:
+    """(u, v) [N, 2] of an eyeball: direction and angle about the axis through its cornea, as a disc.
+
+    Angles are stretched so that an iris of `_LIMBUS_M` has the same place in every model's eyes, however
+    large their balls.
+    """
+    centre = (points.min(0) + points.max(0)) / 2
+    offset = points - centre
+    radius = np.linalg.norm(offset, axis=-1)
+    axis = offset[radius > np.percentile(radius[offset[:, 2] > 0], 90)]
+    axis = axis[axis[:, 2] > 0].mean(0)
+    axis /= np.linalg.norm(axis)
+    along = offset @ axis
+    side = np.cross([0.0, 1, 0], axis)
+    side /= np.linalg.norm(side)
+    across = np.stack([offset @ side, -(offset @ np.cross(axis, side))], -1)
+    lateral = np.linalg.norm(across, axis=-1)
+    angle_deg = np.degrees(np.arctan2(lateral, along))
+    front = np.argsort(angle_deg)[: len(points) // 2]
+    limbus_deg = np.interp(_LIMBUS_M, lateral[front], angle_deg[front])
+    stretched = np.minimum(angle_deg * _LIMBUS_DEG / limbus_deg, 90)
+    return 0.5 + 0.5 * across / np.maximum(lateral, 1e-9)[:, None] * (stretched / 90)[:, None]
 
 
 def register(mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +287,18 @@ def _ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
         expression_names=tuple(expressions),
         triangles=triangles[outer[triangles].all(1)],
         landmarks=np.array(_ICT_LANDMARKS.split(), dtype=np.int64),
+        head=_ict_head(triangles),
     )
+
+
+def _ict_head(triangles: np.ndarray) -> SourceHead:
+    """Skin, mouth, teeth and eyeballs; the sockets behind the eyes and the film before them are left out."""
+    part = np.full(_ICT_VERTICES, 255, np.uint8)
+    for name, spans in _ICT_PARTS.items():
+        for first, last in spans:
+            part[first : last + 1] = HEAD_PARTS.index(name)
+    eyes = tuple(np.arange(first, last + 1) for first, last in _ICT_PARTS["eye"])
+    return SourceHead(triangles[(part[triangles] < 255).all(1)], part, eyes)
 
 
 def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:

@@ -1,6 +1,8 @@
 """Morphable models on the canonical topology (paper, 'Reflectance Field Representation')."""
 
+import math
 import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,11 +11,15 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.head_model import HeadModel, head_from_arrays, head_to_arrays
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
+from facerf_cli.records import one_line
 
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 _MAX_COEFFICIENTS = 500
+_MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
+_DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True, eq=False)  # caches know it by identity
@@ -21,7 +27,7 @@ class MorphableModel:
     """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
 
     mean [V, 3], identity [Ki, V, 3], expression [Ke, V, 3]; every coefficient has a standard normal prior
-    and zeros give the neutral mean.
+    and zeros give the neutral mean. `head` is the whole head in the authors' topology, where they give one.
     """
 
     name: str
@@ -30,6 +36,7 @@ class MorphableModel:
     identity: Tensor
     expression: Tensor
     expression_names: tuple[str, ...]
+    head: HeadModel | None = None
 
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
         """v = mean + M_id alpha + M_exp beta, for alpha [B, Ki] and beta [B, Ke], as [B, V, 3]."""
@@ -44,7 +51,8 @@ class MorphableModel:
     def to(self, device: torch.device | str) -> "MorphableModel":
         """The same model with its arrays on `device`."""
         mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
-        return replace(self, mean=mean, identity=identity, expression=expression)
+        head = self.head and self.head.to(device)
+        return replace(self, mean=mean, identity=identity, expression=expression, head=head)
 
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
@@ -59,6 +67,8 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             identity=model.identity.numpy().astype(np.float16),
             expression=model.expression.numpy().astype(np.float16),
             expression_names=np.array(model.expression_names, dtype=np.str_),
+            allow_pickle=False,
+            **head_to_arrays(model.head),
         )
 
 
@@ -72,13 +82,28 @@ def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
     try:
         if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
             raise ValueError("it is no .npz")
+        _require_bounded(path)
         with np.load(path, allow_pickle=False) as file:
             return _from_arrays(path, {key: file[key] for key in file.files})
-    except (ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+    except _DAMAGED as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
         raise InputError(
             f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
         ) from None
+
+
+def _require_bounded(path: Path) -> None:
+    """Look at what the arrays claim before room is made for them."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+                if read is None:
+                    raise ValueError(f"{entry.filename} is no array of version 1.0")
+                shape, _, dtype = read(file)
+            if max(entry.file_size, math.prod(shape) * dtype.itemsize) > _MAX_ARRAY_BYTES:
+                raise ValueError(f"{entry.filename} is too large")
 
 
 def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
@@ -99,4 +124,7 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
     if not all(tensor.isfinite().all() for tensor in (mean, identity, expression)):
         raise ValueError("it holds values that are not finite")
     names = tuple(str(name) for name in arrays["expression_names"])
-    return MorphableModel(str(arrays["name"]), str(arrays["licence"]), mean, identity, expression, names)
+    head = head_from_arrays(arrays, len(identity), len(expression))
+    return MorphableModel(
+        str(arrays["name"]), str(arrays["licence"]), mean, identity, expression, names, head
+    )
