@@ -1,6 +1,7 @@
 """Radiance of a skin under baked lights: shadowed diffuse, one bounce, scattering, two glossy lobes."""
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -8,7 +9,8 @@ from torch import Tensor
 
 from facerf_cli.stage.skin import Skin
 
-_LOBES = ((1.0, 0.75), (0.55, 0.25))  # (roughness factor, weight): a broad lobe and an oily one
+LOBES = ((1.0, 0.75), (0.55, 0.25))  # (roughness factor, weight): a broad lobe and an oily one
+_STRAND_LOBES = ((-0.12, 1.0), (0.17, 2.0))  # (shift in radians toward the tip, width factor)
 
 
 def diffuse_irradiance(
@@ -49,15 +51,75 @@ def highlights(normals: Tensor, views: Tensor, lights: Tensor, skin: Skin) -> Te
     n_dot_h = (half * normals[:, None]).sum(2).clamp(0, 1)
     v_dot_h = (half * views[:, None]).sum(2).clamp(0, 1)
     n_dot_l = torch.einsum("blc,bcij->blij", lights, normals).clamp_min(0)
-    fresnel = skin.specular + (1 - skin.specular) * (1 - v_dot_h) ** 5
+    cosines = Cosines(n_dot_l, n_dot_v, n_dot_h, v_dot_h)
+    return two_lobes(cosines, skin.specular, skin.roughness)
+
+
+class Cosines(NamedTuple):
+    """Between normal n, light l, view v and half vector h, of any shapes that broadcast; all in 0..1."""
+
+    n_dot_l: Tensor
+    n_dot_v: Tensor
+    n_dot_h: Tensor
+    v_dot_h: Tensor
+
+
+def two_lobes(cosines: Cosines, specular: Tensor, roughness: Tensor) -> Tensor:
+    """The radiance of `highlights` from its cosines, for any shapes that broadcast."""
+    n_dot_l, n_dot_v, n_dot_h, v_dot_h = cosines
+    fresnel = specular + (1 - specular) * (1 - v_dot_h) ** 5
     total = torch.zeros_like(n_dot_l)
-    for factor, weight in _LOBES:
-        alpha_squared = (skin.roughness * factor) ** 4
+    for factor, weight in LOBES:
+        alpha_squared = (roughness * factor) ** 4
         distribution = alpha_squared / (math.pi * (n_dot_h**2 * (alpha_squared - 1) + 1) ** 2)
-        k = skin.roughness * factor / 2
+        k = roughness * factor / 2
         masking = 1 / ((n_dot_l * (1 - k) + k) * (n_dot_v * (1 - k) + k))
         total += weight * distribution * masking / 4
     return math.pi * total * fresnel * n_dot_l
+
+
+def strand_cosines(tangents: Tensor, normals: Tensor, lights: Tensor) -> Tensor:
+    """What takes the place of n.l for hair [N, L]: strands [N, 3] in a volume with normals [N, 3].
+
+    Kajiya and Kay's sine (*Rendering fur*, 1989), wrapped by the volume's normal as Scheuermann has it (*Hair
+    rendering and shading*, 2004), for all unit.
+    """
+    sines = (1 - (tangents @ lights.T) ** 2).clamp_min(0).sqrt()
+    return sines * (0.25 + 0.75 * (normals @ lights.T)).clamp_min(0)
+
+
+class Strands(NamedTuple):
+    """Hair at N points: unit tangents toward the tip and unit views [N, 3], specular and roughness [N]."""
+
+    tangents: Tensor
+    views: Tensor
+    specular: Tensor
+    roughness: Tensor
+
+
+def strand_highlights(hair: Strands, lights: Tensor) -> tuple[Tensor, Tensor]:
+    """Specular radiance [N, L] of lights [L, 3] of rgb 1: the white highlight and the one that hair colours.
+
+    The R and, simplified to a second shifted copy, TRT lobes of Marschner et al. (*Light scattering from
+    human hair fibers*, 2003): a Gaussian in the half angle along the strand, cos(phi / 2) / 4 around it.
+    """
+    sin_l, sin_v = hair.tangents @ lights.T, (hair.tangents * hair.views).sum(-1, keepdim=True)
+    sin_l, sin_v = sin_l.clamp(-0.999, 0.999), sin_v.clamp(-0.999, 0.999)
+    theta_l, theta_v = sin_l.asin(), sin_v.asin()
+    cos_l, cos_v = theta_l.cos(), theta_v.cos()
+    cos_phi = ((hair.views @ lights.T - sin_l * sin_v) / (cos_l * cos_v)).clamp(-1, 1)
+    cos_half_phi = ((1 + cos_phi) / 2).sqrt()
+    cos_difference = ((theta_l - theta_v) / 2).cos()
+    incidence = (cos_half_phi * cos_difference).clamp(0, 1)
+    fresnel = hair.specular[:, None] + (1 - hair.specular[:, None]) * (1 - incidence) ** 5
+    around = math.pi * cos_l * cos_half_phi / (4 * cos_difference**2)
+    half, width = (theta_l + theta_v) / 2, (hair.roughness[:, None] ** 2).clamp_min(0.06)
+    white, coloured = (around * _gaussian(half - shift, width * spread) for shift, spread in _STRAND_LOBES)
+    return fresnel * white, (1 - fresnel) ** 2 * hair.specular[:, None] * coloured
+
+
+def _gaussian(angle: Tensor, sigma: Tensor) -> Tensor:
+    return torch.exp(-0.5 * (angle / sigma) ** 2) / (math.sqrt(2 * math.pi) * sigma)
 
 
 def bend(normals: Tensor, tangents_u: Tensor, tangents_v: Tensor, relief: Tensor) -> Tensor:
