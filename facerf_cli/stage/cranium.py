@@ -1,0 +1,145 @@
+"""The head around the chart: skull, sides and neck, bent smoothly onto the border of any face.
+
+A table of section depths about the head's vertical axis gives an average head; its depths were measured on
+the ICT-FaceKit mean, ears and shoulders taken away, and rounded to half a millimetre (none of its vertices
+are in here). What the chart's border differs from it is carried outward by kriging, so that position and
+slope go on across the border and the difference dies away over the skull.
+"""
+
+from functools import cache
+
+import numpy as np
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import map_coordinates
+from scipy.spatial.distance import cdist
+
+from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
+
+BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; the other one is 1 - BACK_U
+CROWN_LEVEL, NECK_LEVEL = -0.7242, 1.506  # of the pole and of the neck's lower end; see `template`
+
+_AZIMUTHS_DEG = (0, 16, 32, 48, 61, 73, 87, 103, 120, 140, 160, 180)
+# Height in millimetres | distance from the axis; above 92 the rows are degrees of elevation about (0, 92, 0).
+_CROWN_MM = """
+ 90 |  52.5  52.5  52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5
+ 70 |  56.5  56    55.5 55   54.5 54.5 54   53.5 53   52.5 52.5 52.5
+ 50 |  65    64    63   61   59.5 58.5 57.5 57   56.5 55.5 55   55
+ 32 |  78    76.5  73   69   66   64   63   62   61   60   59   58.5
+ 16 |  93    90.5  84   77.5 73   70.5 68.5 67.5 66.5 65.5 64   63.5
+"""
+_SECTIONS_MM = """
+  92 | 108   106    96.5 87   81   77   75   73.5 73   72   70.5 70
+  76 | 113.5 111.5 102   91   84.5 80.5 78   77   76.5 76   75   74.5
+  59 | 117.5 116.5 106   92.5 85.5 81.5 79   78   78   77.5 77   76.5
+  42 | 111   111   107.5 93   85.5 81   78   76.5 76.5 76.5 75.5 75.5
+  25 | 108.5 109   106   95   84.5 78.5 75.5 73.5 73   72.5 72   72
+   8 | 112.5 112   109   94.5 82.5 75   71.5 68.5 67   66.5 66   65.5
+  -8 | 119   114.5 107.5 91.5 80   71.5 66.5 63   60.5 59   58.5 58
+ -24 | 124   115   104   88.5 76   66.5 61.5 57.5 53.5 51.5 51   50.5
+ -40 | 120.5 115   100   83.5 69.5 62.5 58.5 53.5 49.5 48.5 48   47.5
+ -54 | 119.5 110    94   73.5 63   60   57   51.5 48.5 47.5 47   46.5
+ -66 | 120   106.5  81   63   60   59   56   51.5 49   48.5 47.5 47.5
+ -76 | 114    93    65.5 59   59   58.5 56   52.5 51   49.5 48.5 48.5
+ -84 |  79.5  68    59   57   58   58.5 56.5 54.5 53.5 52   51   50.5
+ -92 |  67    62.5  56.5 56   58   58   57   56   56   54.5 53   52.5
+-104 |  61    57.5  54   55.5 57   58.5 59   60   60   58   56   56
+-120 |  54    52.5  52   54   57   60   62.5 64   63.5 61.5 60   59.5
+-140 |  48    48.5  50   53.5 58.5 63   67.5 70   69.5 66.5 64   63
+-172 |  46    47.5  51   57   65   72.5 79   82.5 82   78   74   72
+"""
+_ROUNDING_MM = 0.2
+_CROWN_MM_PER_DEG = 1.4  # of level; about the arc's length
+_REACH_MM = 55.0  # how far the border's difference from the average head is felt
+_RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells further in
+_SCALE_LIMITS = (0.85, 1.2)
+_PAD = 6
+
+
+def template(u: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """The average head [..., 3] in millimetres at (u, level) [...].
+
+    `level` is the chart's v down from the chart's upper edge, and an arc's length over the crown above it:
+    0 at `TOP_M`, `CROWN_LEVEL` at the pole.
+    """
+    azimuth_deg = (u - 0.5) * 2 * HALF_ANGLE_DEG
+    top, tall = TOP_M * 1000, (TOP_M - BOTTOM_M) * 1000
+    height = top - level * tall
+    radius = _radius().ev(height, azimuth_deg)
+    elevation = np.radians(np.clip((height - top) / _CROWN_MM_PER_DEG, 0, 90))
+    azimuth = np.radians(azimuth_deg)
+    across = radius * np.cos(elevation)
+    y = np.minimum(height, top) + radius * np.sin(elevation)
+    return np.stack([across * np.sin(azimuth), y, across * np.cos(azimuth)], -1)
+
+
+@cache
+def _radius() -> RectBivariateSpline:
+    crown, sections = _table(_CROWN_MM), _table(_SECTIONS_MM)
+    crown[:, 0] = TOP_M * 1000 + crown[:, 0] * _CROWN_MM_PER_DEG
+    rows = np.concatenate([crown, sections])[::-1]
+    half = np.array(_AZIMUTHS_DEG, float)
+    azimuths = np.concatenate([half[-4:-1] - 360, -half[:0:-1], half, 360 - half[-2:-5:-1]])
+    columns = [np.abs(np.where(np.abs(a) > 180, 360 - np.abs(a), a)) for a in azimuths]
+    depths = rows[:, 1 + np.searchsorted(half, columns)]
+    return RectBivariateSpline(rows[:, 0], azimuths, depths, s=depths.size * _ROUNDING_MM**2)
+
+
+def _table(text: str) -> np.ndarray:
+    return np.array(
+        [[float(cell) for cell in row.replace("|", " ").split()] for row in text.strip().splitlines()]
+    )
+
+
+def on_chart(vertices_mm: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """The chart's surface [N, 3] at (u, v) [N, 2] inside it: a cubic spline through its vertices."""
+    grid = vertices_mm.reshape(GRID, GRID, 3)
+    padded = np.pad(grid, ((_PAD, _PAD), (_PAD, _PAD), (0, 0)), "reflect", reflect_type="odd")
+    at = np.stack([uv[:, 1], uv[:, 0]]) * (GRID - 1) + _PAD
+    return np.stack([map_coordinates(padded[..., axis], at, order=3) for axis in range(3)], -1)
+
+
+class Surroundings:
+    """The head beyond the chart at fixed (u, level) [N, 2], for many faces."""
+
+    def __init__(self, u_level: np.ndarray) -> None:
+        uv = grid_uv().double().numpy()
+        self._rings = _rings()
+        known = template(*uv[self._rings].T)
+        self._known, self._wanted = known, template(*u_level.T)
+        covariance = _kernel(known, known) + 1e-7 * np.eye(len(known))
+        self._carry = np.linalg.solve(covariance, _kernel(known, self._wanted)).T.astype(np.float32)
+
+    def positions(self, vertices_mm: np.ndarray) -> np.ndarray:
+        """The surface [N, 3] in millimetres that goes on from the chart's `vertices_mm` [V, 3]."""
+        border = vertices_mm[self._rings]
+        scale, shift = _similarity(self._known, border)
+        difference = border - (self._known * scale + shift)
+        return self._wanted * scale + shift + self._carry @ difference.astype(np.float32)
+
+
+def _rings() -> np.ndarray:
+    """Chart vertices [R] along its border and along a ring inside it."""
+    rows = []
+    for inside in (0, _RING_INSIDE):
+        near, far = inside, GRID - 1 - inside
+        along = np.unique([*range(near, GRID // 2, _RING_STEP), GRID // 2])
+        along = np.unique([*along, *(GRID - 1 - along)])
+        row, col = (axis.ravel() for axis in np.meshgrid(along, along, indexing="ij"))
+        edge = (row == near) | (row == far) | (col == near) | (col == far)
+        rows.append((row * GRID + col)[edge])
+    return np.concatenate(rows)
+
+
+def _kernel(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
+    """Matern 5/2: twice differentiable, so that slopes go on across the border."""
+    distance = cdist(a_mm, b_mm) * np.sqrt(5) / _REACH_MM
+    return (1 + distance + distance**2 / 3) * np.exp(-distance)
+
+
+def _similarity(known: np.ndarray, border: np.ndarray) -> tuple[float, np.ndarray]:
+    """Scale and shift [3] that bring the average head nearest to this one; the jaw, which moves, apart."""
+    steady = known[:, 1] > -20
+    a, b = known[steady], border[steady]
+    centred = a - a.mean(0)
+    scale = float(np.clip((centred * (b - b.mean(0))).sum() / (centred**2).sum(), *_SCALE_LIMITS))
+    return scale, b.mean(0) - scale * a.mean(0)

@@ -1,0 +1,144 @@
+"""What an open mouth shows: a dark bag behind the lips, and two rows of teeth."""
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.stage.eyeballs import ring_triangles
+
+# From the rim back: how far behind it, and how much wider and taller than it, in millimetres.
+_BAG_MM = ((0, 0, 0), (1.5, 1.5, 2), (4, 3.5, 5), (9, 4, 8), (18, 2, 10), (28, -4, 9), (38, -11, 4))
+_UPPER_WIDTHS_MM, _LOWER_WIDTHS_MM = (8.4, 6.7, 7.4, 6.8, 6.6, 9.5), (5.4, 5.9, 6.7, 6.8, 6.8, 10.0)
+_UPPER_HEIGHTS_MM, _LOWER_HEIGHTS_MM = (9.8, 8.6, 9.4, 8.0, 7.2, 6.8), (8.6, 8.8, 9.4, 8.2, 7.6, 7.0)
+_ARCH_HALF_MM, _ARCH_DEPTH_MM = 25.0, 40.0
+_EDGE_MM = np.array([0.0, -34.2, 116.5])  # of the upper incisors, in the average head
+_OVERLAP_MM, _OVERJET_MM = 2.0, 2.2
+_HINGE_MM = np.array([0.0, 12.0, 25.0])
+_STEADY = (27, 28, 29, 30, 33, 36, 39, 42, 45)  # landmarks that no expression moves much
+_LIP_MM = 2.5  # between the lips' inner rim and the teeth
+_TOOTH_RINGS, _TOOTH_SEGMENTS = 9, 16
+
+
+def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A bag behind the lips' inner rim [N, 3] (mm, in order): vertices, triangles seen from within, uv."""
+    centre = rim.mean(0)
+    offset = rim - centre
+    reach = np.maximum(np.abs(offset[:, :2]).max(0), 1.0)
+    direction = offset[:, :2] / reach
+    direction = direction / np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-6)
+    rings = []
+    flat = rim[:, 2].max()
+    for behind, wider, taller in _BAG_MM:
+        ring = rim.copy()
+        ring[:, :2] += direction * [wider, taller]
+        share = min(behind / 10, 1)
+        ring[:, 2] = (1 - share) * rim[:, 2] + share * flat - behind
+        rings.append(ring)
+    end = centre - [0, 0, 45]
+    vertices = np.concatenate([*rings, end[None]])
+    count = len(rim)
+    sides = ring_triangles(len(rings), count)
+    last = (len(rings) - 1) * count + np.arange(count)
+    cap = np.stack([last, np.full(count, len(vertices) - 1), np.roll(last, -1)], -1)
+    turn = np.arange(count) / count
+    uv = [np.stack([turn, np.full(count, k / len(rings))], -1) for k in range(len(rings))]
+    return vertices, np.concatenate([sides, cap])[:, ::-1], np.concatenate([*uv, [[0.5, 1]]])
+
+
+def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both rows behind the lips' rim [N, 3]: vertices [V, 3] in millimetres, triangles [F, 3], uv [V, 2]."""
+    scale, turn, shift = _skull(landmarks_mm)
+    upper = _row(_UPPER_WIDTHS_MM, _UPPER_HEIGHTS_MM, 1.0) + _EDGE_MM
+    closed = _EDGE_MM + [0, _OVERLAP_MM, -_OVERJET_MM]
+    lower = _row(_LOWER_WIDTHS_MM, _LOWER_HEIGHTS_MM, -1.0) * [0.94, 1, 0.94] + closed
+    lower = _dropped(lower, landmarks_mm, scale, turn, shift)
+    rows = [(row @ turn.T) * scale + shift for row in (upper, lower)]
+    rows = [row - [0, 0, _too_near(row, rim)] for row in rows]
+    one = _tooth_triangles()
+    count = _TOOTH_RINGS * _TOOTH_SEGMENTS
+    number = 2 * 2 * len(_UPPER_WIDTHS_MM)
+    triangles = (one + count * np.arange(number)[:, None, None]).reshape(-1, 3)
+    uv = np.stack(
+        np.meshgrid(np.linspace(0, 1, _TOOTH_SEGMENTS), np.linspace(0, 1, _TOOTH_RINGS)), -1
+    ).reshape(-1, 2)
+    return np.concatenate(rows), triangles, np.tile(uv, (number, 1))
+
+
+def _skull(landmarks_mm: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, turn [3, 3] and shift [3] from the average head to this one."""
+    a, b = LANDMARKS_M[list(_STEADY)] * 1000, landmarks_mm[list(_STEADY)]
+    turn, _ = Rotation.align_vectors(b - b.mean(0), a - a.mean(0))
+    matrix = turn.as_matrix()
+    scale = float(np.linalg.norm(b - b.mean(0)) / np.linalg.norm(a - a.mean(0)))
+    return scale, matrix, b.mean(0) - scale * matrix @ a.mean(0)
+
+
+def _dropped(
+    row: np.ndarray, landmarks_mm: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray
+) -> np.ndarray:
+    """The lower row turned about the jaw's hinge as far as the chin and the lower lip have gone down."""
+    found = (landmarks_mm - shift) @ turn / scale
+    chin = LANDMARKS_M[8, 1] * 1000 - found[8, 1]
+    parted = found[[61, 62, 63], 1].mean() - found[[67, 66, 65], 1].mean() - 2
+    drop = np.clip(min(chin + 4, parted), 0, 40)
+    arm = np.linalg.norm((_EDGE_MM - _HINGE_MM)[1:])
+    angle = drop / arm
+    aside = np.array([found[[6, 7, 8, 9, 10], 0].mean(), 0, 0])
+    return _HINGE_MM + Rotation.from_rotvec([angle, 0, 0]).apply(row - _HINGE_MM) + aside
+
+
+def _too_near(row: np.ndarray, rim: np.ndarray) -> float:
+    """How far back [mm] a row must go to stay behind the lips."""
+    middle = rim[np.abs(rim[:, 0] - rim[:, 0].mean()) < 0.5 * np.ptp(rim[:, 0]) / 2]
+    front = row[:, 2].max()
+    return float(max(front + _LIP_MM - middle[:, 2].min(), 0))
+
+
+def _row(widths: tuple[float, ...], heights: tuple[float, ...], up: float) -> np.ndarray:
+    """Teeth [V, 3] of a row with the incisors' edge at the origin, roots `up` (1 or -1)."""
+    along = np.linspace(0, np.pi / 2, 200)
+    arch = np.stack([np.sin(along) * _ARCH_HALF_MM, np.cos(along) * _ARCH_DEPTH_MM - _ARCH_DEPTH_MM], -1)
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(arch, axis=0), axis=-1))])
+    curve = CubicSpline(length, arch)
+    centres = np.cumsum(widths) - np.array(widths) / 2
+    sides = []
+    for centre, width, height in zip(centres, widths, heights, strict=True):
+        x, z = curve(centre)
+        tangent = curve(centre, 1)
+        angle = np.arctan2(-tangent[1], tangent[0])
+        tooth = _tooth(width, height, 6.0 if centre < 20 else 9.0) * [1, up, 1]
+        rotated = Rotation.from_rotvec([0, angle, 0]).apply(tooth) + [x, 0, z]
+        sides.append(rotated)
+    right = np.concatenate(sides)
+    mirrored = right.reshape(-1, _TOOTH_RINGS, _TOOTH_SEGMENTS, 3) * [-1, 1, 1]
+    if up < 0:
+        right = right.reshape(mirrored.shape)[:, :, ::-1].reshape(-1, 3)
+    else:
+        mirrored = mirrored[:, :, ::-1]
+    return np.concatenate([mirrored.reshape(-1, 3), right])
+
+
+def _tooth(width: float, height: float, depth: float) -> np.ndarray:
+    """A rounded block [V, 3] whose front is at z = 0 and edge at y = 0."""
+    level = np.linspace(0, 1, _TOOTH_RINGS)
+    around = np.arange(_TOOTH_SEGMENTS) / _TOOTH_SEGMENTS * 2 * np.pi
+    cos, sin = np.cos(around), np.sin(around)
+    square = np.stack([np.sign(cos) * np.abs(cos) ** 0.5, np.sign(sin) * np.abs(sin) ** 0.5], -1)
+    bulge = np.sin(np.pi * np.clip(level, 0.0, 1)) ** 0.25
+    narrow = 1 - 0.16 * level**2
+    x = square[None, :, 0] * (width * 0.49 * bulge * narrow)[:, None]
+    thin = 0.45 + 0.55 * np.clip(level * 1.6, 0, 1)
+    z = square[None, :, 1] * (depth / 2 * bulge * thin)[:, None]
+    front = -depth / 2 * thin[:, None] - 0.5 * (1 - bulge)[:, None]
+    y = np.broadcast_to((height * (1 - np.cos(np.pi * level)) / 2)[:, None], x.shape)
+    return np.stack([x, y, z + front], -1).reshape(-1, 3)
+
+
+def _tooth_triangles() -> np.ndarray:
+    """Counter-clockwise from outside for a tooth whose roots are up."""
+    faces = ring_triangles(_TOOTH_RINGS, _TOOTH_SEGMENTS)
+    last = (_TOOTH_RINGS - 1) * _TOOTH_SEGMENTS
+    faces = np.where(faces < _TOOTH_SEGMENTS, 0, np.where(faces >= last, last, faces))
+    i, j, k = faces.T
+    return faces[(i != j) & (j != k) & (k != i)]

@@ -1,0 +1,186 @@
+"""Any face model's chart closed into a whole head for the synthetic stage.
+
+The chart's surface is sampled finely and goes on over skull, sides and neck (`stage.cranium`); eyes and mouth
+are cut open between the lids and between the lips (`stage.openings`) where they are open, and filled.
+"""
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, landmark_weights
+from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.stage import ears, eyeballs, mouth
+from facerf_cli.stage.cranium import Surroundings, on_chart, template
+from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.openings import Sheet, outline, skin_sheet
+
+_EYES = {"eye_left": (36, 39, ((37, 41), (38, 40))), "eye_right": (42, 45, ((43, 47), (44, 46)))}
+_LIPS = ((61, 67), (62, 66), (63, 65))
+_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
+_AROUND_EYE_MM = 9.0
+_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
+_EAR_SINK_MM = 0.5
+_LID_RIM = ((0.0, 0.25, 0.25), (0.25, 0.6, 0.55))  # toward the ball (share), inward and down (mm)
+
+
+def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: int) -> HeadMesh:
+    """The whole bare head of a face given as canonical vertices [GRID * GRID, 3] in metres.
+
+    gaze: azimuth to the picture's right, elevation up, in degrees. The skin's samples are about
+    1 mm / 2 ** (subdivisions - 1) apart.
+    """
+    face_mm = vertices.detach().cpu().double().numpy() * 1000
+    corners, weights = (array.numpy() for array in landmark_weights())
+    landmarks_mm = (face_mm[corners] * weights[..., None]).sum(1)
+    cut = _open(landmarks_mm)
+    sheet = skin_sheet(subdivisions, cut)
+    skin_mm = _skin(face_mm, sheet, subdivisions, cut)
+    around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _EYES}
+    balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _EYES}
+    normals = _normals(skin_mm, sheet.triangles, sheet.same)
+    skin, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
+    parts = []
+    count = len(skin_mm)
+    same = [sheet.same]
+    for name, rim in sheet.rims.items():
+        edge, inward, down = skin_mm[rim], _inward(skin_mm[rim], normals[rim]), -normals[rim]
+        rings = _lips(edge, inward, down) if name == "mouth" else _lid(edge, inward, down, balls[name])
+        strip = _strip(rim, count, len(rings))
+        skin.append(np.concatenate(rings))
+        uv.append(np.tile(uv[0][rim], (len(rings), 1)))
+        triangles.append(strip)
+        same.append(count + np.arange(len(rings) * len(rim)))
+        count += len(rings) * len(rim)
+        if name == "mouth":
+            parts.append(_part("mouth", *mouth.bag(rings[-1])))
+            parts.append(_part("teeth", *mouth.teeth(landmarks_mm, rings[-1])))
+    parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
+    parts += [_ear(skin_mm, sheet, side) for side in (-1.0, 1.0)]
+    head = _part("skin", np.concatenate(skin), np.concatenate(triangles), np.concatenate(uv), np.concatenate(same))
+    return joined(head, *parts)
+
+
+def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
+    """Which openings are wide enough to be cut."""
+    gaps = {
+        name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
+        for name, (_, _, pairs) in _EYES.items()
+    }
+    found = [name for name, gap in gaps.items() if gap > _SHUT_LIDS_MM]
+    lips = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
+    return (*found, "mouth") if lips > _SHUT_LIPS_MM else tuple(found)
+
+
+def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, ...]) -> np.ndarray:
+    """Positions [N, 3] in millimetres of the sheet's samples."""
+    on = _on_chart(sheet.u_level)
+    skin = np.empty((len(on), 3))
+    skin[on] = on_chart(face_mm, sheet.u_level[on])
+    skin[~on] = _surroundings(subdivisions).positions(face_mm)
+    return skin
+
+
+@cache
+def _surroundings(subdivisions: int) -> Surroundings:
+    u_level = skin_sheet(subdivisions, ()).u_level
+    return Surroundings(u_level[~_on_chart(u_level)])
+
+
+def _on_chart(u_level: np.ndarray) -> np.ndarray:
+    return ((u_level >= 0) & (u_level <= 1)).all(-1)
+
+
+@cache
+def _around_eye(subdivisions: int, cut: tuple[str, ...], name: str) -> np.ndarray:
+    """Samples [M] of the skin about an eye."""
+    uv, line = skin_sheet(subdivisions, cut).u_level, outline(name)
+    margin = _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
+    return np.flatnonzero(((uv > line.min(0) - margin) & (uv < line.max(0) + margin)).all(-1))
+
+
+def _chart_uv(u_level: np.ndarray) -> np.ndarray:
+    """The extended chart's uv [N, 2]: heights over the crown are those of the average head."""
+    v = u_level[:, 1].copy()
+    crown = v < 0
+    y = template(*u_level[crown].T)[:, 1] / 1000
+    v[crown] = (TOP_M - y) / (TOP_M - BOTTOM_M)
+    return np.stack([u_level[:, 0], v], -1)
+
+
+def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Unit vectors [N, 3] in the surface from a counter-clockwise rim into its opening."""
+    along = np.roll(edge, -1, 0) - np.roll(edge, 1, 0)
+    across = np.cross(normals, along)
+    for _ in range(2):
+        across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+        across = np.roll(across, 1, 0) + 2 * across + np.roll(across, -1, 0)
+    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+
+
+def _lid(edge: np.ndarray, inward: np.ndarray, down: np.ndarray, ball: np.ndarray) -> list[np.ndarray]:
+    """Rings of a lid's margin, from its edge to just under the eyeball's surface."""
+    rings = []
+    low = edge + 0.6 * inward
+    to_ball = low - ball
+    foot = ball + to_ball / np.linalg.norm(to_ball, axis=-1, keepdims=True) * (eyeballs.RADIUS_MM - 0.3)
+    rounded = edge + 0.2 * inward + 0.15 * down
+    rings = [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
+    return rings
+
+
+def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
+    """Rings of the lips rolling back into the mouth."""
+    back = np.array([0.0, 0, -1])
+    return [
+        edge + 0.25 * inward + 0.35 * down + 0.2 * back,
+        edge + 0.3 * inward + 1.0 * back + 0.5 * down,
+        edge - 0.3 * inward + 3.0 * back,
+    ]
+
+
+def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
+    """Triangles between the rim's vertices and rings of new ones that start at `first`."""
+    count = len(rim)
+    ids = np.concatenate([rim[None], first + np.arange(rings * count).reshape(rings, count)])
+    a, b = ids[:-1], np.roll(ids[:-1], -1, 1)
+    c, d = ids[1:], np.roll(ids[1:], -1, 1)
+    return np.concatenate(
+        [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
+    )
+
+
+def _ear(skin_mm: np.ndarray, sheet: Sheet, side: float) -> HeadMesh:
+    """The ear at the head's `side` (1: the picture's right), where the head is."""
+    place = np.array([0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG), (TOP_M * 1000 - _EAR_Y_MM) / 174])
+    root = skin_mm[np.linalg.norm((sheet.u_level - place) * [1.4, 1], axis=-1).argmin()]
+    vertices, triangles = ears.ear()
+    points = root - [side * _EAR_SINK_MM, 0, 0] + vertices * [side, 1, 1]
+    azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
+    u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
+    uv = np.stack([u, (TOP_M - points[:, 1] / 1000) / (TOP_M - BOTTOM_M)], -1)
+    return _part("skin", points, triangles if side > 0 else triangles[:, ::-1], uv)
+
+
+def _part(
+    name: str, vertices_mm: np.ndarray, triangles: np.ndarray, uv: np.ndarray, same: np.ndarray | None = None
+) -> HeadMesh:
+    """A piece of mesh of one part, without vertices that no triangle uses."""
+    used, packed = np.unique(triangles, return_inverse=True)
+    stands = np.arange(len(vertices_mm)) if same is None else same
+    normals = _normals(vertices_mm, triangles, stands)[used]
+    return HeadMesh(
+        vertices=(vertices_mm[used] / 1000).astype(np.float32),
+        normals=normals.astype(np.float32),
+        triangles=packed.reshape(-1, 3).astype(np.int64),
+        part=np.full(len(used), PARTS.index(name), np.uint8),
+        uv=uv[used].astype(np.float32),
+        tangents=np.zeros((len(used), 3), np.float32),
+    )
+
+
+def _normals(vertices: np.ndarray, triangles: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Unit normals [V, 3], area-weighted; vertices that stand for one place share theirs."""
+    return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(same[triangles])).numpy()[same]
