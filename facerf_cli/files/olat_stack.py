@@ -8,7 +8,8 @@ without its photo.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -88,13 +89,32 @@ def is_olat_stack(path: Path) -> bool:
 
 def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
     """Read a stack; counts and sizes are checked before any pixels are decoded."""
+    with _opened(path) as stream:
+        content = _header_of(path, stream.spec(), limit_bytes)
+        return OlatStack(_read_header(path, stream, content), _read_lights(path, stream, content))
+
+
+def read_olat_header(path: Path) -> StackHeader:
+    """All of a stack but its lights' pixels, whatever the size of these."""
+    with _opened(path) as stream:
+        return _read_header(path, stream, _header_of(path, stream.spec()))
+
+
+def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
+    """Some lights' pictures [l, 3, h, W] float16, or rows of them, where a stack is too large to hold."""
+    with _opened(path) as stream:
+        return _read_lights(path, stream, _header_of(path, stream.spec()), lights, rows)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[oiio.ImageInput]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     stream = oiio.ImageInput.open(str(path))
     if stream is None:
         raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
     try:
-        return _read_parts(path, stream, limit_bytes)
+        yield stream
     finally:
         stream.geterror()
         stream.close()
@@ -143,23 +163,14 @@ def _as_half(path: Path, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(picture.clip(-HALF_MAX, HALF_MAX), np.float16)
 
 
-def _read_parts(path: Path, stream: oiio.ImageInput, limit_bytes: int) -> OlatStack:
-    spec = stream.spec()
-    content = _header_of(path, spec)
-    height, width, lights = spec.height, spec.width, content["lights"]
-    if not 1 <= lights < _MOST_PARTS or 6 * lights * height * width > limit_bytes:
-        raise InputError(
-            f"{path}: {lights} lights of {width} x {height} pixels are more than can be read "
-            f"({limit_bytes >> 20} MiB)"
-        )
-    olats = np.empty((lights, height, width, 3), np.float16)
+def _read_header(path: Path, stream: oiio.ImageInput, content: dict[str, Any]) -> StackHeader:
+    lights = content["lights"]
+    attributes = stream.spec().extra_attribs
     directions = np.empty((lights, 3))
     for number in range(lights):
-        olats[number], part = _pixels(path, stream, number, ("R", "G", "B"), (height, width))
-        directions[number] = _direction(path, part)
-    source, _ = _pixels(path, stream, lights, _SOURCE_CHANNELS, (height, width))
-    source = source.astype(np.float32)
-    header = StackHeader(
+        directions[number] = _direction(path, _part_at(path, stream, number))
+    source = _pixels(path, stream, lights, _SOURCE_CHANNELS, content["shape"]).astype(np.float32)
+    return StackHeader(
         kind=content["kind"],
         directions=directions,
         rotation=content["rotation"],
@@ -168,9 +179,23 @@ def _read_parts(path: Path, stream: oiio.ImageInput, limit_bytes: int) -> OlatSt
         normals=source[..., 4:],
         layout_version=content["layout_version"],
         fit=content["fit"],
-        metadata={entry.name: entry.value for entry in spec.extra_attribs if _is_provenance(entry.name)},
+        metadata={entry.name: entry.value for entry in attributes if _is_provenance(entry.name)},
     )
-    return OlatStack(header, torch.from_numpy(olats).permute(0, 3, 1, 2))
+
+
+def _read_lights(
+    path: Path,
+    stream: oiio.ImageInput,
+    content: dict[str, Any],
+    lights: slice = slice(None),
+    rows: slice = slice(None),
+) -> Tensor:
+    height, width = content["shape"]
+    numbers = range(content["lights"])[lights]
+    olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
+    for place, number in enumerate(numbers):
+        olats[place] = _pixels(path, stream, number, ("R", "G", "B"), content["shape"], rows)
+    return torch.from_numpy(olats).permute(0, 3, 1, 2)
 
 
 def _is_provenance(name: str) -> bool:
@@ -179,8 +204,20 @@ def _is_provenance(name: str) -> bool:
     )
 
 
-def _header_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
-    """The first part's JSON, each entry of the type that it must have."""
+def _header_of(path: Path, spec: oiio.ImageSpec, limit_bytes: int | None = None) -> dict[str, Any]:
+    """The first part's JSON, each entry of the type that it must have, and the pictures' shape (H, W)."""
+    content = _json_of(path, spec)
+    lights = content["lights"]
+    held_bytes = 0 if limit_bytes is None else 6 * lights * spec.height * spec.width
+    if not 1 <= lights < _MOST_PARTS or held_bytes > (limit_bytes or 0):
+        raise InputError(
+            f"{path}: {lights} lights of {spec.width} x {spec.height} pixels are more than can be read "
+            f"({(limit_bytes or STACK_LIMIT_BYTES) >> 20} MiB)"
+        )
+    return content | {"shape": (spec.height, spec.width)}
+
+
+def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
     text = spec.get_string_attribute(_HEADER)
     if not text:
         raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
@@ -212,20 +249,36 @@ def _direction(path: Path, spec: oiio.ImageSpec) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _pixels(
-    path: Path, stream: oiio.ImageInput, number: int, channels: tuple[str, ...], shape: tuple[int, int]
-) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """The named channels [H, W, C] of a part, and its header."""
+def _part_at(path: Path, stream: oiio.ImageInput, number: int) -> oiio.ImageSpec:
     if not stream.seek_subimage(number, 0):
         raise InputError(f"{path}: damaged OLAT stack: part {number} is missing")
-    spec = stream.spec()
+    return stream.spec()
+
+
+def _pixels(
+    path: Path,
+    stream: oiio.ImageInput,
+    number: int,
+    channels: tuple[str, ...],
+    shape: tuple[int, int],
+    rows: slice = slice(None),
+) -> np.ndarray:
+    """The named channels [h, W, C] of a part, or of some rows of it."""
+    spec = _part_at(path, stream, number)
     names = list(spec.channelnames)
     if (spec.height, spec.width) != shape or not set(channels) <= set(names) or len(names) > 16:
         raise InputError(f"{path}: damaged OLAT stack: part {number} has another size or other channels")
-    values = stream.read_image(number, 0, 0, spec.nchannels, oiio.HALF)
+    first, past, _ = rows.indices(spec.height)
+    if spec.tile_width:  # another program wrote it anew
+        values = stream.read_image(number, 0, 0, spec.nchannels, oiio.HALF)
+        values = None if values is None else values[first:past]
+    else:
+        window = (spec.y + first, spec.y + past, 0)
+        values = stream.read_scanlines(number, 0, *window, 0, spec.nchannels, oiio.HALF)
     if values is None:
         raise InputError(f"{path}: damaged or cut short: {one_line(stream.geterror())}")
+    values = values.reshape(past - first, spec.width, spec.nchannels)
     values = values[..., [names.index(name) for name in channels]]
     if not np.isfinite(values).all():
         raise InputError(f"{path}: part {number} of the OLAT stack holds NaN or infinite values")
-    return values, spec
+    return values
