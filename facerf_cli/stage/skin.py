@@ -1,34 +1,24 @@
-"""Procedural skin in the canonical chart: from pigments to albedo, gloss and fine relief, drawn at random.
+"""Procedural skin: people's pigments, region by region, to albedo, gloss and fine relief.
 
-Albedo follows Beer-Lambert: two pigments (melanin, haemoglobin) over a pale dermis, each with an absorbance
-per channel of linear Rec.709. Absorbances are rounded from the published spectra of both pigments (S.
-Jacques, *Optical properties of biological tissues: a review*, 2013) at 610, 550 and 465 nm.
+The same code paints the plain chart, for the training bank, and the wider canvas of the stage's whole heads.
 """
 
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.face.regions import region_mask
-from facerf_cli.face.topology import LANDMARK_UV
-from facerf_cli.raster.texture import texel_centres_uv
+from facerf_cli.stage.eyes import paint_eyes
+from facerf_cli.stage.facial_hair import FacialHair, draw_facial_hair
+from facerf_cli.stage.make_up import make_up
+from facerf_cli.stage.noise import noise
+from facerf_cli.stage.people import People, draw_people
+from facerf_cli.stage.pigments import hair_albedo, skin_albedo
+from facerf_cli.stage.relief import draw_relief
+from facerf_cli.stage.window import CHART_SPAN, Window, blob, blobs, inside, mask, places_mm, smooth
 
-_DERMIS = (0.86, 0.76, 0.68)  # linear Rec.709
-_MELANIN = (0.62, 0.92, 1.35)  # absorbance per channel of one unit; skins hold 0 to `_DARKEST`
-_DARKEST = 2.8
-_HAEMOGLOBIN = (0.05, 0.38, 0.30)
-_HAIR_COLOURS = (
-    (0.012, 0.010, 0.009),
-    (0.045, 0.025, 0.015),
-    (0.12, 0.07, 0.035),
-    (0.30, 0.21, 0.11),
-    (0.25, 0.24, 0.23),
-)
-_HAIR_SHARES = (0.4, 0.25, 0.15, 0.1, 0.1)
-_PAINTED = ("eyes", "brows", "lips", "mouth", "nostrils", "neck")
-_EYE_CORNERS = ((36, 39), (42, 45))
+# Root mean square reach of the sum of Gaussians that d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
+_SCATTERING_MM = (1.18, 0.26, 0.16)
 
 
 @dataclass(frozen=True)
@@ -48,169 +38,203 @@ class Skin:
 
 
 def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
-    """Draw B skins on a chart of `side` texels, tones from light to dark evenly."""
-    uniform = _Uniform(faces, generator)
-    coarse = noise(faces, side, 6, generator)
-    middle = noise(faces, side, 24, generator)
-    fine = torch.randn(faces, 1, side, side, generator=generator)
-    masks = {name: region_mask(name, side)[None, None] for name in _PAINTED}
+    """Draw B skins on a chart of `side` texels, eyes painted; tones from light to dark evenly."""
+    people = draw_people(faces, generator)
+    window = Window(side, CHART_SPAN)
+    skin = paint_skin(people, window, generator, painted_eyes=True)
+    clothed = mask(window, "neck", 5.0) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.4)
+    cloth = 0.02 + 0.58 * torch.rand(faces, 3, 1, 1, generator=generator)
+    slit = torch.where(torch.rand(faces, 1, 1, 1, generator=generator) < 0.5, 0.5, 0.06)
+    albedo = skin.albedo * (1 - clothed) + clothed * cloth
+    mouth = mask(window, "mouth", 1.0)
+    albedo = albedo * (1 - mouth) + mouth * slit
+    return Skin(albedo, skin.specular, skin.roughness, skin.relief, skin.scattering_texels)
 
-    melanin = uniform(0.05, 1.0) ** 1.4 * _DARKEST
-    melanin = melanin * (1 + uniform(0.02, 0.14) * coarse + uniform(0.02, 0.08) * middle) + _spots(
-        middle, fine, uniform
+
+def bare_skin(people: People) -> Tensor:
+    """Mean albedo [B, 3] of their skin, linear Rec.709, without features."""
+    return skin_albedo(_each(people.melanin), _each(people.haemoglobin))[:, :, 0, 0]
+
+
+def scattering_mm(people: People) -> Tensor:
+    """How far light of each channel spreads under their skin [B, 3], a Gaussian's sigma."""
+    return torch.tensor(_SCATTERING_MM).expand(len(people.melanin), 3).clone()
+
+
+def paint_skin(people: People, window: Window, generator: torch.Generator, painted_eyes: bool) -> Skin:
+    """Paint people's skin on a window; without painted eyes, lids go on where eyeballs will show."""
+    count = len(people.melanin)
+    coarse = noise(count, window, 38, generator)
+    middle = noise(count, window, 9, generator)
+    fine = torch.randn(count, 1, window.side, window.side, generator=generator)
+    melanin, blood = _pigments(people, window, coarse, middle, fine, generator)
+    hair = draw_facial_hair(people, window, generator)
+    relief, depth = draw_relief(people, window, 1 - hair.cover, generator)
+    melanin, blood = melanin * (1 + 0.25 * depth), blood * (1 + 0.3 * depth)
+    albedo = skin_albedo(melanin, blood)
+    cast = torch.tensor([1.0, 0.84, 0.70]).view(1, 3, 1, 1)  # hair under the skin takes more of the red
+    albedo = albedo * torch.exp(-hair.shadow * _darkness(people) * cast)
+    albedo = albedo * (1 - _each(people.random_texture)) + _each(people.random_texture) * _random_colours(
+        count, window, coarse, middle, generator
     )
-    blood = uniform(0.3, 1.1) * (
-        1 + uniform(0.05, 0.3) * noise(faces, side, 6, generator) + 0.5 * _flush(side) * uniform(0, 1)
-    )
-    melanin = melanin + masks["lips"] * uniform(-0.1, 0.35)
-    blood = blood + masks["lips"] * uniform(0.3, 1.6)
-    albedo = _pigmented(melanin, blood) * (1 + 0.03 * fine)
-    albedo = _make_up(albedo, masks, uniform)
-
-    hair, hair_colour = _hair_mask(side, masks, coarse, middle, fine, uniform, generator)
-    albedo = albedo * (1 - hair) + hair * hair_colour * (1 + 0.5 * fine)
-    albedo = albedo * (1 - 0.85 * masks["nostrils"])
-    clothed = masks["neck"] * (uniform(0, 1) < 0.4)
-    albedo = albedo * (1 - clothed) + clothed * uniform(0.02, 0.6, channels=3)
-    albedo = _random_textures(albedo, coarse, middle, uniform, generator)
-    teeth_or_dark = torch.where(uniform(0, 1) < 0.5, uniform(0.35, 0.7), uniform(0.02, 0.1))
-    albedo = albedo * (1 - masks["mouth"]) + masks["mouth"] * teeth_or_dark
-    eye_albedo = _eyes(side, masks["eyes"], uniform)
-    albedo = (albedo * (1 - masks["eyes"]) + masks["eyes"] * eye_albedo).clamp(0.005, 0.95)
-    return _with_gloss(albedo, hair, masks, middle, fine, uniform)
+    albedo = make_up(albedo, people, window)
+    albedo = _with_hair(albedo, people, hair, fine, middle)
+    albedo = _openings(albedo, window)
+    if painted_eyes:
+        albedo = paint_eyes(albedo, people, window, generator)
+    else:
+        albedo = _lid_rims(albedo, people, window)
+    specular, roughness = _gloss(people, window, hair, middle, fine, painted_eyes)
+    sigma = scattering_mm(people) / (sum(window.texel_mm) / 2)
+    eyes = mask(window, "eyes", 1.0) if painted_eyes else torch.zeros(1, 1, 1, 1)
+    return Skin(albedo.clamp(0.005, 0.95), specular, roughness, relief * (1 - eyes), sigma)
 
 
-class _Uniform:
-    """Draws one uniform number a face, shaped to broadcast over [B, C, T, T]."""
-
-    def __init__(self, faces: int, generator: torch.Generator) -> None:
-        self.faces, self.generator = faces, generator
-
-    def __call__(self, low: float, high: float, channels: int = 1) -> Tensor:
-        drawn = torch.rand(self.faces, channels, 1, 1, generator=self.generator)
-        return low + (high - low) * drawn
+def _each(values: Tensor) -> Tensor:
+    return values.view(-1, 1, 1, 1)
 
 
-def noise(faces: int, side: int, cells: int, generator: torch.Generator) -> Tensor:
-    """Smooth noise [B, 1, T, T] of unit deviation with about `cells` bumps a side and two finer octaves."""
-    total = torch.zeros(faces, 1, side, side)
-    for octave, weight in enumerate((1.0, 0.5, 0.25)):
-        size = min(cells * 2**octave, side)
-        grid = torch.randn(faces, 1, size, size, generator=generator)
-        total += weight * F.interpolate(grid, (side, side), mode="bicubic", align_corners=False)
-    return total / 0.9
-
-
-def _pigmented(melanin: Tensor, blood: Tensor) -> Tensor:
-    dermis, mel, haem = (torch.tensor(x).view(1, 3, 1, 1) for x in (_DERMIS, _MELANIN, _HAEMOGLOBIN))
-    return dermis * torch.exp(-melanin.clamp_min(0) * mel - blood.clamp_min(0) * haem)
-
-
-def _blob(side: int, landmark: int | tuple[float, float], radius: float) -> Tensor:
-    u, v = texel_centres_uv(side).unbind(-1)
-    at = LANDMARK_UV[landmark] if isinstance(landmark, int) else landmark
-    return torch.exp(-(((u - at[0]) / radius) ** 2 + ((v - at[1]) / radius) ** 2))
-
-
-def _flush(side: int) -> Tensor:
-    """Where blood shows: cheeks, nose tip, chin [1, 1, T, T]."""
-    cheeks = _blob(side, (0.27, 0.55), 0.10) + _blob(side, (0.73, 0.55), 0.10)
-    return (cheeks + _blob(side, 30, 0.05) + 0.5 * _blob(side, 8, 0.07))[None, None]
-
-
-def _spots(middle: Tensor, fine: Tensor, uniform: _Uniform) -> Tensor:
-    """Freckles and a few moles, as extra melanin."""
-    blurred = F.avg_pool2d(fine, 3, 1, 1) * 3
-    freckled = (uniform(0, 1) < 0.2) * torch.sigmoid(6 * (blurred + middle - 1.8)) * uniform(0.1, 0.5)
-    moles = torch.sigmoid(12 * (blurred - 3.6)) * uniform(0.5, 1.5)
-    return freckled + moles
-
-
-def _make_up(albedo: Tensor, masks: dict[str, Tensor], uniform: _Uniform) -> Tensor:
-    worn = (uniform(0, 1) < 0.2).float()
-    lipstick = uniform(0.05, 0.7, channels=3) * torch.tensor([1.0, 0.35, 0.4]).view(1, 3, 1, 1)
-    cover = worn * masks["lips"] * uniform(0.3, 0.9)
-    return albedo * (1 - cover) + cover * lipstick
-
-
-def _hair_mask(
-    side: int,
-    masks: dict[str, Tensor],
+def _pigments(
+    people: People,
+    window: Window,
     coarse: Tensor,
     middle: Tensor,
     fine: Tensor,
-    uniform: _Uniform,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Cover [B, 1, T, T] of brows, beard, hairline and fringe, and the hair's colour [B, 3, 1, 1]."""
-    u, v = texel_centres_uv(side).unbind(-1)
-    palette = torch.tensor(_HAIR_COLOURS)
-    index = torch.multinomial(torch.tensor(_HAIR_SHARES), uniform.faces, True, generator=generator)
-    colour = palette[index].view(-1, 3, 1, 1) * uniform(0.7, 1.4)
-    streaks = 0.8 + 0.25 * fine + 0.2 * middle
-    brows = masks["brows"] * uniform(0.3, 1.1) * streaks
-    lower = torch.sigmoid(40 * (v - 0.62 - 0.9 * (0.5 - (u - 0.5).abs()).clamp(0, 0.2)))[None, None]
-    moustache = _blob(side, 33, 0.06)[None, None] * (v > 0.6)
-    grown = (uniform(0, 1) < 0.3) * uniform(0.1, 0.9) ** 2
-    beard = (
-        (lower + 0.8 * moustache).clamp(0, 1)
-        * (1 - masks["lips"])
-        * grown
-        * (0.8 + 0.3 * middle + 0.3 * fine)
-    )
-    edge_distance = torch.maximum(0.10 - v, 1.5 * ((u - 0.5).abs() - 0.44))[None, None]
-    line = uniform(-0.12, 0.10) + 0.03 * coarse
-    scalp = torch.sigmoid(60 * (edge_distance + line)) * (0.9 + 0.1 * fine) * (uniform(0, 1) < 0.75)
-    cover = torch.maximum(torch.maximum(brows, beard), scalp).clamp(0, 0.97)
-    return cover * (1 - masks["eyes"]), colour
+    """Melanin and blood [B, 1, T, T], with the face's regions, blotches, freckles and moles."""
+    count = len(people.melanin)
+    even = 1 - 0.6 * _each(people.foundation)
+    uneven = _each(people.blotches) * even
+    age = _each((people.age - 18) / 57)
+    texel = min(1.0, min(window.texel_mm))
+    lips, lids = mask(window, "lips", 2.2), _around_eyes(window)
+    forehead = blob(window, (0.5, 0.02), 55, 0.6)
+    perimeter = smooth((inside(window, "face") - 26) / -40)
+    melanin = 1 + uneven * (0.10 * coarse + 0.07 * middle) + 0.05 * texel * fine
+    melanin = melanin + 0.10 * even * forehead + 0.14 * even * perimeter + 0.22 * even * lids
+    base = _each(people.melanin)
+    melanin = base * melanin.clamp_min(0.3) + _spots(people, window, middle, fine, age * even, generator)
+
+    veins = (1 - noise(count, window, 7, generator, octaves=2).abs() * 2.5).clamp(0, 1) ** 2
+    nose, cheeks = blob(window, 30, 13) + blobs(window, 0.455, 0.55, 7), blobs(window, 0.29, 0.52, 26)
+    ears = blobs(window, 1.24, 0.42, 38, 1.2)
+    flush = 0.9 * nose.clamp(0, 1) + 0.75 * cheeks + 0.35 * blob(window, 8, 14) + 0.8 * ears.clamp(0, 1)
+    flush = flush * (0.35 + 0.65 * _each(people.flush)) * even * (1 + 0.25 * middle)
+    red = 1 + 0.9 * flush + uneven * (0.22 * coarse + 0.16 * middle) + 0.12 * texel * fine * even
+    red = red + 0.5 * lids * even + 0.5 * veins * (nose + cheeks).clamp(0, 1) * (0.3 + age) * uneven
+    red = red - 0.2 * forehead
+    blood = _each(people.haemoglobin) * red.clamp_min(0.25)
+
+    lines = noise(count, window, (1.8, 8.0), generator, octaves=1)
+    lower = smooth((places_mm(window)[1] - 126) / 5)[None, None]
+    lip_melanin = base * (1.15 - 0.45 * lower) + 0.006 + 0.004 * lines
+    lip_blood = (3.2 + 0.5 * lower) * (0.012 + 0.6 * _each(people.haemoglobin)) * (1 + 0.10 * lines)
+    return melanin + lips * (lip_melanin - melanin), blood + lips * (lip_blood - blood)
 
 
-def _random_textures(
-    albedo: Tensor, coarse: Tensor, middle: Tensor, uniform: _Uniform, generator: torch.Generator
+def _around_eyes(window: Window) -> Tensor:
+    """Lids and the hollows under them [1, 1, T, T]."""
+    near = smooth((inside(window, "eyes") + 13) / 13)
+    under = blobs(window, 0.375, 0.385, 16, 0.5)
+    return (0.7 * near + 0.6 * under).clamp(0, 1)
+
+
+def _spots(
+    people: People, window: Window, middle: Tensor, fine: Tensor, age: Tensor, generator: torch.Generator
+) -> Tensor:
+    """Freckles, age spots and moles, as melanin of their own [B, 1, T, T]."""
+    count = len(people.melanin)
+    if bool((people.freckles > 0).any()):
+        dots = noise(count, window, 2.6, generator, octaves=1)
+        where = 0.5 + blobs(window, 0.35, 0.46, 30) + blob(window, 29, 22)
+        freckles = torch.sigmoid(7 * (dots + 0.5 * middle + 0.6 * (where.clamp(0, 1.4) - 1) - 1.25))
+        spots = _each(people.freckles) * 0.05 * freckles
+    else:
+        spots = torch.zeros_like(middle)
+    patches = noise(count, window, 7, generator, octaves=1)
+    spots = spots + 0.02 * age * torch.sigmoid(8 * (patches - 2.1))
+    x, y = places_mm(window)
+    for face in range(count):
+        for _ in range(int(people.moles[face])):
+            place = torch.rand(5, generator=generator)
+            at_x, at_y = 180 * float(place[0]) - 90, 230 * float(place[1]) - 20
+            radius = 0.6 + 1.4 * float(place[2]) ** 3 + 0.5 * max(window.texel_mm)
+            column, row = (int(c) for c in window.to_texels(torch.tensor([at_x, at_y])))
+            reach = int(3 * radius / min(window.texel_mm)) + 2
+            rows = slice(max(0, row - reach), max(0, row + reach))
+            columns = slice(max(0, column - reach), max(0, column + reach))
+            far2 = (x[rows, columns] - at_x) ** 2 + (y[rows, columns] - at_y) ** 2
+            spots[face, 0, rows, columns] += (0.04 + 0.16 * place[3]) * torch.exp(
+                -((far2 / radius**2) ** 1.5)
+            )
+    return spots
+
+
+def _darkness(people: People) -> Tensor:
+    """How dark their hair is, against brown."""
+    dark = (people.hair_eumelanin / 3).clamp(0.15, 1.6) * (1 - 0.6 * people.grey)
+    return _each(dark)
+
+
+def _random_colours(
+    count: int, window: Window, coarse: Tensor, middle: Tensor, generator: torch.Generator
 ) -> Tensor:
     """A share of faces wears random colours, so that nothing is read off skin tone alone."""
-    side = albedo.shape[-1]
-    coloured = torch.cat([noise(uniform.faces, side, 5, generator) for _ in range(3)], 1)
-    painted = (0.35 + 0.12 * coloured + 0.05 * middle + 0.05 * coarse).clamp(0.02, 0.9)
-    return torch.where(uniform(0, 1) < 0.07, painted, albedo)
+    coloured = torch.cat([noise(count, window, 45, generator, octaves=2) for _ in range(3)], 1)
+    mean = 0.15 + 0.4 * torch.rand(count, 3, 1, 1, generator=generator)
+    return (mean * torch.exp(0.35 * coloured + 0.12 * middle + 0.1 * coarse)).clamp(0.02, 0.85)
 
 
-def _eyes(side: int, mask: Tensor, uniform: _Uniform) -> Tensor:
-    """Sclera, iris and pupil, with one gaze for both eyes [B, 3, T, T]."""
-    u, v = texel_centres_uv(side).unbind(-1)
-    iris_colour = (
-        uniform(0.01, 0.22) * torch.tensor([1.0, 0.85, 0.75]).view(1, 3, 1, 1) * uniform(0.6, 1.4, channels=3)
-    )
-    shift_u, shift_v = uniform(-0.012, 0.012), uniform(-0.006, 0.006)
-    sclera = uniform(0.3, 0.65) * torch.tensor([1.0, 0.93, 0.88]).view(1, 3, 1, 1)
-    eye = sclera.expand(-1, 3, side, side)
-    for inner, outer in _EYE_CORNERS:
-        centre = LANDMARK_UV[[inner, outer]].mean(0)
-        radius = (((u - centre[0] - shift_u) / 0.026) ** 2 + ((v - centre[1] - shift_v) / 0.034) ** 2).sqrt()
-        iris, pupil = torch.sigmoid(14 * (1 - radius)), torch.sigmoid(14 * (0.42 - radius))
-        eye = eye * (1 - iris) + iris * iris_colour * (1 - 0.9 * pupil)
-    lashes = 4 * mask * (1 - mask)
-    return eye * (1 - 0.7 * lashes)
+def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, middle: Tensor) -> Tensor:
+    """Brows, beard and scalp over the skin; brows grey later than the rest."""
+    streaks = (1 + 0.18 * fine + 0.12 * middle).clamp(0.4, 1.8)
+    for cover, melanin, greyed in (
+        (hair.scalp, 1.0, 1.0),
+        (hair.beard, 0.8, 1.0),
+        (hair.brows, 1.15, 0.5),
+    ):
+        colour = hair_albedo(people.hair_eumelanin * melanin, people.hair_pheomelanin, people.grey * greyed)
+        albedo = albedo + cover * (colour[..., None, None] * streaks - albedo)
+    return albedo
 
 
-def _with_gloss(
-    albedo: Tensor, hair: Tensor, masks: dict[str, Tensor], middle: Tensor, fine: Tensor, uniform: _Uniform
-) -> Skin:
-    faces, _, side, _ = albedo.shape
-    t_zone = (_blob(side, 30, 0.07) + _blob(side, 27, 0.10) + 0.7 * _blob(side, (0.5, 0.12), 0.16))[
-        None, None
-    ]
-    oil = uniform(0.5, 1.5)
-    specular = 0.026 * oil * (0.8 + 0.6 * t_zone + 0.8 * masks["lips"] + 0.2 * middle).clamp_min(0.2)
-    specular = specular * (1 - 0.7 * hair) * (1 - 0.8 * masks["nostrils"])
-    specular = specular * (1 - masks["eyes"]) + 0.035 * masks["eyes"]
-    roughness = (0.52 - 0.10 * (oil - 1) - 0.08 * t_zone - 0.10 * masks["lips"] + 0.04 * middle).clamp(
-        0.28, 0.7
-    )
-    roughness = roughness * (1 - masks["eyes"]) + 0.22 * masks["eyes"]
-    relief_height = (0.5 * fine + 0.5 * middle) * uniform(0.1, 1) * (1 - masks["eyes"])
-    relief = torch.cat(
-        [relief_height.roll(-1, -1) - relief_height, relief_height.roll(-1, -2) - relief_height], 1
-    )
-    scattering = uniform(0.5, 1.3).view(faces, 1) * torch.tensor([[1.7, 0.9, 0.6]]) * side / 128
-    return Skin(albedo, specular, roughness, 0.09 * relief, scattering)
+def _openings(albedo: Tensor, window: Window) -> Tensor:
+    """Nostrils and the line between the lips are dark."""
+    nostrils = mask(window, "nostrils", 2.5)
+    slit = mask(window, "mouth", 1.2, 0.5)
+    dark = torch.tensor([0.80, 0.93, 0.93]).view(1, 3, 1, 1)
+    return albedo * (1 - 0.9 * nostrils * dark) * (1 - 0.45 * slit * dark)
+
+
+def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
+    """The wet pink rim of the lids, and the lashes' roots along their edge."""
+    beyond = inside(window, "eyes")
+    upper = smooth((62.5 - places_mm(window)[1]) / 5)[None, None]
+    rim = smooth((beyond + 0.6) / 1.2)
+    pink = skin_albedo(0.25 * _each(people.melanin), 0.03 + 0 * _each(people.melanin))
+    albedo = albedo + 0.6 * rim * (pink - albedo)
+    width = 0.7 + 0.6 * upper
+    lashes = torch.exp(-(((beyond + 0.9) / width) ** 2)) * (0.22 + 0.48 * upper)
+    return albedo * (1 - lashes * _darkness(people).clamp(0.5, 1))
+
+
+def _gloss(
+    people: People, window: Window, hair: FacialHair, middle: Tensor, fine: Tensor, painted_eyes: bool
+) -> tuple[Tensor, Tensor]:
+    """Reflectance at normal incidence and roughness [B, 1, T, T]; the same for all tones of skin."""
+    oil = _each(people.oiliness)
+    powder = _each(people.foundation)
+    t_zone = blob(window, 30, 15) + blob(window, 27, 20) + 0.8 * blob(window, (0.5, 0.06), 36, 0.7)
+    t_zone = (t_zone + 0.5 * blobs(window, 0.31, 0.45, 17) + 0.4 * blob(window, 8, 14)).clamp(0, 1)
+    lips = mask(window, "lips", 2.0)
+    specular = 0.028 * (0.75 + 0.35 * oil + 0.45 * t_zone * (0.4 + 0.6 * oil) + 0.08 * middle)
+    specular = specular * (1 - 0.2 * powder) + lips * 0.012
+    specular = specular * (1 - 0.5 * hair.cover) * (1 - 0.85 * mask(window, "nostrils", 2.5))
+    roughness = 0.56 - 0.08 * oil - 0.10 * t_zone * (0.3 + 0.7 * oil) + 0.06 * powder + 0.03 * middle
+    roughness = roughness + 0.02 * fine + lips * (0.36 + 0.03 * fine - roughness)
+    roughness = roughness + 0.15 * hair.cover
+    if painted_eyes:
+        eyes = mask(window, "eyes", 1.0)
+        specular, roughness = specular + eyes * (0.03 - specular), roughness + eyes * (0.18 - roughness)
+    return specular.clamp(0.003, 0.08), roughness.clamp(0.16, 0.85)
