@@ -1,4 +1,4 @@
-"""What the parts of a synthetic head are made of: skin on its canvas, eyes, teeth, mouth, cloth, hair, frame."""
+"""What the parts of a synthetic head are made of: skin on its canvas, eyes, teeth, cloth, hair, frames."""
 
 from dataclasses import dataclass
 
