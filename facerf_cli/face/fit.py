@@ -33,7 +33,7 @@ from facerf_cli.raster.camera import Camera
 
 Quality = Literal["good", "fair", "poor"]
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # a mean landmark error up to this is a good, a fair fit
-_IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
+IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
 _BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _INVISIBLE_M = 1e-4  # a direction of shape that moves no landmark further at one deviation is left out
 _BORDER = 0.01  # of the crop's side: contour landmarks closer to the photo's border are guesses
@@ -139,11 +139,9 @@ def fit_batch(
     """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weighs them."""
     target_px = torch.from_numpy(np.stack([check_landmarks(face.numpy()) for face in landmarks_px]))
     trust = torch.ones(target_px.shape[:2], dtype=torch.float64) if trust is None else trust.double()
-    basis = _basis(model, settings)
+    basis = fit_basis(model, settings)
     start, scale = weak_perspective(basis, target_px, camera)
-    noise_px = torch.full((68,), settings.noise_inner, dtype=torch.float64)
-    noise_px[list(CONTOUR)] = settings.noise_contour
-    noise_px = noise_px * (_IOD_M * scale)[:, None]  # [B, 68]
+    noise_px = landmark_noise(settings) * (IOD_M * scale)[:, None]  # [B, 68]
     problem = Problem(basis, target_px, camera, trust.sqrt() / noise_px, settings.huber)
     state = minimise(problem, start, settings.steps)
     distance_px = residuals(problem, state).difference_px.norm(dim=-1)
@@ -206,13 +204,21 @@ def load_fit(path: Path) -> FaceFit:
         raise InputError(f"{path}: not a fit that facerf wrote ({error}); fit the photo again") from None
 
 
+def landmark_noise(settings: FitSettings) -> Tensor:
+    """Deviation of each landmark [68], a share of the inter-ocular distance."""
+    noise = torch.full((68,), settings.noise_inner, dtype=torch.float64)
+    noise[list(CONTOUR)] = settings.noise_contour
+    return noise
+
+
 def _iod_px(landmarks_px: Tensor) -> Tensor:
     left, right = OUTER_EYE_CORNERS
     return (landmarks_px[:, left] - landmarks_px[:, right]).norm(dim=-1)
 
 
 @lru_cache(maxsize=4)
-def _basis(model: MorphableModel, settings: FitSettings) -> FitBasis:
+def fit_basis(model: MorphableModel, settings: FitSettings) -> FitBasis:
+    """The model at the points that a fit may use, with the settings' priors; once for each pair."""
     rays = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
     along = np.arange(rays) / RAYS_PER_LANDMARK
     contour = LANDMARK_UV[list(CONTOUR)]

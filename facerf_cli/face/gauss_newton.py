@@ -4,6 +4,7 @@ Contour landmarks slide: each is held to the closest point of the mesh's silhoue
 anew at every step (paper, 'Landmark loss').
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -91,14 +92,31 @@ def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tupl
 
 
 def minimise(problem: Problem, state: FitState, steps: int) -> FitState:
-    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost falls."""
-    damping = torch.full((len(problem.target_px),), _FIRST_DAMPING, dtype=torch.float64)
-    at = residuals(problem, state)
-    cost = _cost(problem, state, at)
+    """The state [B] after at most so many accepted steps."""
+    return descend(
+        lambda there: residuals(problem, there),
+        lambda there, at: landmark_cost(problem, at) + prior_cost(there),
+        lambda there, at, damping: _step(problem, there, at, damping),
+        state,
+        steps,
+    )
+
+
+def descend(
+    residuals_of: Callable[[FitState], Residuals],
+    cost_of: Callable[[FitState, Residuals], Tensor],
+    step_of: Callable[[FitState, Residuals, Tensor], Tensor],
+    state: FitState,
+    steps: int,
+) -> FitState:
+    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost [B] falls."""
+    damping = torch.full((len(state.coordinates),), _FIRST_DAMPING, dtype=torch.float64)
+    at = residuals_of(state)
+    cost = cost_of(state, at)
     for _ in range(steps):
-        trial = moved(state, _step(problem, state, at, damping))
-        trial_at = residuals(problem, trial)
-        trial_cost = _cost(problem, trial, trial_at)
+        trial = moved(state, step_of(state, at, damping))
+        trial_at = residuals_of(trial)
+        trial_cost = cost_of(trial, trial_at)
         accept = trial_cost < cost  # False for NaN
         state, at = trial.where(accept, state), trial_at.where(accept, at)
         cost = torch.where(accept, trial_cost, cost)
@@ -135,14 +153,8 @@ def _closest_edge(problem: Problem, state: FitState, band_px: Tensor) -> Tensor:
 
 def jacobian(problem: Problem, state: FitState, at: Residuals) -> Tensor:
     """d(px) / d(omega, shift, coordinates) [B, 68, 2, 6 + Q] at fixed correspondences, see `moved`."""
-    x, y, z = at.points_camera.unbind(-1)
-    zero, scale = torch.zeros_like(x), problem.camera.focal_px / -z
-    rows_u = torch.stack([scale, zero, -scale * x / z], -1)
-    rows_v = torch.stack([zero, -scale, scale * y / z], -1)
-    px_by_camera = torch.stack([rows_u, rows_v], -2)  # [B, 68, 2, 3]
-    turned = at.points_camera - state.translation_m[:, None]
-    by_rotation = -px_by_camera @ skew_matrix(turned)
-    by_translation = px_by_camera * -state.translation_m[:, None, None, 2:]
+    px_by_camera = pixels_by_points(at.points_camera, problem.camera)
+    by_pose = pixels_by_pose(px_by_camera, at.points_camera, state.translation_m)
     px_by_head = px_by_camera @ state.rotation[:, None]
     contour, inner = px_by_head[:, : len(CONTOUR)], px_by_head[:, len(CONTOUR) :]
     modes = problem.basis.modes
@@ -152,7 +164,24 @@ def jacobian(problem: Problem, state: FitState, at: Residuals) -> Tensor:
         INNER_COUNT, -1, 2, modes.shape[-1]
     )
     by_coordinates = torch.cat([by_contour, by_inner.permute(1, 0, 2, 3)], 1)
-    return torch.cat([by_rotation, by_translation, by_coordinates], -1)
+    return torch.cat([by_pose, by_coordinates], -1)
+
+
+def pixels_by_points(points_camera: Tensor, camera: Camera) -> Tensor:
+    """d(px) / d(point) [..., 2, 3] of points [..., 3]."""
+    x, y, z = points_camera.unbind(-1)
+    zero, scale = torch.zeros_like(x), camera.focal_px / -z
+    rows_u = torch.stack([scale, zero, -scale * x / z], -1)
+    rows_v = torch.stack([zero, -scale, scale * y / z], -1)
+    return torch.stack([rows_u, rows_v], -2)
+
+
+def pixels_by_pose(px_by_camera: Tensor, points_camera: Tensor, translation_m: Tensor) -> Tensor:
+    """d(px) / d(omega, shift) [B, N, 2, 6] of points [B, N, 3] of heads at translations [B, 3]."""
+    turned = points_camera - translation_m[:, None]
+    by_rotation = -px_by_camera @ skew_matrix(turned)
+    by_translation = px_by_camera * -translation_m[:, None, None, 2:]
+    return torch.cat([by_rotation, by_translation], -1)
 
 
 def moved(state: FitState, step: Tensor) -> FitState:
@@ -162,24 +191,40 @@ def moved(state: FitState, step: Tensor) -> FitState:
     return FitState(so3_exp(omega) @ state.rotation, translation, state.coordinates + change)
 
 
-def _cost(problem: Problem, state: FitState, at: Residuals) -> Tensor:
-    """Huber's cost of the landmarks plus the Gaussian priors [B]."""
+def landmark_cost(problem: Problem, at: Residuals) -> Tensor:
+    """Huber's cost of the landmarks [B]."""
     distance, huber = at.difference_px.norm(dim=-1) * problem.inverse_noise, problem.huber
     robust = torch.where(distance <= huber, distance**2, huber * (2 * distance - huber))
-    return robust.sum(1) + (state.coordinates**2).sum(1)
+    return robust.sum(1)
+
+
+def prior_cost(state: FitState) -> Tensor:
+    """The Gaussian priors' cost [B]."""
+    return (state.coordinates**2).sum(1)
 
 
 def _step(problem: Problem, state: FitState, at: Residuals, damping: Tensor) -> Tensor:
     """The damped step [B, 6 + Q] of the iteratively reweighted least squares."""
+    normal, gradient = normal_equations(problem, jacobian(problem, state, at), at)
+    return damped_step(normal, gradient, state.coordinates, damping)
+
+
+def normal_equations(problem: Problem, by_parameters: Tensor, at: Residuals) -> tuple[Tensor, Tensor]:
+    """The landmarks' part [B, P, P] and [B, P], reweighted, for a Jacobian [B, 68, 2, P]."""
     distance = at.difference_px.norm(dim=-1) * problem.inverse_noise
     weight = problem.inverse_noise * (problem.huber / distance.clamp(min=problem.huber)).sqrt()  # [B, 68]
-    weighted = (jacobian(problem, state, at) * weight[..., None, None]).flatten(1, 2)
+    weighted = (by_parameters * weight[..., None, None]).flatten(1, 2)
     difference = (at.difference_px * weight[..., None]).flatten(1, 2)
-    prior = torch.ones(weighted.shape[-1], dtype=torch.float64)
+    return weighted.mT @ weighted, (difference[:, None] @ weighted)[:, 0]
+
+
+def damped_step(normal: Tensor, gradient: Tensor, coordinates: Tensor, damping: Tensor) -> Tensor:
+    """Solve the landmarks' normal equations with the priors added: the step [B, 6 + Q]."""
+    prior = torch.ones(normal.shape[-1], dtype=torch.float64)
     prior[:6] = 0
-    gradient = (difference[:, None] @ weighted)[:, 0]
-    gradient[:, 6:] += state.coordinates
-    normal = weighted.mT @ weighted
+    gradient = gradient.clone()
+    gradient[:, 6:] += coordinates
+    normal = normal.clone()
     diagonal = normal.diagonal(dim1=1, dim2=2)
     diagonal += prior + damping[:, None] * (diagonal + prior)
     return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky(normal))[..., 0]

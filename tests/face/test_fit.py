@@ -11,7 +11,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import (
     FitSettings,
-    _basis,
+    fit_basis,
     fit_batch,
     fit_from_arrays,
     fit_landmarks,
@@ -78,7 +78,7 @@ def test_strong_priors_keep_the_shape_at_the_mean(model):
 
 
 def test_the_jacobian_is_the_derivative(model):
-    basis = _basis(model, FitSettings())
+    basis = fit_basis(model, FitSettings())
     target_px = see(model, *coefficients(model, 0.5, batch=2), (20, -8, 10)).double()
     problem = Problem(basis, target_px, CAMERA, torch.full((2, 68), 0.3).double(), 2.0)
     state = minimise(problem, weak_perspective(basis, target_px, CAMERA)[0], steps=2)
@@ -143,7 +143,7 @@ def test_the_far_jaw_slides_along_the_silhouette(model, yaw):
     vertices = model.mean @ rotation.mT + translation
     seen = rasterize(vertices, grid_triangles(), camera).triangle >= 0
     start = see(model, *coefficients(model, 0), (yaw, 0, 0), translation.tolist()).double()
-    basis = _basis(model, FitSettings())
+    basis = fit_basis(model, FitSettings())
     problem = Problem(basis, start, camera, torch.ones(1, 68).double(), 2.0)
     state = weak_perspective(basis, start, camera)[0]
     state = replace(state, rotation=rotation[None].double(), translation_m=translation[None].double())

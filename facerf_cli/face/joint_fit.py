@@ -1,0 +1,265 @@
+"""One head fitted to the landmarks of several calibrated cameras, and what each camera's crop sees of it.
+
+Identity, expression and the head's place in the world are shared; each camera adds the residuals of its 68
+landmarks, whose contour slides along the silhouette that this camera sees (`gauss_newton.py`). Priors and
+noise are those of single fits (`fit.py`). The world is the calibration's own, in metres, right-handed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import check_landmarks, from_landmarks
+from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
+from facerf_cli.face.gauss_newton import (
+    FitState,
+    Problem,
+    Residuals,
+    damped_step,
+    descend,
+    jacobian,
+    landmark_cost,
+    moved,
+    normal_equations,
+    pixels_by_points,
+    pixels_by_pose,
+    prior_cost,
+    residuals,
+    weak_perspective,
+)
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS, grid_triangles
+from facerf_cli.raster.camera import Camera, pixel_rays, project
+from facerf_cli.raster.rasterize import front_facing
+
+_USUAL = FitSettings()
+LOST_IOD = 0.15  # landmarks that lie this far off in the mean belong to no face, or to another one
+_PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # all cameras' landmarks are taken to this one's picture
+_CROP_STEPS = 12
+_CROP_STRIDE = 5  # every so many vertices hold the crop's pose
+
+
+@dataclass(frozen=True, eq=False)
+class PosedCamera:
+    """A calibrated pinhole camera in the world; camera space as in `raster/camera.py`, float64."""
+
+    focal_px: tuple[float, float]  # along x and along y
+    centre_px: tuple[float, float]
+    width_px: int
+    height_px: int
+    rotation: Tensor  # [3, 3] world to camera
+    translation_m: Tensor  # [3] world to camera
+
+    def project(self, points_world: Tensor) -> Tensor:
+        """World points [..., 3] to the picture's pixels [..., 2], float64."""
+        points_camera = points_world.double() @ self.rotation.mT + self.translation_m
+        focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
+        return project(points_camera, _PLANE) * focal + centre
+
+    def to_plane(self, px: Tensor) -> Tensor:
+        """Pixels [..., 2] to the picture of a camera of focal length 1, centred at 0."""
+        focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
+        return (px - centre) / focal
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A head in the world, float64."""
+
+    rotation: Tensor  # [3, 3], head to world
+    translation_m: Tensor  # [3]
+    alpha: Tensor  # [Ki]
+    beta: Tensor  # [Ke]
+    error_iod: tuple[float | None, ...]  # of each camera's landmarks, see `fit_views`; None where it has none
+
+    @property
+    def mean_error_iod(self) -> float:
+        """The mean over the cameras that have landmarks."""
+        return float(np.mean([error for error in self.error_iod if error is not None]))
+
+    def vertices_world(self, model: MorphableModel) -> Tensor:
+        """The mesh in the world [V, 3], float64."""
+        vertices = model.vertices(self.alpha[None].float(), self.beta[None].float())[0]
+        return vertices.double() @ self.rotation.mT + self.translation_m
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """The problem of one head seen by W cameras, its pose sought in the space of one of them.
+
+    States of the head are batches of one; the cameras' landmarks are the rows of `problem`.
+    """
+
+    problem: Problem
+    turn: Tensor  # [W, 3, 3], that camera's space to each one's
+    shift_m: Tensor  # [W, 3]
+
+    @staticmethod
+    def seen_from(reference: PosedCamera, cameras: Sequence[PosedCamera], problem: Problem) -> "_Joint":
+        turn = torch.stack([camera.rotation for camera in cameras]) @ reference.rotation.mT
+        shift_m = torch.stack([camera.translation_m for camera in cameras]) - turn @ reference.translation_m
+        return _Joint(problem, turn, shift_m)
+
+    def views(self, head: FitState) -> FitState:
+        """The head as each camera sees it [W]."""
+        place = self.turn @ head.translation_m[0] + self.shift_m
+        return FitState(self.turn @ head.rotation, place, head.coordinates.expand(len(place), -1))
+
+    def residuals(self, head: FitState) -> Residuals:
+        return residuals(self.problem, self.views(head))
+
+    def cost(self, head: FitState, at: Residuals) -> Tensor:
+        return landmark_cost(self.problem, at).sum(0, keepdim=True) + prior_cost(head)
+
+    def step(self, head: FitState, at: Residuals, damping: Tensor) -> Tensor:
+        views = self.views(head)
+        by_view = jacobian(self.problem, views, at)  # [W, 68, 2, 6 + Q]
+        depths = head.translation_m[0, 2] / views.translation_m[:, 2]  # `moved` shifts in units of depth
+        by_omega = by_view[..., :3] @ self.turn[:, None]
+        by_shift = by_view[..., 3:6] @ (self.turn * depths[:, None, None])[:, None]
+        by_head = torch.cat([by_omega, by_shift, by_view[..., 6:]], -1)
+        normal, gradient = normal_equations(self.problem, by_head, at)
+        return damped_step(normal.sum(0, True), gradient.sum(0, True), head.coordinates, damping)
+
+
+def fit_views(
+    model: MorphableModel,
+    cameras: Sequence[PosedCamera],
+    landmarks_px: Sequence[np.ndarray | None],
+    settings: FitSettings = _USUAL,
+) -> JointFit:
+    """Fit one head to landmarks [68, 2] in the pixels of each camera, None where it found no face.
+
+    Landmarks that the other cameras contradict (`LOST_IOD`) are left out and become None in the result.
+    Errors are mean distances of trusted landmarks over the inter-ocular distance as seen square on.
+    """
+    views = [(index, cameras[index], px) for index, px in enumerate(landmarks_px) if px is not None]
+    if not views:
+        raise InputError("no camera shows a face that can be found")
+    while True:
+        joint, errors = _fit_found(model, [view[1] for view in views], [view[2] for view in views], settings)
+        limit = max(LOST_IOD, min(errors))
+        kept = [view for view, error in zip(views, errors, strict=True) if error <= limit]
+        if len(kept) == len(views):
+            by_index = {view[0]: error for view, error in zip(views, errors, strict=True)}
+            return replace(joint, error_iod=tuple(by_index.get(index) for index in range(len(cameras))))
+        views = kept
+
+
+def _fit_found(
+    model: MorphableModel,
+    cameras: list[PosedCamera],
+    landmarks_px: list[np.ndarray],
+    settings: FitSettings,
+) -> tuple[JointFit, list[float]]:
+    """The fit, its errors still empty, and the errors [W]."""
+    basis = fit_basis(model, settings)
+    pairs = list(zip(cameras, landmarks_px, strict=True))
+    target = torch.stack([camera.to_plane(torch.from_numpy(check_landmarks(px))) for camera, px in pairs])
+    trust = torch.from_numpy(np.stack([_trust(camera, px) for camera, px in pairs]))
+    alone, scale = weak_perspective(basis, target, _PLANE)
+    noise = landmark_noise(settings) * (IOD_M * scale)[:, None]
+    problem = Problem(basis, target, _PLANE, trust.sqrt() / noise, settings.huber)
+    # Each camera alone says where the head is; the one that all agree with best begins, in its own space.
+    starts = [
+        (_Joint.seen_from(camera, cameras, problem), _row(alone, i)) for i, camera in enumerate(cameras)
+    ]
+    costs = torch.cat([joint.cost(head, joint.residuals(head)) for joint, head in starts])
+    first = int(costs.nan_to_num(nan=torch.inf).argmin())
+    joint, head = starts[first]
+    head = descend(joint.residuals, joint.cost, joint.step, head, settings.steps)
+    off = (joint.residuals(head).difference_px.norm(dim=-1) * trust).sum(1) / trust.sum(1)  # [W]
+    views = joint.views(head)
+    errors_iod = off * _eyes_depth_m(views.rotation, views.translation_m) / IOD_M
+    coefficients = (head.coordinates @ basis.spread.mT)[0]
+    to_world = cameras[first].rotation.mT
+    fit = JointFit(
+        rotation=to_world @ head.rotation[0],
+        translation_m=to_world @ (head.translation_m[0] - cameras[first].translation_m),
+        alpha=coefficients[: len(model.identity)],
+        beta=coefficients[len(model.identity) :],
+        error_iod=(),
+    )
+    return fit, errors_iod.tolist()
+
+
+def _eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
+    """How far along the camera's axis the eyes are [...], for poses [..., 3, 3] and [..., 3]."""
+    eyes = torch.from_numpy(LANDMARKS_M[list(OUTER_EYE_CORNERS)].mean(0))
+    return -(rotation @ eyes + translation_m)[..., 2]
+
+
+def _row(state: FitState, index: int) -> FitState:
+    row = slice(index, index + 1)
+    return FitState(state.rotation[row], state.translation_m[row], state.coordinates[row])
+
+
+def _trust(camera: PosedCamera, landmarks_px: np.ndarray) -> np.ndarray:
+    crop = from_landmarks(landmarks_px, 256)
+    return trust_inside(crop.to_crop(landmarks_px), crop, camera.height_px, camera.width_px)
+
+
+def fit_in_crop(
+    model: MorphableModel,
+    joint: JointFit,
+    camera: PosedCamera,
+    landmarks_px: np.ndarray | None,
+    error_iod: float,
+    crop_px: int,
+) -> tuple[FaceFit, float]:
+    """The head in the fixed camera of its crop from a camera's picture, identity and expression unchanged.
+
+    The crop goes by the fitted landmarks. The pose is the one under which the vertices that face the camera
+    lie where the true camera sees them; the mean distance that is left, over the inter-ocular distance, comes
+    second (the two cameras stand at different distances). `landmarks_px` None takes the fitted ones.
+    """
+    vertices_world = joint.vertices_world(model)
+    fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
+    crop = from_landmarks(fitted_px, crop_px)
+    in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
+    ids = _facing(in_camera)[::_CROP_STRIDE]
+    target_px = torch.from_numpy(crop.to_crop(camera.project(vertices_world[ids]).numpy()))
+    head = (vertices_world[ids] - joint.translation_m) @ joint.rotation
+    rotation, translation_m = _pose_in_crop(head, target_px, camera.rotation @ joint.rotation, crop.camera)
+    off_px = (project(head @ rotation.mT + translation_m, crop.camera) - target_px).norm(dim=-1).mean()
+    seen_px = fitted_px if landmarks_px is None else landmarks_px
+    fit = FaceFit(
+        model=model.name,
+        crop=crop,
+        rotation=rotation.float(),
+        translation_m=translation_m.float(),
+        alpha=joint.alpha.float(),
+        beta=joint.beta.float(),
+        landmarks_px=torch.from_numpy(crop.to_crop(seen_px)).float(),
+        error_iod=error_iod,
+    )
+    iod_px = crop.camera.focal_px * IOD_M / _eyes_depth_m(rotation, translation_m)
+    return fit, float(off_px / iod_px)
+
+
+def _facing(vertices_camera: Tensor) -> Tensor:
+    """Ids of the vertices of triangles that face the camera."""
+    triangles = grid_triangles()
+    return torch.unique(triangles[front_facing(vertices_camera, triangles)])
+
+
+def _pose_in_crop(head: Tensor, target_px: Tensor, rotation: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Rotation [3, 3] and translation [3] that bring points [N, 3] closest to pixels [N, 2]; Gauss-Newton.
+
+    It begins with a rotation in a camera that looks elsewhere, and with the points where their mean is seen.
+    """
+    ray = pixel_rays(target_px.mean(0), camera)
+    spread_px = (target_px - target_px.mean(0)).norm(dim=-1).mean()
+    spread_m = ((head - head.mean(0)) @ rotation.mT)[:, :2].norm(dim=-1).mean()
+    place = ray * (camera.focal_px * spread_m / spread_px) - rotation @ head.mean(0)
+    state = FitState(rotation[None], place[None], torch.zeros(1, 0, dtype=torch.float64))
+    for _ in range(_CROP_STEPS):
+        points = head @ state.rotation.mT + state.translation_m[:, None]
+        by_pose = pixels_by_pose(pixels_by_points(points, camera), points, state.translation_m)[0]
+        off_px = project(points, camera)[0] - target_px
+        state = moved(state, -torch.linalg.lstsq(by_pose.flatten(0, 1), off_px.flatten()).solution[None])
+    return state.rotation[0], state.translation_m[0]
