@@ -6,6 +6,7 @@ coefficients.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,7 +45,7 @@ class HeadModel:
         return replace(self, **{key: getattr(self, key).to(device) for key in _KEYS})
 
 
-def head_to_arrays(head: HeadModel | None) -> dict[str, np.ndarray]:
+def head_to_arrays(head: HeadModel | None) -> dict[str, Any]:
     """Arrays for a face model's file; bases in half precision. None for no head."""
     if head is None:
         return {}

@@ -67,7 +67,6 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             identity=model.identity.numpy().astype(np.float16),
             expression=model.expression.numpy().astype(np.float16),
             expression_names=np.array(model.expression_names, dtype=np.str_),
-            allow_pickle=False,
             **head_to_arrays(model.head),
         )
 

@@ -17,6 +17,7 @@ from facerf_cli.face.importers import EXPRESSION_STD
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG
 from facerf_cli.stage.mesh import PARTS, HeadMesh
+from facerf_cli.stage.slits import Slit, eye_slit, lip_slit
 
 _TURN = 360 / (2 * HALF_ANGLE_DEG)  # of u, once around the head
 _LOOK_DEG = 30.0  # the gaze that a full eyeLook shape goes with
@@ -24,7 +25,7 @@ _LID_GAP_M, _LID_REACH_M = (
     0.0002,
     0.0008,
 )  # lids stay this far off the ball; those nearer than the reach yield
-_SKIN, _EYE = HEAD_PARTS.index("skin"), HEAD_PARTS.index("eye")
+_SKIN, _EYE, _MOUTH = (HEAD_PARTS.index(name) for name in ("skin", "eye", "mouth"))
 
 
 def build_head(
@@ -42,10 +43,11 @@ def build_head(
     if model.head is None:
         from facerf_cli.stage.shell import shell_head
 
-        return shell_head(model.vertices(alpha[None], beta[None])[0].numpy(), gaze_deg, subdivisions)
-    plan = _plan(model.head, subdivisions)
+        return shell_head(model.vertices(alpha[None], beta[None])[0], gaze_deg, subdivisions)
+    plan = _plan(model.head, model.expression_names, subdivisions)
     moved = beta + _lids(model.expression_names, beta, gaze_deg)
     coarse = model.head.vertices(alpha, moved).double().numpy()
+    coarse[:, 1] += _closings(model.head, plan, alpha, moved, coarse)
     for eye in plan.eyes:
         coarse[eye.coarse] = _looking(coarse[eye.coarse], gaze_deg)
     vertices = plan.refine @ coarse
@@ -76,6 +78,20 @@ def _lids(names: tuple[str, ...], beta: Tensor, gaze_deg: tuple[float, float]) -
             full = max(share.get(name.removeprefix("eyeLook"), 0.0), 0.0) * min(max(1 - closed, 0.0), 1.0)
             moved[index] = full / EXPRESSION_STD
     return moved
+
+
+def _closings(head: HeadModel, plan: "_Plan", alpha: Tensor, beta: Tensor, shape: np.ndarray) -> np.ndarray:
+    """Offsets along y [N]: lips that rest on each other when nothing moves them, lids that a blink shuts."""
+    offset = np.zeros(len(shape))
+    if plan.lips is not None:
+        neutral = head.vertices(alpha, torch.zeros_like(beta)).double().numpy()
+        offset += plan.lips.closing(neutral)
+    for index, lids in plan.lids.items():
+        closed = min(max(float(beta[index]) * EXPRESSION_STD, 0.0), 1.0)
+        blink = head.expression[index].double().numpy() / EXPRESSION_STD
+        if closed:
+            offset += closed * lids.closing(shape + (1 - closed) * blink)
+    return offset
 
 
 def _looking(ball: np.ndarray, gaze_deg: tuple[float, float]) -> np.ndarray:
@@ -131,6 +147,8 @@ class _Plan:
     triangles: np.ndarray  # [F, 3] of the fine mesh, before it is cut into parts and at the back of the chart
     skin: np.ndarray  # ids of the fine mesh's skin vertices
     eyes: tuple[_Eye, ...]
+    lips: Slit | None
+    lids: dict[int, Slit]  # by the index of the blink that shuts them
     source: np.ndarray  # [W] vertex of the fine mesh that each vertex of the cut mesh is
     split_triangles: np.ndarray  # [F, 3] of the cut mesh
     part: np.ndarray  # [W] index into stage.mesh.PARTS
@@ -138,7 +156,7 @@ class _Plan:
 
 
 @lru_cache(maxsize=4)
-def _plan(head: HeadModel, subdivisions: int) -> _Plan:
+def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
     triangles = head.triangles.numpy()
     part = head.part.numpy()
     owner = part[triangles].max(1)  # [F]
@@ -156,9 +174,58 @@ def _plan(head: HeadModel, subdivisions: int) -> _Plan:
         uv = np.concatenate([_quartered(uv[fine]), uv[~fine]])
     eyes = _eyes(head, triangles[owner == _EYE], refine)
     source, split, kinds, flat = _cut(triangles, owner, uv)
-    names = np.array([PARTS.index(name) for name in HEAD_PARTS], np.uint8)
-    skin = np.unique(triangles[owner == _SKIN])
-    return _Plan(refine, triangles, skin, eyes, source, split, names[kinds], flat.astype(np.float32))
+    parts = np.array([PARTS.index(name) for name in HEAD_PARTS], np.uint8)
+    return _Plan(
+        refine=refine,
+        triangles=triangles,
+        skin=np.unique(triangles[owner == _SKIN]),
+        eyes=eyes,
+        lips=_lip_slit(head, names),
+        lids=_lid_slits(head, names),
+        source=source,
+        split_triangles=split,
+        part=parts[kinds],
+        uv=flat.astype(np.float32),
+    )
+
+
+def _lip_slit(head: HeadModel, names: tuple[str, ...]) -> Slit | None:
+    if "jawOpen" not in names:
+        return None
+    part = head.part.numpy()
+    jaw = head.expression[names.index("jawOpen")].double().numpy()
+    skin, soft = np.flatnonzero(part == _SKIN), np.flatnonzero((part == _SKIN) | (part == _MOUTH))
+    return lip_slit(head.mean.double().numpy(), head.uv.double().numpy(), skin, soft, jaw)
+
+
+def _lid_slits(head: HeadModel, names: tuple[str, ...]) -> dict[int, Slit]:
+    """The lids of each eye: a border of the skin that its blink moves more than any other."""
+    mean, part, triangles = head.mean.double().numpy(), head.part.numpy(), head.triangles.numpy()
+    skin = triangles[(part[triangles] == _SKIN).all(-1)]
+    border = _borders(skin, len(mean))
+    slits = {}
+    for index, name in enumerate(names):
+        if name.startswith("eyeBlink"):
+            blink = head.expression[index].double().numpy() / EXPRESSION_STD
+            loop = max(border, key=lambda loop: np.abs(blink[loop]).max())
+            slits[index] = eye_slit(mean, mean + blink, loop, skin)
+    return slits
+
+
+def _borders(triangles: np.ndarray, count: int) -> list[np.ndarray]:
+    """The vertices of each connected border of a surface."""
+    sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), -1)
+    edges, used = np.unique(sides, axis=0, return_counts=True)
+    return _pieces(edges[used == 1], count)
+
+
+def _pieces(cells: np.ndarray, count: int) -> list[np.ndarray]:
+    """The vertices of each connected piece of edges or triangles [F, K]."""
+    ends = cells[:, :-1].ravel(), cells[:, 1:].ravel()
+    links = coo_matrix((np.ones(len(ends[0])), ends), (count, count))
+    _, piece = connected_components(links, directed=False)
+    used = np.unique(cells)
+    return [used[piece[used] == label] for label in np.unique(piece[used])]
 
 
 def _unwrapped(uv: np.ndarray) -> np.ndarray:
@@ -231,18 +298,8 @@ def _loop_share(valence: np.ndarray) -> np.ndarray:
 
 def _eyes(head: HeadModel, triangles: np.ndarray, refine: csr_matrix) -> tuple[_Eye, ...]:
     """Each eyeball, as a connected piece of the eyes' triangles."""
-    count = refine.shape[0]
-    links = coo_matrix(
-        (np.ones(2 * len(triangles)), (triangles[:, :2].ravel(), triangles[:, 1:].ravel())), (count, count)
-    )
-    _, piece = connected_components(links, directed=False)
     old = len(head.mean)
-    used = np.unique(triangles)
-    return tuple(
-        _Eye(coarse=ball[ball < old], fine=ball)
-        for label in np.unique(piece[used])
-        if len(ball := used[piece[used] == label])
-    )
+    return tuple(_Eye(ball[ball < old], ball) for ball in _pieces(triangles, refine.shape[0]))
 
 
 def _cut(
