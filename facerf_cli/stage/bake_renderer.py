@@ -92,7 +92,7 @@ def scattered_irradiance(
     transport: MeshTransport,
     settings: RenderSettings = RenderSettings(),
 ) -> np.ndarray:
-    """Irradiance [3, V, L] by channel: direct, bounced and spread under the skin; 1 faces a light of rgb 1."""
+    """Irradiance [3, V, L]: direct, bounced and spread under the skin; 1 on what faces a light of rgb 1."""
     direct = np.ascontiguousarray(transport.visibility.T) * _cosines(head, transport.directions)
     albedo = _vertex_albedo(head, appearance)
     scatterings = _scatterings(head, transport.baked, appearance) if settings.scattering else [[], [], []]

@@ -72,10 +72,14 @@ def two_lobes(cosines: Cosines, specular: Tensor, roughness: Tensor) -> Tensor:
     for factor, weight in LOBES:
         alpha_squared = (roughness * factor) ** 4
         distribution = alpha_squared / (math.pi * (n_dot_h**2 * (alpha_squared - 1) + 1) ** 2)
-        k = roughness * factor / 2
-        masking = 1 / ((n_dot_l * (1 - k) + k) * (n_dot_v * (1 - k) + k))
-        total += weight * distribution * masking / 4
+        masking = 1 / (_smith(n_dot_l, alpha_squared) * _smith(n_dot_v, alpha_squared))
+        total += weight * distribution * masking
     return math.pi * total * fresnel * n_dot_l
+
+
+def _smith(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
+    """2 cosine / G1 of Smith's masking, equation 34 of Walter et al."""
+    return cosine + (alpha_squared + (1 - alpha_squared) * cosine**2).sqrt()
 
 
 def strand_cosines(tangents: Tensor, normals: Tensor, lights: Tensor) -> Tensor:
