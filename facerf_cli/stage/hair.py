@@ -28,10 +28,11 @@ _CHIN_M = -0.13
 _ROWS_LEFT = 1e-4  # shortest step of a wisp, metres
 
 
-def draw_hair(head: HeadMesh, random: np.random.Generator) -> tuple[HairStyle, HeadMesh]:
-    """Draw a style and grow it on a head, which may wear clothes already: long hair falls over them."""
+def draw_hair(head: HeadMesh, random: np.random.Generator) -> tuple[HeadMesh | None, HairStyle]:
+    """Draw a style and grow it on a head (none if bald), which may wear clothes: long hair falls over them."""
     style = draw_style(random)
-    return style, grow_hair(head, style, random)
+    hair = grow_hair(head, style, random)
+    return hair if len(hair.vertices) else None, style
 
 
 def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> HeadMesh:
