@@ -24,11 +24,20 @@ from facerf_cli.commands.fit_geometry import fit_geometry
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
 from facerf_cli.commands.relight import relight
+from facerf_cli.commands.relight_dataset import relight_dataset
 from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (relight, predict_olat, fit_geometry, train, envmap, doctor)
+VERBS: tuple[Callable[..., Any], ...] = (
+    relight,
+    predict_olat,
+    fit_geometry,
+    relight_dataset,
+    train,
+    envmap,
+    doctor,
+)
 GROUPS: dict[str, typer.Typer] = {"face-model": face_model.app}  # verbs that have verbs of their own
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
