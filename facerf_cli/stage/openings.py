@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, RBFInterpolator
 
 from facerf_cli.face.regions import CHART_MM
-from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.face.topology import LANDMARK_UV, grid_uv
 from facerf_cli.stage.cranium import BACK_U, CROWN_LEVEL, NECK_LEVEL
 
 OPENINGS = ("eye_left", "eye_right", "mouth")  # eyes by the picture's side
@@ -19,6 +19,8 @@ _ARCS = {"eye_left": ([36, 37, 38, 39], [39, 40, 41, 36]), "mouth": ([*range(60,
 _ROWS_PER_COLUMN = 0.75  # so that cells are about square on the skin
 _GROWTH, _COARSEST_MM = 1.1, 3.5  # cells grow away from the face
 _RELAXATIONS, _RELAXED_MM = 8, 5.0
+_BLURRED_MM, _SOURCE_MM, _SIDE_MM, _CORNER_MM = 0.4, 6.0, 6.0, 2.0  # about an outline; see `lips`
+_SMOOTHING = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +68,60 @@ def outline(name: str) -> np.ndarray:
         return outline("eye_left") * [-1, 1] + [1, 0]
     arcs = [_smooth(LANDMARK_UV[list(arc)] * CHART_MM) for arc in _ARCS[name]]
     return np.concatenate([arc[:-1] for arc in arcs]) / CHART_MM
+
+
+@dataclass(frozen=True, eq=False)
+class Lip:
+    """One side of an opening, a lid or a lip, and how it goes on into the opening.
+
+    The chart's vertices `replaced` [M] are `weights` [M, N] of the vertices `sources` [N] on this side.
+    """
+
+    name: str
+    upper: bool
+    replaced: np.ndarray
+    sources: np.ndarray
+    weights: np.ndarray
+
+    def holds(self, uv: np.ndarray) -> np.ndarray:
+        """[N] bool: samples that belong to this side."""
+        line, points = outline(self.name) * CHART_MM, uv * CHART_MM
+        left, right = line[:, 0].min(), line[:, 0].max()
+        low, high = line[:, 1].min() - _SIDE_MM, line[:, 1].max() + _SIDE_MM
+        inside = (points[:, 0] > left) & (points[:, 0] < right) & (points[:, 1] > low) & (points[:, 1] < high)
+        return inside & (_above(points, line) == self.upper)
+
+
+@cache
+def lips(name: str) -> tuple[Lip, Lip]:
+    """The two sides of an opening, as if each went on into it.
+
+    The chart drops from the lid to the eyeball, and from lip to lip, within a cell or two, which a fine sample
+    of the rim would see.
+    """
+    points, line = grid_uv().double().numpy() * CHART_MM, outline(name) * CHART_MM
+    signed, _ = _signed(points, line)
+    corners = line[[0, len(line) // 2]]
+    between = (points[:, 0] > corners[:, 0].min()) & (points[:, 0] < corners[:, 0].max())
+    at_corner = (np.abs(points[:, None] - corners).max(-1) < _CORNER_MM).any(-1)
+    above = _above(points, line)
+    sides = []
+    for upper in (True, False):
+        own = above == upper
+        opening = (signed > -_BLURRED_MM) | (~own & between & (signed > -_SIDE_MM) & ~at_corner)
+        sources = np.flatnonzero(~opening & (signed > -_SOURCE_MM) & (own | at_corner))
+        replaced = np.flatnonzero(opening)
+        field = RBFInterpolator(points[sources], np.eye(len(sources)), smoothing=_SMOOTHING)
+        sides.append(Lip(name, upper, replaced, sources, field(points[replaced])))
+    return sides[0], sides[1]
+
+
+def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """[N] bool: above the middle between an outline's two arcs (v runs down)."""
+    half = len(line) // 2
+    arcs = (line[: half + 1], np.concatenate([line[half:], line[:1]]))
+    margins = [np.interp(points[:, 0], *arc[np.argsort(arc[:, 0])].T) for arc in arcs]
+    return np.asarray(points[:, 1] < np.mean(margins, 0))
 
 
 def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:

@@ -15,7 +15,7 @@ from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage import ears, eyeballs, mouth
 from facerf_cli.stage.cranium import Surroundings, on_chart, template
 from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
-from facerf_cli.stage.openings import Sheet, outline, skin_sheet
+from facerf_cli.stage.openings import Sheet, lips, outline, skin_sheet
 
 _EYES = {"eye_left": (36, 39, ((37, 41), (38, 40))), "eye_right": (42, 45, ((43, 47), (44, 46)))}
 _LIPS = ((61, 67), (62, 66), (63, 65))
@@ -56,6 +56,7 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
         count += len(rings) * len(rim)
         if name == "mouth":
             parts.append(_part("mouth", *mouth.bag(rings[-1])))
+            parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, rings[-1])]
             parts.append(_part("teeth", *mouth.teeth(landmarks_mm, rings[-1])))
     parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
     parts += [_ear(skin_mm, sheet, side) for side in (-1.0, 1.0)]
@@ -70,8 +71,8 @@ def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
         for name, (_, _, pairs) in _EYES.items()
     }
     found = [name for name, gap in gaps.items() if gap > _SHUT_LIDS_MM]
-    lips = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
-    return (*found, "mouth") if lips > _SHUT_LIPS_MM else tuple(found)
+    parted = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
+    return (*found, "mouth") if parted > _SHUT_LIPS_MM else tuple(found)
 
 
 def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, ...]) -> np.ndarray:
@@ -79,8 +80,19 @@ def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, 
     on = _on_chart(sheet.u_level)
     skin = np.empty((len(on), 3))
     skin[on] = on_chart(face_mm, sheet.u_level[on])
+    for name in cut:
+        for lip, held in zip(lips(name), _held(subdivisions, cut, name), strict=True):
+            side_mm = face_mm.copy()
+            side_mm[lip.replaced] = lip.weights @ face_mm[lip.sources]
+            skin[held] = on_chart(side_mm, sheet.u_level[held])
     skin[~on] = _surroundings(subdivisions).positions(face_mm)
-    return skin
+    return skin[sheet.same]
+
+
+@cache
+def _held(subdivisions: int, cut: tuple[str, ...], name: str) -> list[np.ndarray]:
+    """Samples of the upper and of the lower side of an opening."""
+    return [np.flatnonzero(lip.holds(skin_sheet(subdivisions, cut).u_level)) for lip in lips(name)]
 
 
 @cache
