@@ -20,8 +20,9 @@ def envmap(
         list[str] | None,
         typer.Option(
             metavar="KIND",
-            help="Draw from this kind alone (may be repeated): sun, overcast, windows, studio, night, stage.",
-            show_default="all",
+            help="Draw from this kind alone (may be repeated): sun, dusk, overcast, windows, hall, studio, "
+            "night, stage.",
+            show_default="all, sun most often",
         ),
     ] = None,
     size: Annotated[int, typer.Option(min=16, max=8192, help="Width in pixels; the height is half.")] = 512,
@@ -35,9 +36,9 @@ def envmap(
     """
     from facerf_cli import __version__
     from facerf_cli.files.images import write_exr
-    from facerf_cli.stage.skies import KINDS, draw_sky, kind_of
+    from facerf_cli.stage.skies import KINDS, MIX, draw_sky, kind_of
 
-    kinds = tuple(dict.fromkeys(kind or KINDS))
+    kinds = tuple(dict.fromkeys(kind)) if kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:
         raise UsageError(f"--kind {unknown[0]}: no such kind; there are {', '.join(KINDS)}")
     if size % 2:

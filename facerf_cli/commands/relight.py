@@ -37,9 +37,10 @@ def relight(
         list[str] | None,
         typer.Option(
             "--envmap",
-            metavar="SKY.exr|DIR",
-            help="Lat-long maps (.exr, .hdr), twice as wide as high: files, folders or quoted patterns. May "
-            "be repeated; .exr and .hdr files that follow it directly are maps too.",
+            metavar="SKY.exr|DIR|procedural:N",
+            help="Lat-long maps (.exr, .hdr), twice as wide as high: files, folders or quoted patterns; or N "
+            "maps drawn from --seed, the first N of facerf envmap. May be repeated; .exr and .hdr files that "
+            "follow it directly are maps too.",
             show_default=False,
         ),
     ] = None,
@@ -137,7 +138,7 @@ def relight(
     photo.check()
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file")
-    asked = collect_shots(envmap or (), rotate, light or (), output)
+    asked = collect_shots(envmap or (), rotate, light or (), output, settings.seed)
     shots = usable(asked)
     if not shots:
         raise FacerfError("no map can be used")

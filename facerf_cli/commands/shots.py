@@ -21,9 +21,19 @@ if TYPE_CHECKING:
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "paper"]
 BALL_PX = 256
+DRAWN, DRAWN_WIDTH_PX = "procedural:", 512
 _MOST_FRAMES = 9999
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)")  # a name, and the frame numbers that it ends in
 log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class DrawnMap:
+    """A procedural map, named as `facerf envmap` names its files."""
+
+    name: str
+    index: int
+    seed: int
 
 
 @dataclass(frozen=True)
@@ -32,7 +42,7 @@ class Shot:
 
     name: str  # of the light
     frame: str = ""  # '.0001': frame numbers, which end a file's name
-    envmap: Path | None = None
+    envmap: Path | DrawnMap | None = None
     rotate_deg: float = 0.0
     lamps: tuple[tuple[float, ...], ...] = ()
 
@@ -50,12 +60,17 @@ def split_frame(name: str) -> tuple[str, str]:
 
 
 def collect_shots(
-    envmaps: Sequence[str], rotate: str | None, lamps: Sequence[str], output: Path
+    envmaps: Sequence[str], rotate: str | None, lamps: Sequence[str], output: Path, seed: int = 0
 ) -> tuple[Shot, ...]:
-    """All pictures that the options ask for; maps are named here and read later."""
+    """All pictures that the options ask for; maps are named here and read, or drawn from `seed`, later."""
     rotations = parse_rotations(rotate)
-    paths = [path for entry in envmaps for path in _expand_glob(entry)]
-    shots: list[Shot] = []
+    words = [entry for entry in envmaps if entry.startswith(DRAWN)]
+    paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
+    shots = [
+        Shot(drawn.name + turn, number, drawn, degrees)
+        for drawn in drawn_maps(words, seed)
+        for turn, number, degrees in rotations
+    ]
     maps = collect_items(paths, output, MAP_SUFFIXES) if paths else []
     last_parts = [Path(item.name).name for item in maps]
     for item, short in zip(maps, last_parts, strict=True):
@@ -71,6 +86,18 @@ def collect_shots(
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two pictures would be called {min(twice)}; give each light once")
     return tuple(shots)
+
+
+def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
+    """The maps of `procedural:N`; of several such words, the most."""
+    if not words:
+        return []
+    from facerf_cli.stage.skies import kind_of, parse_envmaps
+
+    most = max(len(parse_envmaps(word, seed)) for word in words)
+    if most > _MOST_FRAMES:
+        raise UsageError(f"--envmap {DRAWN}{most}: {_MOST_FRAMES} maps at most")
+    return [DrawnMap(f"{index:05d}_{kind_of(index, seed)}", index, seed) for index in range(most)]
 
 
 def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
@@ -94,7 +121,7 @@ def usable(shots: Iterable[Shot]) -> tuple[Shot, ...]:
     good: list[Shot] = []
     for path, group in groupby(shots, lambda shot: shot.envmap):
         try:
-            if path is not None:
+            if isinstance(path, Path):
                 read_map(path)
             good += group
         except InputError as error:
@@ -102,10 +129,14 @@ def usable(shots: Iterable[Shot]) -> tuple[Shot, ...]:
     return tuple(good)
 
 
-def read_map(path: Path) -> "Tensor":
+def read_map(path: Path | DrawnMap) -> "Tensor":
     """A lat-long map [H, W, 3], linear; an InputError names what is wrong with it."""
     import torch
 
+    if isinstance(path, DrawnMap):
+        from facerf_cli.stage.skies import draw_sky
+
+        return torch.from_numpy(draw_sky(path.index, path.seed, DRAWN_WIDTH_PX)[0])
     from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
     from facerf_cli.light.envmap import check_envmap
 

@@ -1,4 +1,11 @@
-"""Clear sky and sun after Preetham, Shirley and Smits, 'A Practical Analytic Model for Daylight', 1999."""
+"""Clear sky and sun after Preetham, Shirley and Smits, 'A Practical Analytic Model for Daylight' (1999).
+
+The sky is the paper's appendix A.2 (Perez' distribution and the zenith's values). The sun is its appendix A.1
+with the data of its table 2: what is above the atmosphere, less Rayleigh, aerosol and ozone extinction. Mixed
+gases and water vapour, which absorb beyond 690 nm alone, are left out.
+"""
+
+from functools import lru_cache
 
 import numpy as np
 
@@ -10,7 +17,7 @@ _PEREZ = np.array(
         [[-0.0167, -0.2608], [-0.0950, 0.0092], [-0.0079, 0.2102], [-0.0441, -1.6537], [-0.0109, 0.0529]],
     ]
 )
-# Zenith chromaticity x, y: rows T^2, T, 1; columns theta^3, theta^2, theta, 1.
+# Appendix A.2: zenith chromaticity x, y; rows T^2, T, 1; columns theta^3, theta^2, theta, 1.
 _ZENITH = np.array(
     [
         [
@@ -32,12 +39,35 @@ _XYZ_TO_REC709 = np.array(
         [0.0556434, -0.2040259, 1.0572252],
     ]
 )
-_RGB_UM = np.array([0.61, 0.55, 0.465])  # a wavelength for each channel
-_SUN_KLX = 128.0  # illuminance above the atmosphere, across the beam
+SUN_RADIUS_DEG = 0.2665
+SUN_SR = 2 * np.pi * (1 - np.cos(np.radians(SUN_RADIUS_DEG)))
+_SUN_NM = np.arange(380, 751, 10.0)
+# Table 2: the sun's radiance above the atmosphere, W / (cm2 um sr), over _SUN_NM.
+# fmt: off
+_SUN = 10 * np.array([
+    165.5, 162.3, 211.2, 258.8, 258.2, 242.3, 267.6, 296.6, 305.4, 300.6, 306.6, 288.3, 287.1, 278.2,
+    271.0, 272.3, 263.6, 255.0, 250.6, 253.1, 253.5, 251.3, 246.3, 241.7, 236.8, 232.1, 228.2, 223.4,
+    219.7, 215.3, 211.0, 207.3, 202.4, 198.7, 194.3, 190.7, 186.3, 182.6,
+])
+# Table 2: ozone's absorption, 1 / cm, over _SUN_NM.
+_OZONE = np.array([
+    0, 0, 0, 0, 0, 0, 0, 0.003, 0.006, 0.009, 0.014, 0.021, 0.030, 0.040, 0.048, 0.063, 0.075, 0.085,
+    0.103, 0.120, 0.120, 0.115, 0.125, 0.120, 0.105, 0.090, 0.079, 0.067, 0.057, 0.048, 0.036, 0.028,
+    0.023, 0.018, 0.014, 0.011, 0.010, 0.009,
+])
+# fmt: on
+_OZONE_CM = 0.35
+_LUMENS_PER_WATT = 683.0
 
 
 def preetham_sky(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> np.ndarray:
     """Sky radiance [H, W, 3] linear Rec.709 (kcd/m2), without the sun's disc; the horizon's below it."""
+    xyz = sky_xyz(directions, sun, turbidity)
+    return np.asarray(np.clip(xyz @ _XYZ_TO_REC709.T.astype(xyz.dtype), 0, None))
+
+
+def sky_xyz(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> np.ndarray:
+    """Sky radiance [..., 3] as CIE XYZ, Y in kcd/m2, along directions [..., 3]."""
     cos_theta = np.clip(directions[..., 1], 0.01, 1)  # B / cos diverges at the horizon
     cos_gamma = np.clip(directions @ sun, -1, 1)
     sun_theta = np.arccos(np.clip(sun[1], 0, 1))
@@ -46,25 +76,61 @@ def preetham_sky(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> n
     powers_t, powers_theta = turbidity ** np.array([2, 1, 0]), sun_theta ** np.array([3, 2, 1, 0])
     zenith = np.array([zenith_y, *(powers_t @ _ZENITH @ powers_theta)])
     values = []
-    for level, slopes in zip(zenith, _PEREZ, strict=True):
-        perez = slopes @ [turbidity, 1.0]
-        values.append(level * _perez(perez, cos_theta, cos_gamma) / _perez(perez, 1.0, np.cos(sun_theta)))
-    luminance, x, y = values
-    xyz = np.stack([x / y, np.ones_like(x), (1 - x - y) / y], -1) * luminance[..., None]
-    return np.asarray(np.clip(xyz @ _XYZ_TO_REC709.T, 0, None))
-
-
-def _perez(c: np.ndarray, cos_theta: np.ndarray | float, cos_gamma: np.ndarray | float) -> np.ndarray:
-    """Perez' distribution, equation 3 of the paper."""
     gamma = np.arccos(cos_gamma)
+    for level, slopes in zip(zenith, _PEREZ, strict=True):
+        perez = [float(value) for value in slopes @ [turbidity, 1.0]]
+        at_zenith = _perez(perez, 1.0, float(sun_theta), float(np.cos(sun_theta)))
+        values.append(_perez(perez, cos_theta, gamma, cos_gamma) * float(level / at_zenith))
+    luminance, x, y = values
+    return np.stack([x / y, np.ones_like(x), (1 - x - y) / y], -1) * luminance[..., None]
+
+
+def _perez(
+    c: list[float],
+    cos_theta: np.ndarray | float,
+    gamma: np.ndarray | float,
+    cos_gamma: np.ndarray | float,
+) -> np.ndarray:
+    """Perez' distribution, equation 3 of the paper."""
     haze = 1 + c[2] * np.exp(c[3] * gamma) + c[4] * cos_gamma**2
     return np.asarray((1 + c[0] * np.exp(c[1] / cos_theta)) * haze)
 
 
 def sun_irradiance(elevation_deg: float, turbidity: float) -> np.ndarray:
-    """Irradiance [3] across the sun's beam (unit: klx): Rayleigh and aerosol extinction of appendix A.1."""
-    theta_deg = 90 - elevation_deg
+    """Irradiance [3] across the sun's beam, linear Rec.709 (klx); its luminance is the illuminance."""
+    xyz = _sun_to_xyz() @ (transmittance(_SUN_NM, elevation_deg, turbidity) * _SUN)
+    return np.asarray(np.clip(_XYZ_TO_REC709 @ xyz, 0, None))
+
+
+def transmittance(wavelength_nm: np.ndarray, elevation_deg: float, turbidity: float) -> np.ndarray:
+    """Share of the sun's light [W] that comes down: appendix A.1, Rayleigh, aerosol and ozone extinction."""
+    theta_deg, um = 90 - elevation_deg, wavelength_nm / 1000
     air_mass = 1 / (np.cos(np.radians(theta_deg)) + 0.15 * (93.885 - theta_deg) ** -1.253)
-    beta = 0.04608 * turbidity - 0.04586
-    depth = 0.008735 * _RGB_UM**-4.08 + beta * _RGB_UM**-1.3
-    return np.asarray(_SUN_KLX * np.exp(-depth * air_mass))
+    beta = 0.04608365822050 * turbidity - 0.04586025928522  # Angstrom's turbidity
+    ozone = np.interp(wavelength_nm, _SUN_NM, _OZONE) * _OZONE_CM
+    return np.asarray(np.exp(-air_mass * (0.008735 * um**-4.08 + beta * um**-1.3 + ozone)))
+
+
+@lru_cache(maxsize=1)
+def _sun_to_xyz() -> np.ndarray:
+    """From spectral radiance of the sun's disc (table 2) to XYZ irradiance in klx: [3, W]."""
+    per_nm = SUN_SR * 10.0  # W / (cm2 um sr) over the disc, in W / (m2 nm)
+    step_nm = _SUN_NM[1] - _SUN_NM[0]
+    return np.asarray(_LUMENS_PER_WATT / 1000 * per_nm * step_nm * _colour_matching(_SUN_NM))
+
+
+def _colour_matching(wavelength_nm: np.ndarray) -> np.ndarray:
+    """CIE 1931 colour matching functions [3, W].
+
+    The multi-lobe fit of Wyman, Sloan and Shirley, 'Simple Analytic Approximations to the CIE XYZ Color
+    Matching Functions', JCGT 2(2), 2013.
+    """
+    x = _lobe(wavelength_nm, 1.056, 599.8, 37.9, 31.0) + _lobe(wavelength_nm, 0.362, 442.0, 16.0, 26.7)
+    x = x + _lobe(wavelength_nm, -0.065, 501.1, 20.4, 26.2)
+    y = _lobe(wavelength_nm, 0.821, 568.8, 46.9, 40.5) + _lobe(wavelength_nm, 0.286, 530.9, 16.3, 31.1)
+    z = _lobe(wavelength_nm, 1.217, 437.0, 11.8, 36.0) + _lobe(wavelength_nm, 0.681, 459.0, 26.0, 13.8)
+    return np.stack([x, y, z])
+
+
+def _lobe(nm: np.ndarray, height: float, middle: float, left: float, right: float) -> np.ndarray:
+    return np.asarray(height * np.exp(-0.5 * ((nm - middle) / np.where(nm < middle, left, right)) ** 2))

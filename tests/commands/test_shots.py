@@ -22,7 +22,7 @@ from facerf_cli.commands.values import parse_directions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
-from facerf_cli.main import repeat_options
+from facerf_cli.main import main, repeat_options
 
 HEIGHT_PX = 16
 
@@ -180,3 +180,21 @@ def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
     half = diffuse.shape[1] // 2
     assert diffuse[:, half:].sum() > 5 * diffuse[:, :half].sum()
     assert sorted(path.name for path in (tmp_path / "out/balls").iterdir()) == ["one.exr", "one.png"]
+
+
+def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
+    assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
+    files = collect_shots([str(tmp_path)], "0:360:2", [], tmp_path / "out")
+    drawn = collect_shots(["procedural:2"], "0:360:2", [], tmp_path / "out", seed=3)
+    assert [(shot.name, shot.frame) for shot in drawn] == [(shot.name, shot.frame) for shot in files]
+    assert usable(drawn) == drawn
+    rigs = [light_photos(shots, "12", "cell")[1] for shots in (files, drawn)]
+    np.testing.assert_allclose(rigs[0], rigs[1], rtol=2e-3, atol=1e-4)
+    write_balls(drawn[:1], tmp_path / "out", None, False)
+    assert (tmp_path / f"out/balls/{drawn[0].name}.0000.png").exists()
+
+
+@pytest.mark.parametrize("word", ["procedural:", "procedural:x", "procedural:10000"])
+def test_a_bad_number_of_procedural_maps_is_refused(word: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="procedural"):
+        collect_shots([word], None, [], tmp_path)

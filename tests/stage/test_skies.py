@@ -2,8 +2,25 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.stage.daylight import preetham_sky, sun_irradiance
-from facerf_cli.stage.skies import KINDS, SUN_RADIUS_DEG, disc, draw_sky, make_grid, parse_envmaps, toward
+from facerf_cli.stage.clouds import Layer, cover
+from facerf_cli.stage.daylight import SUN_RADIUS_DEG
+from facerf_cli.stage.interiors import Lights, draw_room
+from facerf_cli.stage.landscape import Land, Skyline, stand_under, sun_is_seen
+from facerf_cli.stage.skies import KINDS, MIX, draw_sky, kind_of, parse_envmaps
+from facerf_cli.stage.sky_grid import (
+    Rectangle,
+    around,
+    disc,
+    irradiance,
+    look_up,
+    make_grid,
+    noise_tile,
+    paint,
+    ring_noise,
+    toward,
+)
+
+UP, NO_BEAM = np.array([0.0, 1.0, 0.0]), np.zeros(3)
 
 
 @pytest.mark.parametrize("width_px", [16, 64, 256, 1024])
@@ -49,19 +66,86 @@ def test_a_sun_lights_alike_at_every_size(index: int) -> None:
     assert np.linalg.norm(moments[0] - moments[1]) < 0.04
 
 
-def test_the_brightest_sky_is_beside_the_sun_and_blue_far_from_it() -> None:
-    grid, sun = make_grid(128), toward(0, 40)
-    sky = preetham_sky(grid.directions, sun, 2.5)
-    zenith = sky[0].mean(0)
-    assert zenith[2] > 1.3 * zenith[0]
-    row = np.unravel_index(sky[:32].sum(-1)[4:28].argmax(), (24, 128))
-    assert grid.directions[row[0] + 4, row[1]] @ sun > 0.99
+@pytest.mark.parametrize("kind", KINDS)
+def test_size_changes_the_resolution_and_not_the_scene(kind: str) -> None:
+    """Irradiance from the six sides, 64 against 256 pixels wide."""
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    small, large = (
+        irradiance(make_grid(width_px), draw_sky(4, 0, width_px, (kind,))[0], sides) for width_px in (64, 256)
+    )
+    assert np.abs(small - large).max() < 0.12 * large.max()
 
 
-def test_a_low_sun_is_dimmer_and_redder() -> None:
-    low, high = sun_irradiance(4, 3), sun_irradiance(60, 3)
-    assert (low < high).all() and low[0] / low[2] > 2 * high[0] / high[2]
-    assert 70 < high[1] < 110  # klx, as measured on clear days
+def test_every_kind_is_drawn_in_its_share() -> None:
+    assert set(MIX) == set(KINDS)
+    drawn = [kind_of(index, 0) for index in range(1500)]
+    for kind in KINDS:
+        assert drawn.count(kind) / 1500 == pytest.approx(MIX.count(kind) / len(MIX), abs=0.03)
+
+
+def test_noise_is_periodic_and_of_deviation_one() -> None:
+    random = np.random.default_rng(0)
+    tile, ring = noise_tile(random), ring_noise(random, 1.0)
+    assert tile.std() == pytest.approx(1, abs=1e-3) and ring.std() == pytest.approx(1)
+    x = np.array([0.3, 1.3, -2.7])
+    assert np.ptp(look_up(tile, x, 0 * x)) < 1e-3
+    columns = around(make_grid(256), ring)
+    assert abs(columns[0] - columns[-1]) < 4 * np.abs(np.diff(columns)).max()
+
+
+def flat_land(grey: float, *skylines: Skyline) -> Land:
+    return Land(np.full((2, 3), grey), np.zeros((256, 256), np.float32), 10.0, 0.0, skylines)
+
+
+def test_ground_and_walls_reflect_what_falls_on_them() -> None:
+    grid = make_grid(64)
+    white = np.ones((32, 64, 3))
+    wall = Skyline(np.full(2048, 0.5), np.full((2048, 3), 0.4), 0.0, 0.0)
+    lit = stand_under(grid, white, flat_land(0.5, wall), UP, NO_BEAM)
+    np.testing.assert_allclose(lit[-8:], 0.5, rtol=0.01)  # under a sky of radiance 1
+    np.testing.assert_allclose(lit[:8], 1.0)
+    np.testing.assert_allclose(lit[13], 0.4 * 0.75, rtol=0.02)  # half sees sky, half the ground
+    sun = toward(0, 30).astype(float)
+    lit = stand_under(grid, 0 * white, flat_land(0.5, wall), sun, np.full(3, 2.0))
+    np.testing.assert_allclose(lit[-8:], 0.5 / np.pi * 2.0 * 0.5, rtol=0.01)
+    assert lit[13, 0, 0] > 3 * lit[13, 32, 0]  # what faces the sun, opposite to it
+
+
+def test_a_skyline_hides_the_sun() -> None:
+    tops = np.where(np.arange(2048) < 1024, 0.3, -0.01)  # azimuth 0 to 180 degrees
+    land = flat_land(0.2, Skyline(tops, np.zeros((2048, 3)), 0.0, 0.0))
+    assert not sun_is_seen(land, 90, 10) and sun_is_seen(land, 90, 30) and sun_is_seen(land, -90, 10)
+
+
+def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
+    grid, sun = make_grid(64), toward(0, 50)
+    sky, beam = np.full((32, 64, 3), 5.0) * [0.5, 1, 2], np.full(3, 80.0)
+    tile = np.zeros((256, 256), np.float32)
+    closed, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), -1.0, 3.0, 25.0)])
+    assert share == pytest.approx(np.exp(-3), rel=1e-3)
+    assert closed[2, 32, 2] / closed[2, 32, 0] < 2  # bluish sky, whiter cloud
+    none, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), 1.0, 3.0, 25.0)])
+    assert share == 1 and np.allclose(none, sky)
+
+
+def test_a_room_is_brightest_near_its_lamp() -> None:
+    grid, random = make_grid(64), np.random.default_rng(2)
+    room, lights = draw_room(grid, random, (0.4, 0.5)), Lights(grid)
+    centre = toward(70, 20)
+    lights.add(centre, paint(disc(grid, centre, 4), [100.0, 100, 100]), flat=False)
+    light = room.lit(lights).mean(-1) / room.albedo.mean(-1)
+    brightest = grid.directions.reshape(-1, 3)[light.argmax()]
+    assert brightest @ centre > 0.8
+    assert np.isfinite(light).all() and light.min() > 0
+
+
+def test_a_rectangle_covers_its_solid_angle() -> None:
+    grid = make_grid(512)
+    cover_sr = (
+        Rectangle(40, 10, 0.3, 0.5).cover(grid.directions, grid.pixel_rad) * grid.solid_angles_sr
+    ).sum()
+    exact = 4 * np.arcsin(0.3 * 0.5 / np.sqrt((1 + 0.09) * (1 + 0.25)))
+    assert cover_sr == pytest.approx(exact, rel=0.01)
 
 
 def test_procedural_maps_are_drawn_lazily() -> None:
