@@ -16,7 +16,9 @@ from scipy.spatial.distance import cdist
 from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
 
 BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; the other one is 1 - BACK_U
-CROWN_LEVEL, NECK_LEVEL = -0.7242, 1.506  # of the pole and of the neck's lower end; see `template`
+_CROWN_MM_PER_DEG = 1.4  # of arc
+CROWN_LEVEL = -90 * _CROWN_MM_PER_DEG / 1000 / (TOP_M - BOTTOM_M)
+NECK_LEVEL = 1.506  # of the pole and of the neck's lower end; see `template`
 
 _AZIMUTHS_DEG = (0, 16, 32, 48, 61, 73, 87, 103, 120, 140, 160, 180)
 # Height in millimetres | distance from the axis; above 92 the rows are degrees of elevation about (0, 92, 0).
@@ -47,9 +49,8 @@ _SECTIONS_MM = """
 -140 |  48    48.5  50   53.5 58.5 63   67.5 70   69.5 66.5 64   63
 -172 |  46    47.5  51   57   65   72.5 79   82.5 82   78   74   72
 """
-_ROUNDING_MM = 0.2
-_CROWN_MM_PER_DEG = 1.4  # of level; about the arc's length
-_REACH_MM = 55.0  # how far the border's difference from the average head is felt
+_ROUNDING_MM = 0.3
+_REACHES_MM = ((55.0, 1.0), (14.0, 0.03))  # how far the border's broad and its small differences are felt
 _RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells further in
 _SCALE_LIMITS = (0.85, 1.2)
 _PAD = 6
@@ -62,26 +63,30 @@ def template(u: np.ndarray, level: np.ndarray) -> np.ndarray:
     0 at `TOP_M`, `CROWN_LEVEL` at the pole.
     """
     azimuth_deg = (u - 0.5) * 2 * HALF_ANGLE_DEG
-    top, tall = TOP_M * 1000, (TOP_M - BOTTOM_M) * 1000
-    height = top - level * tall
-    radius = _radius().ev(height, azimuth_deg)
-    elevation = np.radians(np.clip((height - top) / _CROWN_MM_PER_DEG, 0, 90))
+    across, y = (spline.ev(-level * (TOP_M - BOTTOM_M) * 1000, azimuth_deg) for spline in _profiles())
     azimuth = np.radians(azimuth_deg)
-    across = radius * np.cos(elevation)
-    y = np.minimum(height, top) + radius * np.sin(elevation)
     return np.stack([across * np.sin(azimuth), y, across * np.cos(azimuth)], -1)
 
 
 @cache
-def _radius() -> RectBivariateSpline:
+def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
+    """Distance from the axis and height, in millimetres, over (arc's length above the chart, azimuth)."""
     crown, sections = _table(_CROWN_MM), _table(_SECTIONS_MM)
-    crown[:, 0] = TOP_M * 1000 + crown[:, 0] * _CROWN_MM_PER_DEG
-    rows = np.concatenate([crown, sections])[::-1]
+    top = TOP_M * 1000
+    elevation = np.radians(crown[:, :1])
+    across = np.concatenate([crown[:, 1:] * np.cos(elevation), sections[:, 1:]])[::-1]
+    heights = np.broadcast_to(sections[:, :1], sections[:, 1:].shape)
+    y = np.concatenate([top + crown[:, 1:] * np.sin(elevation), heights])[::-1]
+    length = np.concatenate([crown[:, 0] * _CROWN_MM_PER_DEG, sections[:, 0] - top])[::-1]
     half = np.array(_AZIMUTHS_DEG, float)
     azimuths = np.concatenate([half[-4:-1] - 360, -half[:0:-1], half, 360 - half[-2:-5:-1]])
-    columns = [np.abs(np.where(np.abs(a) > 180, 360 - np.abs(a), a)) for a in azimuths]
-    depths = rows[:, 1 + np.searchsorted(half, columns)]
-    return RectBivariateSpline(rows[:, 0], azimuths, depths, s=depths.size * _ROUNDING_MM**2)
+    folded = np.where(np.abs(azimuths) > 180, 360 - np.abs(azimuths), np.abs(azimuths))
+    column = np.searchsorted(half, folded)
+    smoothing = across[:, column].size * _ROUNDING_MM**2
+    return (
+        RectBivariateSpline(length, azimuths, across[:, column], s=smoothing),
+        RectBivariateSpline(length, azimuths, y[:, column], s=smoothing),
+    )
 
 
 def _table(text: str) -> np.ndarray:
@@ -132,8 +137,11 @@ def _rings() -> np.ndarray:
 
 def _kernel(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
     """Matern 5/2: twice differentiable, so that slopes go on across the border."""
-    distance = cdist(a_mm, b_mm) * np.sqrt(5) / _REACH_MM
-    return (1 + distance + distance**2 / 3) * np.exp(-distance)
+    distance = cdist(a_mm, b_mm) * np.sqrt(5)
+    return sum(
+        share * (1 + distance / reach + (distance / reach) ** 2 / 3) * np.exp(-distance / reach)
+        for reach, share in _REACHES_MM
+    )
 
 
 def _similarity(known: np.ndarray, border: np.ndarray) -> tuple[float, np.ndarray]:

@@ -12,6 +12,9 @@ _CENTRE_MM = np.array([6.0, 2.0])
 _RINGS, _SPOKES = 34, 112
 _OUT_DEG, _BACK_TILT_DEG, _IN_DEG = 27.0, 10.0, 4.0
 _THICKNESS_MM = 3.2
+_SINK_MM = 6.0  # of the front rim into the cheek
+_HOLLOW_MM, _HOLLOW_HALF_MM = np.array([7.0, 1.0]), np.array([9.0, 11.0])
+_BEND_MM = 3.0  # of the ear's upper and lower end, toward the head
 _ROOT_MM = 20.0  # how far the ear's back reaches into the head
 
 
@@ -27,14 +30,21 @@ def ear() -> tuple[np.ndarray, np.ndarray]:
     front = _relief(rho[:, None], plane)
     edge = np.sqrt(np.clip(1 - ((rho[:, None] - 0.86) / 0.14).clip(0, 1) ** 2, 0, 1))
     thickness = _THICKNESS_MM * edge
-    attached = _step(0.72 - rho[:, None], -0.12, 0.22)
-    forward = _step(-plane[..., 0], -4, 4)
+    attached = _step(-rho[:, None], -0.92, -0.25)
+    forward = _step(-plane[..., 0], -12, 5)
     back = front - thickness - _ROOT_MM * np.maximum(attached, 0) * np.ones_like(front)
-    front = front - 9.0 * forward * _step(rho[:, None], 0.75, 1.0)
-    back = back - 9.0 * forward
+    front = front - _SINK_MM * forward * _step(rho[:, None], 0.7, 1.0)
+    back = back - _SINK_MM * forward
     sheet = np.concatenate([_placed(plane, front), _placed(plane, back)[-2::-1]])
     rings = len(sheet)
     return sheet.reshape(-1, 3), _triangles(rings)
+
+
+def hollow_mm(points: np.ndarray) -> np.ndarray:
+    """How far [N] the head gives way to the ear's bowl at points [N, 3] from the canal's mouth (as `ear`)."""
+    offset = np.stack([-points[:, 2], points[:, 1]], -1) - _HOLLOW_MM
+    from_centre = np.linalg.norm(offset / _HOLLOW_HALF_MM, axis=-1)
+    return np.where(points[:, 0] > -30, _ROOT_MM * np.exp(-(from_centre**4)), 0)
 
 
 def _outline(turn: np.ndarray) -> np.ndarray:
@@ -54,14 +64,15 @@ def _relief(rho: np.ndarray, plane: np.ndarray) -> np.ndarray:
     helix = 3.4 * np.exp(-(((rho - 0.90) / 0.085) ** 2)) * above * (1 - 0.8 * lobe)
     scapha = -1.6 * np.exp(-(((rho - 0.74) / 0.07) ** 2)) * above * (1 - lobe)
     antihelix = 2.6 * np.exp(-(((rho - 0.57) / 0.10) ** 2)) * _step(a, 2, 10) * (1 - lobe)
-    bowl = -10.0 * np.exp(-((((a - 5) / 8.5) ** 2 + ((b - 0) / 10.5) ** 2) ** 1.6))
+    bowl = -11.0 * np.exp(-((((a - 5.5) / 7.5) ** 2 + ((b + 0.5) / 10.0) ** 2) ** 1.6))
     crus = 4.0 * np.exp(-(((b - 5.5 - 0.25 * a) / 2.2) ** 2)) * _step(-a, -9, 2) * _step(a, -9, -2)
     fossa = -2.0 * np.exp(-((((a - 11) / 6) ** 2 + ((b - 22) / 6) ** 2)))
-    tragus = 4.5 * np.exp(-((((a + 4.0) / 2.8) ** 2 + ((b + 2.5) / 5.0) ** 2) ** 1.5))
+    tragus = 6.5 * np.exp(-((((a + 4.0) / 3.2) ** 2 + ((b + 2.0) / 6.0) ** 2) ** 1.5))
     antitragus = 2.6 * np.exp(-((((a - 6) / 4.5) ** 2 + ((b + 13) / 2.8) ** 2)))
     plump = 1.5 * np.exp(-((((a - 6) / 9) ** 2 + ((b + 21) / 6) ** 2)))
     turned = -2.6 * np.clip((rho - 0.9) / 0.1, 0, 1) ** 2
-    return helix + scapha + antihelix + bowl + crus + fossa + tragus + antitragus + plump + turned
+    bend = -_BEND_MM * ((b - 6) / 30) ** 2
+    return bend + helix + scapha + antihelix + bowl + crus + fossa + tragus + antitragus + plump + turned
 
 
 def _placed(plane: np.ndarray, height: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.face.regions import CHART_MM
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, landmark_weights
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage import ears, eyeballs, mouth
@@ -22,7 +23,7 @@ _LIPS = ((61, 67), (62, 66), (63, 65))
 _SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
 _AROUND_EYE_MM = 9.0
 _EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
-_EAR_SINK_MM = 0.5
+_EAR_OUT_MM = 1.5
 _LID_RIM = ((0.0, 0.25, 0.25), (0.25, 0.6, 0.55))  # toward the ball (share), inward and down (mm)
 
 
@@ -38,11 +39,14 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
     cut = _open(landmarks_mm)
     sheet = skin_sheet(subdivisions, cut)
     skin_mm = _skin(face_mm, sheet, subdivisions, cut)
+    roots = {side: _ear_root(skin_mm, sheet, side) for side in (-1.0, 1.0)}
+    for side, root in roots.items():
+        skin_mm = _hollowed(skin_mm, root, side)
     around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _EYES}
     balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _EYES}
     normals = _normals(skin_mm, sheet.triangles, sheet.same)
     skin, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
-    parts = []
+    parts = [_ear(root, side) for side, root in roots.items()]
     count = len(skin_mm)
     same = [sheet.same]
     for name, rim in sheet.rims.items():
@@ -59,7 +63,6 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
             parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, rings[-1])]
             parts.append(_part("teeth", *mouth.teeth(landmarks_mm, rings[-1])))
     parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
-    parts += [_ear(skin_mm, sheet, side) for side in (-1.0, 1.0)]
     head = _part("skin", np.concatenate(skin), np.concatenate(triangles), np.concatenate(uv), np.concatenate(same))
     return joined(head, *parts)
 
@@ -164,12 +167,23 @@ def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
     )
 
 
-def _ear(skin_mm: np.ndarray, sheet: Sheet, side: float) -> HeadMesh:
-    """The ear at the head's `side` (1: the picture's right), where the head is."""
-    place = np.array([0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG), (TOP_M * 1000 - _EAR_Y_MM) / 174])
-    root = skin_mm[np.linalg.norm((sheet.u_level - place) * [1.4, 1], axis=-1).argmin()]
+def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
+    """Where the ear sits [3] at the head's `side` (1: the picture's right)."""
+    u = 0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG)
+    v = (TOP_M - _EAR_Y_MM / 1000) / (TOP_M - BOTTOM_M)
+    nearest = (((sheet.u_level - [u, v]) * CHART_MM) ** 2).sum(-1).argmin()
+    return skin_mm[nearest] + [side * _EAR_OUT_MM, 0, 0]
+
+
+def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
+    """The skin drawn in behind the ear's bowl."""
+    depth = ears.hollow_mm((skin_mm - root) * [side, 1, 1])
+    return skin_mm - depth[:, None] * [side, 0, 0]
+
+
+def _ear(root: np.ndarray, side: float) -> HeadMesh:
     vertices, triangles = ears.ear()
-    points = root - [side * _EAR_SINK_MM, 0, 0] + vertices * [side, 1, 1]
+    points = root + vertices * [side, 1, 1]
     azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
     u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
     uv = np.stack([u, (TOP_M - points[:, 1] / 1000) / (TOP_M - BOTTOM_M)], -1)
