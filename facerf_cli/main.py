@@ -23,6 +23,7 @@ from facerf_cli.commands.envmap import envmap
 from facerf_cli.commands.fit_geometry import fit_geometry
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
+from facerf_cli.commands.prepare_dataset import prepare_dataset
 from facerf_cli.commands.relight import relight
 from facerf_cli.commands.relight_dataset import relight_dataset
 from facerf_cli.commands.train import train
@@ -33,6 +34,7 @@ VERBS: tuple[Callable[..., Any], ...] = (
     relight,
     predict_olat,
     fit_geometry,
+    prepare_dataset,
     relight_dataset,
     train,
     envmap,

@@ -90,9 +90,7 @@ class FaceFit:
     @property
     def quality(self) -> Quality:
         """'good' up to an error of `GOOD_ERROR_IOD`, 'fair' up to `FAIR_ERROR_IOD`, else 'poor'."""
-        if self.error_iod <= GOOD_ERROR_IOD:
-            return "good"
-        return "fair" if self.error_iod <= FAIR_ERROR_IOD else "poor"
+        return quality_of(self.error_iod)
 
     def vertices_camera(self, model: MorphableModel) -> Tensor:
         """The mesh in camera space [V, 3]; `model` must be the one that was fitted."""
@@ -104,6 +102,13 @@ class FaceFit:
             raise ValueError(f"the fit is of the face model {self.model!r}, not of {model.name!r}")
         vertices = model.vertices(self.alpha[None], self.beta[None])[0]
         return vertices @ self.rotation.mT + self.translation_m
+
+
+def quality_of(error_iod: float) -> Quality:
+    """What a mean landmark error says of a fit."""
+    if error_iod <= GOOD_ERROR_IOD:
+        return "good"
+    return "fair" if error_iod <= FAIR_ERROR_IOD else "poor"
 
 
 def fit_landmarks(

@@ -29,11 +29,11 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage.documents import Node, read_document, unique_ids
+from facerf_cli.stage.layouts import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 
 FORMAT = "facerf-dataset-1"
 DATASET_FILE = "dataset.json"
 SPLITS = ("train", "validation", "test")
-MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 LARGEST_CROP_PX = 4096
 
 
@@ -96,7 +96,7 @@ def read_dataset(folder: Path) -> Dataset:
     if root["format"].value != FORMAT:
         raise root["format"].wrong(f"'{FORMAT}'")
     lights = root["rig"]["lights"].items(MOST_LIGHTS)
-    directions = np.array([_unit(light["direction_world"]) for light in lights]).reshape(-1, 3)
+    directions = np.array([light["direction_world"].unit() for light in lights]).reshape(-1, 3)
     if not lights:
         raise root["rig"]["lights"].wrong("a light at least")
     cameras = _prepared_cameras(root)
@@ -108,8 +108,8 @@ def read_dataset(folder: Path) -> Dataset:
         directions_world=directions,
         splits=_read_splits(root["splits"], set(cameras)),
         cameras=cameras,
-        normalisation=dict(root["normalisation"].entries(16) and root["normalisation"].value),
-        provenance=dict(root["provenance"].value),
+        normalisation=root["normalisation"].table(),
+        provenance=root["provenance"].table(),
     )
     for subject, ids in cameras.items():
         for camera in ids:
@@ -117,13 +117,6 @@ def read_dataset(folder: Path) -> Dataset:
                 if not path.is_file():
                     raise InputError(f"{path}: missing from the dataset; run prepare-dataset again")
     return dataset
-
-
-def _unit(node: Node) -> np.ndarray:
-    direction = node.array(3)
-    if not abs(np.linalg.norm(direction) - 1) < 1e-3:
-        raise node.wrong("a vector of length 1")
-    return direction / np.linalg.norm(direction)
 
 
 def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:

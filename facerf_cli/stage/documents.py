@@ -1,6 +1,7 @@
 """JSON that a user brings: read within bounds, and every entry checked, with one line that says where."""
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from facerf_cli.files.atomic import atomic_path
 _LIMIT_BYTES = 64 << 20
 # Names become parts of paths: no separators, nothing hidden, nothing that climbs out of a folder.
 _NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")
-_LARGEST = 1e12
+_LARGEST, _UNIT_OFF = 1e12, 1e-3
 
 
 @dataclass(frozen=True)
@@ -39,9 +40,8 @@ class Node:
 
     def get(self, key: str) -> "Node | None":
         """An object's entry, or None where it has none of that key."""
-        if not isinstance(self.value, dict):
-            raise self.wrong("an object { }")
-        return Node(f"{self.where}: {key}", self.value[key]) if key in self.value else None
+        table = self.table()
+        return Node(f"{self.where}: {key}", table[key]) if key in table else None
 
     def text(self) -> str:
         """A string."""
@@ -72,6 +72,19 @@ class Node:
             raise self.wrong(kind)
         return array.astype(np.float64)
 
+    def unit(self) -> np.ndarray:
+        """A direction [3] of length 1."""
+        direction = self.array(3)
+        if not abs(np.linalg.norm(direction) - 1) < _UNIT_OFF:
+            raise self.wrong("a vector of length 1")
+        return direction / np.linalg.norm(direction)
+
+    def table(self) -> dict[str, Any]:
+        """An object as it stands."""
+        if not isinstance(self.value, dict):
+            raise self.wrong("an object { }")
+        return self.value
+
     def items(self, most: int) -> "list[Node]":
         """A list's entries, `most` of them or fewer."""
         if not isinstance(self.value, list):
@@ -82,9 +95,7 @@ class Node:
 
     def entries(self, most: int) -> "dict[str, Node]":
         """An object's entries by key, each key a `name`, `most` of them or fewer."""
-        if not isinstance(self.value, dict):
-            raise self.wrong("an object { }")
-        if len(self.value) > most:
+        if len(self.table()) > most:
             raise InputError(f"{self.where} has {len(self.value)} entries; {most} are the most")
         return {
             Node(f"{self.where}: a key", key).name(): Node(f"{self.where}: {key}", entry)
@@ -106,9 +117,18 @@ def read_document(path: Path, missing: str) -> Node:
     if size > _LIMIT_BYTES:
         raise InputError(f"{path}: {size >> 20} MiB are too many for a description")
     try:
-        return Node(str(path), json.loads(text))
+        return Node(str(path), json.loads(text, parse_constant=_no_number, parse_float=_finite))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error})") from None
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(f"{text} is no finite number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    return number if math.isfinite(number) else _no_number(text)
 
 
 def write_document(path: Path, content: Mapping[str, Any]) -> None:

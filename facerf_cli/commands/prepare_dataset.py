@@ -1,0 +1,193 @@
+"""`facerf prepare-dataset`: a light stage's capture as crops, fits, OLAT stacks and splits."""
+
+import logging
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.options import (
+    DryRunOption,
+    FaceModelOption,
+    OverwriteOption,
+    settings_of,
+)
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.records import LOGGER_NAME
+
+if TYPE_CHECKING:
+    from facerf_cli.face.morphable import MorphableModel
+    from facerf_cli.stage.dataset import Split
+    from facerf_cli.stage.layouts import Capture
+
+_CROP_STEP_PX, _CROP_MOST_PX = 8, 4096
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class _Prepare:
+    """Prepares one subject; settings only."""
+
+    capture: Path
+    layout: str
+    face_model: str
+    crop_px: int
+    folder: Path
+    key: str
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """A subject's files."""
+        from facerf_cli.stage.prepare import subject_outputs
+
+        return subject_outputs(_capture(self.capture, self.layout), item.name, self.folder)
+
+    def __call__(self, item: Item) -> Outcome:
+        """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
+        import torch
+
+        from facerf_cli.stage.prepare import prepare_subject
+
+        capture, model = _capture(self.capture, self.layout), _face_model(self.face_model)
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            record = prepare_subject(capture, item.name, model, self.folder, self.crop_px, self.key)
+        finally:
+            torch.set_num_threads(threads)
+        if record["quality"] == "poor":
+            log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
+        worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
+        facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
+        facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
+        return Outcome(self.outputs_of(item), facts)
+
+
+@cache
+def _capture(folder: Path, layout: str) -> "Capture":
+    """The capture's description, once a process; it is an input of the whole run."""
+    from facerf_cli.stage.layouts import read_capture
+
+    try:
+        return read_capture(folder, layout)
+    except InputError as error:
+        raise UsageError(str(error)) from None
+
+
+@cache
+def _face_model(name: str) -> "MorphableModel":
+    """The face model, once a process."""
+    from facerf_cli.face.morphable import load_face_model
+
+    return load_face_model(name)
+
+
+def prepare_dataset(
+    context: typer.Context,
+    capture: Annotated[
+        Path, typer.Argument(metavar="CAPTURE", help="Folder with stage.json.", show_default=False)
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="DATASET", help="Folder for the data.", show_default=False),
+    ],
+    layout: Annotated[
+        str, typer.Option(metavar="NAME", help="How the capture lies on disk; 'stage' is with stage.json.")
+    ] = "stage",
+    split: Annotated[
+        str,
+        typer.Option(
+            metavar="T/V/T",
+            help="Subjects for training, validation and test: counts (300/10/40) or shares; --seed draws.",
+        ),
+    ] = "0.8/0.1/0.1",
+    crop: Annotated[int, typer.Option(metavar="PX", help="Side of the crops; a multiple of 8.")] = 256,
+    face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = False,
+    dry_run: DryRunOption = False,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Subjects worked on at a time.")] = 1,
+) -> None:
+    """Prepare a light stage's capture for training: crops, fits, OLAT stacks, splits.
+
+    Pictures are taken to linear Rec.709, less the black level, over each lamp's intensity. One head is fitted
+    to all of a subject's cameras; DATASET gets olat/SUBJECT/CAMERA.exr (stacks that `facerf relight` takes),
+    fits, a sheet a subject, index.html to look through, and dataset.json at the end. A second run goes on
+    where the first was cut off.
+    """
+    from facerf_cli.stage.dataset import DATASET_FILE, Split
+    from facerf_cli.stage.prepare import preparation_key
+
+    settings = settings_of(context)
+    drawn = Split.parse(split)
+    if crop % _CROP_STEP_PX or not 0 < crop <= _CROP_MOST_PX:
+        raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {_CROP_MOST_PX}")
+    found = _capture(capture, layout)
+    _check_subjects(found, output, drawn)
+    model_sha256 = _model_digest(face_model)
+    key = preparation_key(found, model_sha256, crop)
+    _check_earlier(found, output, key, overwrite)
+    work = _Prepare(capture, layout, face_model, crop, output, key)
+    items = [Item(found.folder / name, output / name, name) for name in found.subjects]
+    options = BatchOptions(output, overwrite, dry_run, jobs)
+    if overwrite and not dry_run:
+        (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
+    code = run_items("prepare-dataset", items, work, work.outputs_of, options, settings)
+    if not dry_run:
+        _finish(found, output, drawn, settings.seed, face_model, model_sha256, crop)
+    raise typer.Exit(code)
+
+
+def _check_subjects(capture: "Capture", output: Path, split: "Split") -> None:
+    """Raise for what no subject could mend."""
+    if not capture.subjects:
+        raise UsageError(f"{capture.folder}: no subjects found (pictures are at {capture.pattern})")
+    if output.resolve() == capture.folder.resolve():
+        raise UsageError(f"-o {output}: is the capture itself; give another folder")
+    left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
+    if left:
+        log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
+
+
+def _model_digest(name: str) -> str:
+    from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH
+    from facerf_cli.stage.prepare import sha256_of
+
+    _face_model(name)  # a file that is none is named first
+    return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
+
+
+def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) -> None:
+    """Raise where finished subjects were prepared otherwise: a dataset is of one kind."""
+    from facerf_cli.stage.prepare import prepared_subjects
+
+    earlier = {} if overwrite else prepared_subjects(capture, output)
+    other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
+    if other:
+        raise UsageError(
+            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model "
+            "or calibration; give --overwrite, or another folder"
+        )
+
+
+def _finish(
+    capture: "Capture", output: Path, split: "Split", seed: int, face_model: str, model_sha256: str, crop: int
+) -> None:
+    """Write the page and `dataset.json` of the subjects that are finished."""
+    from facerf_cli.files.atomic import atomic_path
+    from facerf_cli.stage.dataset import DATASET_FILE
+    from facerf_cli.stage.documents import write_document
+    from facerf_cli.stage.index_page import index_page
+    from facerf_cli.stage.prepare import describe_dataset, prepared_subjects
+
+    records = prepared_subjects(capture, output)
+    if not records:
+        return
+    model = _face_model(face_model)
+    dataset = describe_dataset(capture, records, split, seed, model, model_sha256, crop)
+    with atomic_path(output / "index.html") as temporary:
+        temporary.write_text(index_page(dataset, records), encoding="utf-8")
+    write_document(output / DATASET_FILE, dataset)
+    print(output / DATASET_FILE)

@@ -1,0 +1,51 @@
+"""A page to look through prepared data with: every subject's sheet, split and fit; plain HTML, no scripts."""
+
+from collections.abc import Iterator, Mapping
+from html import escape
+from typing import Any
+
+_STYLE = """
+body { font: 15px/1.5 sans-serif; margin: 2em; background: #181818; color: #ddd }
+a { color: #8bf } h2 { margin: 2em 0 0 } p { margin: .2em 0 } img { max-width: 100%; margin-top: .5em }
+table { border-spacing: 1.2em 0; margin-left: -1.2em } td, th { text-align: left }
+.fair { color: #fc6 } .poor, .failed { color: #f66 }
+"""
+_COLUMNS = (
+    "A row of a sheet is a camera: the crop under all lights, the fit over it (green: landmarks that were "
+    "found, or the fit's where there was no face; orange: the fit's), what the mask leaves, and a light in "
+    "front, on the left and on the right."
+)
+
+
+def index_page(dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> str:
+    """The page for the content of `dataset.json` and the records of its finished subjects."""
+    return "\n".join(_lines(dataset, records)) + "\n"
+
+
+def _lines(dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    title = escape(f"{dataset['capture']}: {len(records)} of {len(dataset['subjects'])} subjects")
+    yield '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
+    yield f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{title}</h1>"
+    split_of = {name: split for split, names in dataset["splits"].items() for name in names}
+    counts = ", ".join(f"{len(names)} {split}" for split, names in dataset["splits"].items())
+    yield f"<p>{counts}. {len(dataset['rig']['lights'])} lights, {len(dataset['cameras'])} cameras.</p>"
+    yield f"<p>{escape(_COLUMNS)}</p>"
+    for subject in dataset["subjects"]:
+        yield from _subject(subject, split_of.get(subject, "in no split"), records.get(subject))
+    yield "</body>\n</html>"
+
+
+def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iterator[str]:
+    name = escape(subject)
+    yield f'<h2 id="{name}">{name}</h2>'
+    if record is None:
+        yield '<p class="failed">failed; report.jsonl says why</p>'
+        return
+    yield f"<p>{escape(split)}</p>\n<table>\n<tr><th>camera</th><th>error, % of the eyes' distance</th></tr>"
+    for camera, fit in record["cameras"].items():
+        stack = f'<a href="olat/{name}/{escape(camera)}.exr">{escape(camera)}</a>'
+        found = f"{100 * fit['error_iod']:.1f} {fit['quality']}" if fit["face_found"] else "no face found"
+        kind = fit["quality"] if fit["face_found"] else "fair"
+        yield f'<tr><td>{stack}</td><td class="{kind}">{found}</td></tr>'
+    sheet = f"sheets/{name}.jpg"
+    yield f'</table>\n<a href="{sheet}"><img loading="lazy" src="{sheet}" alt="{name}"></a>'
