@@ -56,7 +56,7 @@ def eyeball(
 
 def _sclera(side: int, angle: Tensor, redness: float, age: float, generator: torch.Generator) -> Tensor:
     """Off-white, yellower with age, pinker and with more veins away from the iris [3, T, T]."""
-    young, old = torch.tensor([0.56, 0.52, 0.50]), torch.tensor([0.52, 0.46, 0.37])
+    young, old = torch.tensor([0.50, 0.46, 0.44]), torch.tensor([0.47, 0.41, 0.33])
     base = (young + (old - young) * (age - 18) / 57 * 0.8).view(3, 1, 1)
     ridges = 1 - plain_noise((side, side), 26, generator).abs() * 3
     veins = ridges.clamp(0, 1) ** 3 * torch.sigmoid((angle - 45) / 7)

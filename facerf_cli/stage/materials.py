@@ -1,11 +1,12 @@
 """What the parts of a synthetic head are made of: skin on its canvas, eyes, teeth, cloth, hair, frames."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.eyes import eyeball
 from facerf_cli.stage.mesh import PARTS
 from facerf_cli.stage.noise import plain_noise
@@ -77,6 +78,29 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     traits["hair_colour"] = _hair_name(people)
     traits.update(eye_traits, frame=frame_kind, cloth=cloth_kind)
     return Appearance(materials, scattering_mm(people)[0], traits)
+
+
+def canvas_uv(side: int) -> Tensor:
+    """(u, v) [T, T, 2] of the chart at the centres of the canvas's texels."""
+    return CANVAS_SPAN[0] + (CANVAS_SPAN[1] - CANVAS_SPAN[0]) * texel_centres_uv(side)
+
+
+def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
+    """The same person with a scalp that hair grows on: its short hair, by its share [T, T] of the canvas.
+
+    The colour is the mean of the hair's roots.
+    """
+    skin, hair = appearance.materials["skin"], appearance.materials["hair"]
+    colour = hair.albedo[:, :8].mean((1, 2)).view(3, 1, 1)
+    streaks = (1 + 0.2 * torch.randn(1, *cover.shape, generator=generator)).clamp(0.3, 1.8)
+    share = 0.9 * cover.float()[None]
+    stained = Material(
+        skin.albedo + share * (colour * streaks - skin.albedo),
+        skin.specular * (1 - 0.5 * share),
+        (skin.roughness + 0.15 * share).clamp(max=0.85),
+        skin.relief * (1 - share),
+    )
+    return replace(appearance, materials=appearance.materials | {"skin": stained})
 
 
 def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Surface:

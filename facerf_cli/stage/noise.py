@@ -1,5 +1,8 @@
 """Noise and strokes on a window of the chart, in millimetres, so that they look the same at every size."""
 
+from dataclasses import dataclass
+from functools import lru_cache
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -23,54 +26,86 @@ def noise(
         rows = round(side * window.texel_mm[1] / height * 2**octave)
         if octave and max(rows, columns) > 1.5 * side:
             break
-        size = (min(max(rows, 2), side), min(max(columns, 2), side))
+        size = [side if n > 0.6 * side else max(n, 2) for n in (rows, columns)]
         grid = torch.randn(faces, 1, *size, generator=generator)
-        if size != (side, side):
-            grid = F.interpolate(grid, (side, side), mode="bicubic", align_corners=False)
-        total += 0.5**octave * grid
+        total += 0.5**octave * _enlarged(grid, side)
         power += 0.25**octave
     return total / (0.78 * power**0.5)
 
 
-def splat(window: Window, places: Tensor, area_mm2: Tensor) -> Tensor:
-    """How many layers of little areas [N] at places [N, 2] in millimetres lie on each texel [1, 1, T, T]."""
+def _enlarged(grid: Tensor, side: int) -> Tensor:
+    """A grid [B, 1, h, w] at [B, 1, side, side], bicubic; as two small products where that is quicker."""
+    rows, columns = grid.shape[-2:]
+    if rows == columns == side:
+        return grid
+    if side > 256 and rows * columns > side * side / 9:
+        return F.interpolate(grid, (side, side), mode="bicubic", align_corners=False)
+    return _bicubic(rows, side) @ (grid @ _bicubic(columns, side).T)
+
+
+@lru_cache(maxsize=256)
+def _bicubic(cells: int, side: int) -> Tensor:
+    """[side, cells]: what each cell gives to each texel."""
+    each = torch.eye(cells)[None, None]
+    return F.interpolate(each, (side, cells), mode="bicubic", align_corners=False)[0, 0]
+
+
+def splat(
+    window: Window, places: Tensor, area_mm2: Tensor, face: Tensor | None = None, faces: int = 1
+) -> Tensor:
+    """How many layers of little areas [N] at places [N, 2] in millimetres lie on each texel [B, 1, T, T].
+
+    `face` [N] says whose they are, where there are several.
+    """
     side = window.side
     at = window.to_texels(places)
     corner = at.floor()
-    fraction = at - corner
+    right, down = (at - corner).unbind(-1)
     column, row = corner.long().unbind(-1)
-    total = torch.zeros(side * side, dtype=torch.float64)
-    for down in (0, 1):
-        for right in (0, 1):
-            share = (fraction[:, 0] if right else 1 - fraction[:, 0]) * (
-                fraction[:, 1] if down else 1 - fraction[:, 1]
-            )
-            x, y = column + right, row + down
-            seen = (x >= 0) & (x < side) & (y >= 0) & (y < side)
-            index = torch.where(seen, y * side + x, 0)
-            total += torch.bincount(index, (share * area_mm2 * seen).double(), side * side)
+    first = 0 if face is None else face * side * side
+    total = torch.zeros(faces * side * side, dtype=torch.float64)
+    for dy, share_y in ((0, 1 - down), (1, down)):
+        y = row + dy
+        weight_y = share_y * area_mm2 * ((y >= 0) & (y < side))
+        for dx, share_x in ((0, 1 - right), (1, right)):
+            x = column + dx
+            weight = weight_y * share_x * ((x >= 0) & (x < side))
+            index = y.clamp(0, side - 1) * side + x.clamp(0, side - 1) + first
+            total += torch.bincount(index, weight.double(), len(total))
     texel = window.texel_mm[0] * window.texel_mm[1]
-    return (total / texel).float().view(1, 1, side, side)
+    return (total / texel).float().view(faces, 1, side, side)
 
 
-def hairs(
-    window: Window, roots: Tensor, angles: Tensor, bends: Tensor, lengths: Tensor, width_mm: float
-) -> Tensor:
-    """Layers of hair [1, 1, T, T] of N single hairs, tapering to the tip.
+@dataclass(frozen=True)
+class Strokes:
+    """N single hairs on a window: roots [N, 2] and lengths [N] in millimetres.
 
-    roots [N, 2] and lengths [N] in millimetres; angles [N] at the root, counter-clockwise from the picture's
-    right; bends [N]: by how much each has turned at its tip.
+    angles [N] at the root, counter-clockwise from the picture's right; bends [N]: how far each has turned
+    at its tip; widths [N] in millimetres at the root.
     """
-    if len(roots) == 0:
-        return torch.zeros(1, 1, window.side, window.side)
-    steps = max(2, min(40, int(1.3 * float(lengths.max()) / min(window.texel_mm)) + 1))
+
+    roots: Tensor
+    angles: Tensor
+    bends: Tensor
+    lengths: Tensor
+    widths: Tensor
+
+
+def hairs(window: Window, strokes: Strokes, face: Tensor | None = None, faces: int = 1) -> Tensor:
+    """Layers of hair [B, 1, T, T] of single hairs, each tapering to its tip."""
+    if len(strokes.roots) == 0:
+        return torch.zeros(faces, 1, window.side, window.side)
+    longest = float(strokes.lengths.max())
+    steps = max(2, min(40, int(1.2 * longest / min(window.texel_mm)) + 1))
     along = (torch.arange(steps) + 0.5) / steps  # [S]
-    turned = angles[:, None] + bends[:, None] * along / 2  # mean direction from the root to there
-    reach = lengths[:, None] * along
-    x = roots[:, :1] + reach * turned.cos()
-    y = roots[:, 1:] - reach * turned.sin()
-    area = lengths[:, None] / steps * width_mm * 1.3 * (1 - along**2).clamp_min(0.1)
-    return splat(window, torch.stack([x, y], -1).view(-1, 2), area.reshape(-1))
+    turned = strokes.angles[:, None] + strokes.bends[:, None] * along / 2  # mean direction up to there
+    reach = strokes.lengths[:, None] * along
+    x = strokes.roots[:, :1] + reach * turned.cos()
+    y = strokes.roots[:, 1:] - reach * turned.sin()
+    taper = 1.3 * (1 - along**2).clamp_min(0.1) / steps
+    area = (strokes.lengths * strokes.widths)[:, None] * taper
+    whose = None if face is None else face.repeat_interleave(steps)
+    return splat(window, torch.stack([x, y], -1).view(-1, 2), area.reshape(-1), whose, faces)
 
 
 def blurred(field: Tensor, window: Window, sigma_mm: float) -> Tensor:

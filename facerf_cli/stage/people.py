@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-DARKEST, LIGHTEST = 0.23, 0.006  # melanin
+DARKEST, LIGHTEST = 0.23, 0.0075  # melanin
 RANDOM_TEXTURES = 0.06  # the share of people who wear random colours
 
 
@@ -67,7 +67,7 @@ def draw_people(count: int, generator: torch.Generator) -> People:
     deep = uniform(0, 1)
     return People(
         melanin=melanin,
-        haemoglobin=uniform(0.007, 0.020),
+        haemoglobin=uniform(0.006, 0.020),
         oiliness=uniform(0, 1),
         age=age,
         blotches=uniform(0.2, 1),

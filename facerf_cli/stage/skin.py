@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.stage.eyes import paint_eyes
-from facerf_cli.stage.facial_hair import FacialHair, draw_facial_hair
+from facerf_cli.stage.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
 from facerf_cli.stage.make_up import make_up
 from facerf_cli.stage.noise import noise
 from facerf_cli.stage.people import People, draw_people
@@ -42,6 +42,9 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     people = draw_people(faces, generator)
     window = Window(side, CHART_SPAN)
     skin = paint_skin(people, window, generator, painted_eyes=True)
+    scalp = scalp_hair(people, window, above_hairline(people, window), generator)
+    scalp = scalp * _each(1 - people.bald) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.8)
+    skin = with_scalp(skin, people, scalp, generator)
     clothed = mask(window, "neck", 5.0) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.4)
     cloth = 0.02 + 0.58 * torch.rand(faces, 3, 1, 1, generator=generator)
     slit = torch.where(torch.rand(faces, 1, 1, 1, generator=generator) < 0.5, 0.5, 0.06)
@@ -67,16 +70,17 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
     coarse = noise(count, window, 38, generator)
     middle = noise(count, window, 9, generator)
     fine = torch.randn(count, 1, window.side, window.side, generator=generator)
-    melanin, blood = _pigments(people, window, coarse, middle, fine, generator)
+    pores = noise(count, window, 2.0, generator, octaves=2)
+    melanin, blood = _pigments(people, window, coarse, middle, 0.7 * pores + 0.3 * fine, generator)
     hair = draw_facial_hair(people, window, generator)
-    relief, depth = draw_relief(people, window, 1 - hair.cover, generator)
-    melanin, blood = melanin * (1 + 0.25 * depth), blood * (1 + 0.3 * depth)
+    relief, depth = draw_relief(people, window, pores, 1 - hair.cover, generator)
+    melanin, blood = melanin * (1 + 0.3 * depth), blood * (1 + 0.4 * depth)
     albedo = skin_albedo(melanin, blood)
     cast = torch.tensor([1.0, 0.84, 0.70]).view(1, 3, 1, 1)  # hair under the skin takes more of the red
     albedo = albedo * torch.exp(-hair.shadow * _darkness(people) * cast)
-    albedo = albedo * (1 - _each(people.random_texture)) + _each(people.random_texture) * _random_colours(
-        count, window, coarse, middle, generator
-    )
+    odd = people.random_texture > 0
+    if bool(odd.any()):
+        albedo[odd] = _random_colours(int(odd.sum()), window, coarse[odd], middle[odd], generator)
     albedo = make_up(albedo, people, window)
     albedo = _with_hair(albedo, people, hair, fine, middle)
     albedo = _openings(albedo, window)
@@ -84,10 +88,23 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
         albedo = paint_eyes(albedo, people, window, generator)
     else:
         albedo = _lid_rims(albedo, people, window)
-    specular, roughness = _gloss(people, window, hair, middle, fine, painted_eyes)
+    specular, roughness = _gloss(people, window, hair.cover, middle, fine, painted_eyes)
     sigma = scattering_mm(people) / (sum(window.texel_mm) / 2)
     eyes = mask(window, "eyes", 1.0) if painted_eyes else torch.zeros(1, 1, 1, 1)
     return Skin(albedo.clamp(0.005, 0.95), specular, roughness, relief * (1 - eyes), sigma)
+
+
+def with_scalp(skin: Skin, people: People, cover: Tensor, generator: torch.Generator) -> Skin:
+    """The skin under short hair of that cover [B, 1, T, T], in the hair's colour."""
+    colour = hair_albedo(people.hair_eumelanin, people.hair_pheomelanin, people.grey)[..., None, None]
+    streaks = (1 + 0.2 * torch.randn(cover.shape, generator=generator)).clamp(0.3, 1.8)
+    return Skin(
+        skin.albedo + cover * (colour * streaks - skin.albedo).clamp(-1, 1),
+        skin.specular * (1 - 0.5 * cover),
+        (skin.roughness + 0.15 * cover).clamp(max=0.85),
+        skin.relief * (1 - cover),
+        skin.scattering_texels,
+    )
 
 
 def _each(values: Tensor) -> Tensor:
@@ -107,22 +124,21 @@ def _pigments(
     even = 1 - 0.6 * _each(people.foundation)
     uneven = _each(people.blotches) * even
     age = _each((people.age - 18) / 57)
-    texel = min(1.0, min(window.texel_mm))
     lips, lids = mask(window, "lips", 2.2), _around_eyes(window)
     forehead = blob(window, (0.5, 0.02), 55, 0.6)
     perimeter = smooth((inside(window, "face") - 26) / -40)
-    melanin = 1 + uneven * (0.10 * coarse + 0.07 * middle) + 0.05 * texel * fine
-    melanin = melanin + 0.10 * even * forehead + 0.14 * even * perimeter + 0.22 * even * lids
+    melanin = 1 + uneven * (0.05 * coarse + 0.06 * middle) + 0.07 * even * fine
+    melanin = melanin + 0.10 * even * forehead + 0.14 * even * perimeter + 0.30 * even * lids
     base = _each(people.melanin)
     melanin = base * melanin.clamp_min(0.3) + _spots(people, window, middle, fine, age * even, generator)
 
     veins = (1 - noise(count, window, 7, generator, octaves=2).abs() * 2.5).clamp(0, 1) ** 2
     nose, cheeks = blob(window, 30, 13) + blobs(window, 0.455, 0.55, 7), blobs(window, 0.29, 0.52, 26)
     ears = blobs(window, 1.24, 0.42, 38, 1.2)
-    flush = 0.9 * nose.clamp(0, 1) + 0.75 * cheeks + 0.35 * blob(window, 8, 14) + 0.8 * ears.clamp(0, 1)
-    flush = flush * (0.35 + 0.65 * _each(people.flush)) * even * (1 + 0.25 * middle)
-    red = 1 + 0.9 * flush + uneven * (0.22 * coarse + 0.16 * middle) + 0.12 * texel * fine * even
-    red = red + 0.5 * lids * even + 0.5 * veins * (nose + cheeks).clamp(0, 1) * (0.3 + age) * uneven
+    flush = 1.2 * nose.clamp(0, 1) + 1.0 * cheeks + 0.35 * blob(window, 8, 14) + 0.8 * ears.clamp(0, 1)
+    flush = flush * (0.4 + 0.8 * _each(people.flush)) * even * (1 + 0.25 * middle)
+    red = 1 + 0.9 * flush + uneven * (0.14 * coarse + 0.12 * middle) + 0.16 * even * fine
+    red = red + 0.7 * lids * even + 0.5 * veins * (nose + cheeks).clamp(0, 1) * (0.3 + age) * uneven
     red = red - 0.2 * forehead
     blood = _each(people.haemoglobin) * red.clamp_min(0.25)
 
@@ -146,14 +162,14 @@ def _spots(
     """Freckles, age spots and moles, as melanin of their own [B, 1, T, T]."""
     count = len(people.melanin)
     if bool((people.freckles > 0).any()):
-        dots = noise(count, window, 2.6, generator, octaves=1)
+        dots = noise(count, window, 1.8, generator, octaves=1)
         where = 0.5 + blobs(window, 0.35, 0.46, 30) + blob(window, 29, 22)
-        freckles = torch.sigmoid(7 * (dots + 0.5 * middle + 0.6 * (where.clamp(0, 1.4) - 1) - 1.25))
-        spots = _each(people.freckles) * 0.05 * freckles
+        freckles = smooth((dots + 0.35 * middle + 0.6 * (where.clamp(0, 1.4) - 1.4) - 0.7) / 1.6)
+        spots = _each(people.freckles) * 0.035 * freckles
     else:
         spots = torch.zeros_like(middle)
-    patches = noise(count, window, 7, generator, octaves=1)
-    spots = spots + 0.02 * age * torch.sigmoid(8 * (patches - 2.1))
+    patches = noise(count, window, 4.5, generator, octaves=1)
+    spots = spots + 0.012 * age * smooth((patches - 1.9) / 1.2)
     x, y = places_mm(window)
     for face in range(count):
         for _ in range(int(people.moles[face])):
@@ -187,14 +203,11 @@ def _random_colours(
 
 
 def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, middle: Tensor) -> Tensor:
-    """Brows, beard and scalp over the skin; brows grey later than the rest."""
-    streaks = (1 + 0.18 * fine + 0.12 * middle).clamp(0.4, 1.8)
-    for cover, melanin, greyed in (
-        (hair.scalp, 1.0, 1.0),
-        (hair.beard, 0.8, 1.0),
-        (hair.brows, 1.15, 0.5),
-    ):
-        colour = hair_albedo(people.hair_eumelanin * melanin, people.hair_pheomelanin, people.grey * greyed)
+    """Brows and beard over the skin; brows grey later than the rest."""
+    streaks = (1 + 0.25 * fine + 0.12 * middle).clamp(0.3, 1.8)
+    beard_grey, brow_grey = 0.7 * people.grey**1.5, 0.6 * (people.grey - 0.5).clamp_min(0)
+    for cover, melanin, grey in ((hair.beard, 0.8, beard_grey), (hair.brows, 1.3, brow_grey)):
+        colour = hair_albedo(people.hair_eumelanin * melanin, people.hair_pheomelanin, grey)
         albedo = albedo + cover * (colour[..., None, None] * streaks - albedo)
     return albedo
 
@@ -220,7 +233,7 @@ def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
 
 
 def _gloss(
-    people: People, window: Window, hair: FacialHair, middle: Tensor, fine: Tensor, painted_eyes: bool
+    people: People, window: Window, hair: Tensor, middle: Tensor, fine: Tensor, painted_eyes: bool
 ) -> tuple[Tensor, Tensor]:
     """Reflectance at normal incidence and roughness [B, 1, T, T]; the same for all tones of skin."""
     oil = _each(people.oiliness)
@@ -228,12 +241,12 @@ def _gloss(
     t_zone = blob(window, 30, 15) + blob(window, 27, 20) + 0.8 * blob(window, (0.5, 0.06), 36, 0.7)
     t_zone = (t_zone + 0.5 * blobs(window, 0.31, 0.45, 17) + 0.4 * blob(window, 8, 14)).clamp(0, 1)
     lips = mask(window, "lips", 2.0)
-    specular = 0.028 * (0.75 + 0.35 * oil + 0.45 * t_zone * (0.4 + 0.6 * oil) + 0.08 * middle)
-    specular = specular * (1 - 0.2 * powder) + lips * 0.012
-    specular = specular * (1 - 0.5 * hair.cover) * (1 - 0.85 * mask(window, "nostrils", 2.5))
-    roughness = 0.56 - 0.08 * oil - 0.10 * t_zone * (0.3 + 0.7 * oil) + 0.06 * powder + 0.03 * middle
-    roughness = roughness + 0.02 * fine + lips * (0.36 + 0.03 * fine - roughness)
-    roughness = roughness + 0.15 * hair.cover
+    specular = 0.028 * (0.8 + 0.3 * oil + 0.3 * t_zone * oil + 0.08 * middle + 0.12 * fine)
+    specular = specular * (1 - 0.2 * powder) + lips * 0.007
+    specular = specular * (1 - 0.5 * hair) * (1 - 0.85 * mask(window, "nostrils", 2.5))
+    roughness = 0.62 - 0.07 * oil - 0.10 * t_zone * (0.2 + 0.8 * oil) + 0.06 * powder + 0.03 * middle
+    roughness = roughness + 0.03 * fine + lips * (0.44 + 0.03 * fine - roughness)
+    roughness = roughness + 0.15 * hair
     if painted_eyes:
         eyes = mask(window, "eyes", 1.0)
         specular, roughness = specular + eyes * (0.03 - specular), roughness + eyes * (0.18 - roughness)
