@@ -18,9 +18,10 @@ from scipy.spatial import cKDTree
 _OFFSET_M = 2e-4  # rays start this far off the surface, above float32's step at head scale;
 _MESH_OFFSET_M = 3e-5  # from a vertex, where no facet has to be cleared, so much and
 _RISE_SHARE = 0.5  # this share of its neighbours' rise, up to as much again as from a texel
-_BLUR_NEIGHBOURS = 16
+_BLUR_NEIGHBOURS = 24
 _SAME_SURFACE_COSINE = 0.6  # of two normals, for near vertices to share their view of the surroundings
 _NO_WEIGHT = 1e-4
+_R2 = np.array([0.7548776662466927, 0.5698402909980532], np.float32)  # 1 / p, 1 / p^2 with p^3 = p + 1
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class BakeSettings:
     lamp_radius_deg: float = 1.5
     bounce_samples: int = 32
     bounce_blur_texels: float = 1.5
-    bounce_blur_m: float = 0.0015
+    bounce_blur_m: float = 0.002
 
 
 def bake_transport(
@@ -109,23 +110,34 @@ def bake_mesh(
 
     Only `wanted` [V] bool vertices are baked, and for the lights alone those that light bounces from.
     `all_round` [V] bool ones (hair) are lit on both sides, at a single ray a lamp: they are many and finer
-    than any penumbra.
+    than any penumbra. Unless the lamps are points, shadows are smoothed by a mean over a vertex's own edges,
+    which keeps their outlines off the triangles' zigzag.
     """
-    random = np.random.default_rng(seed)
     nothing = np.zeros(len(vertices), bool)
     baked = ~nothing if wanted is None else wanted
     surface = _Surface.of(vertices, normals, triangles, nothing if all_round is None else all_round)
-    gather = _gather(surface, baked, settings, random)
+    shifts = np.random.default_rng(seed).random((len(vertices), 2), np.float32)
+    gather = _gather(surface, baked, settings, shifts)
     sources = np.bincount(gather.indices, minlength=len(vertices)) > 0
     visibility = np.zeros((len(directions), len(vertices)), np.float32)
     for light, direction in enumerate(directions):
-        visibility[light] = _lamp_share(surface, direction, baked | sources, settings, random)
+        visibility[light] = _lamp_share(surface, direction, baked | sources, settings, shifts)
     return MeshTransport(directions, visibility, gather, baked)
+
+
+def _spread(shifts: np.ndarray, chosen: np.ndarray, sample: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two numbers [N, 1] in 0..1 for one of the samples of each of the chosen vertices.
+
+    Each vertex's samples cover the square evenly (Roberts's R2 sequence), from its own shift [V, 2], so that
+    near vertices cover what the others leave out.
+    """
+    numbers = (shifts[chosen] + sample * _R2) % 1
+    return numbers[:, :1], numbers[:, 1:]
 
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """A mesh to cast rays from and at; edges [E, 2], each once."""
+    """A mesh to cast rays from and at; edges [E, 2], each once, and as a matrix [V, V] of ones."""
 
     scene: rtcore_scene.EmbreeScene
     vertices: np.ndarray
@@ -133,6 +145,7 @@ class _Surface:
     triangles: np.ndarray
     all_round: np.ndarray
     edges: np.ndarray
+    beside: csr_matrix
     offset_m: np.ndarray  # [V, 1] of ray origins off the surface
 
     @classmethod
@@ -143,6 +156,8 @@ class _Surface:
         pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         keys = np.unique(pairs[:, 0].astype(np.int64) * len(vertices) + pairs[:, 1])
         edges = np.stack([keys // len(vertices), keys % len(vertices)], -1)
+        both_ways = (np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]]))
+        ones = np.ones(2 * len(edges), np.float32)
         return cls(
             build_scene(vertices, triangles),
             vertices,
@@ -150,6 +165,7 @@ class _Surface:
             triangles,
             all_round,
             edges,
+            csr_matrix((ones, both_ways), shape=(len(vertices), len(vertices))),
             _mesh_offset_m(vertices, normals, edges)[:, None],
         )
 
@@ -172,7 +188,7 @@ def _lamp_share(
     direction: np.ndarray,
     traced: np.ndarray,
     settings: BakeSettings,
-    random: np.random.Generator,
+    shifts: np.ndarray,
 ) -> np.ndarray:
     """The share [V] of one lamp that each vertex sees; 0 where it is not traced or faces away.
 
@@ -182,16 +198,15 @@ def _lamp_share(
     lit = traced & ((facing > 0) | surface.all_round)
     share = np.zeros(len(lit), np.float32)
     first = np.flatnonzero(lit)
-    share[first] = _lamp_rays(surface, first, facing, direction, settings, random)
-    samples = 1 if settings.lamp_radius_deg == 0 else settings.lamp_samples
-    if samples == 1:
+    share[first] = _lamp_rays(surface, first, facing, direction, settings, _spread(shifts, first, 0))
+    if settings.lamp_radius_deg == 0:
         return share
-    edge = _beside(surface.edges, share, lit)
-    edge = np.flatnonzero(edge & lit & ~surface.all_round)
-    for _ in range(samples - 1):
-        share[edge] += _lamp_rays(surface, edge, facing, direction, settings, random)
-    share[edge] /= samples
-    return share
+    edge = np.flatnonzero(_beside(surface.edges, share, lit) & lit & ~surface.all_round)
+    for sample in range(1, settings.lamp_samples):
+        numbers = _spread(shifts, edge, sample)
+        share[edge] += _lamp_rays(surface, edge, facing, direction, settings, numbers)
+    share[edge] /= settings.lamp_samples
+    return lit * (share + surface.beside @ share) / (1 + surface.beside @ lit.astype(np.float32))
 
 
 def _lamp_rays(
@@ -200,12 +215,12 @@ def _lamp_rays(
     facing: np.ndarray,
     direction: np.ndarray,
     settings: BakeSettings,
-    random: np.random.Generator,
+    numbers: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Whether one ray from each of the chosen vertices [N] reaches the lamp; bool [N]."""
     side = np.where(facing[chosen] < 0, np.float32(-1), np.float32(1))[:, None]  # of a strand
     origins = surface.vertices[chosen] + surface.normals[chosen] * (side * surface.offset_m[chosen])
-    rays = _within_cone(direction, settings.lamp_radius_deg, len(chosen), random)
+    rays = _on_disc(direction, settings.lamp_radius_deg, *numbers)
     return ~occluded(surface.scene, origins, rays)
 
 
@@ -220,23 +235,21 @@ def _beside(edges: np.ndarray, share: np.ndarray, lit: np.ndarray) -> np.ndarray
     return found
 
 
-def _gather(
-    surface: _Surface, baked: np.ndarray, settings: BakeSettings, random: np.random.Generator
-) -> csr_matrix:
+def _gather(surface: _Surface, baked: np.ndarray, settings: BakeSettings, shifts: np.ndarray) -> csr_matrix:
     """See `MeshTransport.gather`: what hemisphere rays hit, as barycentric weights of its corners."""
     count, samples = len(baked), settings.bounce_samples
     if samples == 0:
         return csr_matrix((count, count), dtype=np.float32)
     smooth, strands = np.flatnonzero(baked & ~surface.all_round), np.flatnonzero(baked & surface.all_round)
-    blocks = [*_hemisphere_hits(surface, smooth, samples, random)]
-    blocks += _hemisphere_hits(surface, strands, max(1, samples // 4), random)
+    blocks = [*_hemisphere_hits(surface, smooth, samples, shifts)]
+    blocks += _hemisphere_hits(surface, strands, max(1, samples // 4), shifts)
     rows, columns, values = (np.concatenate(column) for column in zip(*blocks, strict=True))
     hits = csr_matrix((values, (rows, columns)), shape=(count, count), dtype=np.float32)
     return _neighbour_means(surface, smooth, settings.bounce_blur_m) @ hits
 
 
 def _hemisphere_hits(
-    surface: _Surface, chosen: np.ndarray, samples: int, random: np.random.Generator
+    surface: _Surface, chosen: np.ndarray, samples: int, shifts: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Row, column and value of what each round of one ray from every chosen vertex hits."""
     normals = surface.normals[chosen]
@@ -244,8 +257,8 @@ def _hemisphere_hits(
     a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
     outward = np.cross(b - a, c - a)
     strand = surface.all_round[surface.triangles[:, 0]]
-    for _ in range(samples):
-        rays = _cosine_hemisphere(normals, random)
+    for sample in range(samples):
+        rays = _over_hemisphere(normals, *_spread(shifts, chosen, sample))
         hits = surface.scene.run(origins, rays, output=True)
         triangle = hits["primID"]
         front = np.einsum("nc,nc->n", rays, outward[triangle]) < 0
@@ -310,9 +323,14 @@ def _lamp_visibility(
 
 def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.random.Generator) -> np.ndarray:
     """Unit directions [count, 3] spread evenly over the disc of a lamp; a lamp of radius 0 is a point."""
+    return _on_disc(axis, radius_deg, random.random((count, 1)), random.random((count, 1)))
+
+
+def _on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Unit directions [N, 3] to points on a lamp's disc, by two numbers [N, 1] in 0..1."""
     tangent, bitangent = _tangents(axis[None])
-    radius = np.tan(np.radians(radius_deg)) * np.sqrt(random.random((count, 1)))
-    turn = 2 * np.pi * random.random((count, 1))
+    radius = np.tan(np.radians(radius_deg)) * np.sqrt(share)
+    turn = 2 * np.pi * around
     rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
     return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
 
@@ -346,9 +364,14 @@ def _one_bounce(
 
 def _cosine_hemisphere(normals: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """One cosine-distributed unit direction about each normal [N, 3]."""
+    return _over_hemisphere(normals, random.random((len(normals), 1)), random.random((len(normals), 1)))
+
+
+def _over_hemisphere(normals: np.ndarray, share: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """A direction [N, 3] about each normal by two numbers [N, 1] in 0..1; even ones give a cosine lobe."""
     tangent, bitangent = _tangents(normals)
-    radius = np.sqrt(random.random((len(normals), 1)))
-    turn = 2 * np.pi * random.random((len(normals), 1))
+    radius = np.sqrt(share)
+    turn = 2 * np.pi * around
     rays = np.sqrt(1 - radius**2) * normals + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
     return rays.astype(np.float32)
 

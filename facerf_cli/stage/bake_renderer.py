@@ -31,7 +31,7 @@ from facerf_cli.stage.shading import (
 
 _SKIN, _HAIR = PARTS.index("skin"), PARTS.index("hair")
 _SMALL_PX = 160  # a picture up to this side takes 3 x 3 samples a pixel, a larger one 2 x 2
-_CHUNK = 1 << 22  # facets x lights that are worked on at a time; bounds the memory
+_CHUNK = 1 << 20  # facets x lights that are worked on at a time; bounds the memory
 _NEAR = 32  # vertices that one pass of scattering reaches
 _RELIEF_SOFTNESS = 0.15  # light from the sides (scattering, bounces) that keeps bumps from going black
 _NORMAL_VARIANCE = 0.18  # at most, added to alpha squared where a pixel's normals spread

@@ -67,14 +67,15 @@ class Cosines(NamedTuple):
 def two_lobes(cosines: Cosines, specular: Tensor, roughness: Tensor) -> Tensor:
     """The radiance of `highlights` from its cosines, for any shapes that broadcast."""
     n_dot_l, n_dot_v, n_dot_h, v_dot_h = cosines
-    fresnel = specular + (1 - specular) * (1 - v_dot_h) ** 5
+    away = 1 - v_dot_h
+    fresnel = specular + (1 - specular) * (away * away).square() * away
     total = torch.zeros_like(n_dot_l)
     for factor, weight in LOBES:
         alpha_squared = (roughness * factor) ** 4
-        distribution = alpha_squared / (math.pi * (n_dot_h**2 * (alpha_squared - 1) + 1) ** 2)
-        masking = 1 / (_smith(n_dot_l, alpha_squared) * _smith(n_dot_v, alpha_squared))
-        total += weight * distribution * masking
-    return math.pi * total * fresnel * n_dot_l
+        spread = (n_dot_h.square() * (alpha_squared - 1) + 1).square()  # of GGX: alpha^2 / (pi spread)
+        masking = _smith(n_dot_l, alpha_squared) * _smith(n_dot_v, alpha_squared)
+        total += (weight * alpha_squared) / (spread * masking)
+    return total * fresnel * n_dot_l
 
 
 def _smith(cosine: Tensor, alpha_squared: Tensor) -> Tensor:

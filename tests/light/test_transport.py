@@ -1,11 +1,12 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.transport import BakeSettings, bake_transport, build_scene
+from facerf_cli.light.transport import BakeSettings, bake_mesh, bake_transport, build_scene
 from facerf_cli.light.transport import occluded as embree_occluded
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import rasterize
@@ -115,3 +116,121 @@ def test_the_same_seed_gives_the_same_bake(head: tuple[np.ndarray, ...]) -> None
         for _ in "ab"
     )
     assert (first.visibility == second.visibility).all() and (first.bounce == second.bounce).all()
+
+
+def _tessellated(corner: np.ndarray, along: np.ndarray, across: np.ndarray, count: int) -> tuple:
+    """Vertices and counter-clockwise triangles of a parallelogram, and its normal."""
+    a, b = np.meshgrid(np.linspace(0, 1, count), np.linspace(0, 1, count))
+    vertices = corner + a.reshape(-1, 1) * along + b.reshape(-1, 1) * across
+    cells = np.arange(count * count).reshape(count, count)[:-1, :-1].ravel()
+    first = np.stack([cells, cells + 1, cells + count + 1], -1)
+    second = np.stack([cells, cells + count + 1, cells + count], -1)
+    normal = np.cross(along, across)
+    return vertices, np.concatenate([first, second]), normal / np.linalg.norm(normal)
+
+
+def _joined(*pieces: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices, normals, triangles of several flat pieces."""
+    offsets = np.cumsum([0, *(len(vertices) for vertices, _, _ in pieces)])
+    return (
+        np.concatenate([vertices for vertices, _, _ in pieces]),
+        np.concatenate([np.repeat(normal[None], len(vertices), 0) for vertices, _, normal in pieces]),
+        np.concatenate([piece[1] + offset for piece, offset in zip(pieces, offsets, strict=False)]),
+    )
+
+
+def _table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A floor of 1 m, facing up, and 0.3 m above its middle a small board that faces up too."""
+    x, z = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+    floor = _tessellated(np.array([-0.5, 0, -0.5]), z, x, 41)
+    board = _tessellated(np.array([-0.1, 0.3, -0.1]), 0.2 * z, 0.2 * x, 9)
+    return _joined(floor, board)
+
+
+def test_a_mesh_shadow_lies_where_the_lamp_throws_it() -> None:
+    vertices, normals, triangles = _table()
+    lamp = np.array([1.0, 3.0, 0.0]) / np.sqrt(10)  # moves the board's shadow by 0.1 m to -x
+    baked = bake_mesh(vertices, normals, triangles, lamp[None], POINT_LAMP)
+    floor = vertices[:, 1] == 0
+    shadow = (np.abs(vertices[:, 0] + 0.1) < 0.1 - 1e-3) & (np.abs(vertices[:, 2]) < 0.1 - 1e-3)
+    clear = (np.abs(vertices[:, 0] + 0.1) > 0.1 + 1e-3) | (np.abs(vertices[:, 2]) > 0.1 + 1e-3)
+    assert (baked.visibility[0][floor & shadow] == 0).all() and (floor & shadow).sum() > 20
+    assert (baked.visibility[0][~floor | clear] == 1).all()
+    assert (bake_mesh(vertices, normals, triangles, -lamp[None], POINT_LAMP).visibility == 0).all()
+
+
+def test_a_wide_lamp_has_a_penumbra_of_its_own_width() -> None:
+    vertices, normals, triangles = _table()
+    lamp, settings = np.array([[0.0, 1.0, 0.0]]), BakeSettings(64, 10.0, 0)
+    share = bake_mesh(vertices, normals, triangles, lamp, settings).visibility[0]
+    row = (vertices[:, 1] == 0) & (np.abs(vertices[:, 2]) < 1e-6)
+    x, found = vertices[row, 0], share[row]
+    half_m = 0.3 * np.tan(np.radians(10))  # of the penumbra about the board's edge at 0.1 m
+    offset = np.clip((np.abs(x) - 0.1) / half_m, -1, 1)
+    expected = 0.5 + (offset * np.sqrt(1 - offset**2) + np.arcsin(offset)) / np.pi  # of a disc beyond a chord
+    assert np.abs(found - expected).max() < 0.12  # smoothed over a vertex's neighbours
+    assert np.abs(found - expected).mean() < 0.03
+
+
+def test_smooth_normals_of_a_sphere_throw_no_shadow_on_it() -> None:
+    sphere = trimesh.creation.icosphere(3, 0.1)
+    lamps = rig_directions(20).numpy()
+    baked = bake_mesh(sphere.vertices, sphere.vertex_normals, sphere.faces, lamps, POINT_LAMP)
+    facing = lamps @ sphere.vertex_normals.T
+    assert (baked.visibility[facing > 0.02] == 1).all()
+    assert (baked.visibility[facing <= 0] == 0).all()
+    inside_out = -sphere.vertex_normals  # a hollow: its facets rise above every tangent plane
+    hollow = bake_mesh(sphere.vertices, inside_out, sphere.faces[:, ::-1], lamps, BakeSettings())
+    cover = np.asarray(hollow.gather.sum(1))[:, 0]
+    assert np.allclose(cover, 1, atol=1e-5)  # nothing but the hollow to be seen from within
+
+
+def test_a_mesh_gathers_the_form_factor_of_a_wall() -> None:
+    x, y, z = np.eye(3)
+    floor = _tessellated(np.array([-4.0, 0, 0]), z, 8 * x, 81)
+    wall = _tessellated(np.array([-4.0, 0, 0]), 8 * x, y, 81)
+    vertices, normals, triangles = _joined(floor, wall)
+    settings = BakeSettings(bounce_samples=300, bounce_blur_m=0.0)
+    middle = np.flatnonzero((np.abs(vertices[:, 0]) < 0.2) & (vertices[:, 1] == 0) & (normals[:, 1] == 1))
+    wanted = np.isin(np.arange(len(vertices)), middle)
+    baked = bake_mesh(vertices, normals, triangles, z[None], settings, wanted=wanted)
+    expected = (1 - 1 / np.sqrt(1 + (1 / np.maximum(vertices[middle, 2], 1e-9)) ** 2)) / 2
+    seen = np.asarray(baked.gather.sum(1))[middle, 0]
+    away = vertices[middle, 2] > 0.02  # on the edge itself half of all rays run along the wall
+    assert np.abs(seen - expected)[away].mean() < 0.01
+    bounced = (baked.gather @ baked.visibility[0])[middle]  # the lamp meets the wall head on
+    assert np.abs(bounced - expected)[away].mean() < 0.01
+    assert baked.gather[~wanted].nnz == 0 and (baked.baked == wanted).all()
+    assert baked.visibility[0][~wanted].max() == 1  # the wall was not asked for, yet light bounces off it
+
+
+def test_light_bounces_off_outsides_only() -> None:
+    x, y, z = np.eye(3)
+    vertices, normals, triangles = _joined(
+        _tessellated(np.zeros(3), z, x, 9), _tessellated(np.array([0, 0.1, 0.0]), z, x, 9)
+    )
+    bake = bake_mesh(vertices, normals, triangles, y[None], BakeSettings())
+    assert bake.gather.nnz == 0  # the ceiling turns its back
+    flipped = triangles.copy()
+    flipped[len(flipped) // 2 :] = flipped[len(flipped) // 2 :, ::-1]
+    below = np.arange(len(vertices)) < 81
+    facing = bake_mesh(vertices, np.where(below[:, None], normals, -normals), flipped, y[None])
+    assert np.asarray(facing.gather.sum(1)).mean() > 0.5
+
+
+def test_hair_is_lit_from_both_sides() -> None:
+    x, y, z = np.eye(3)
+    vertices, normals, triangles = _joined(_tessellated(np.zeros(3), 0.1 * z, 0.01 * x, 5))
+    lamps = np.stack([y, -y])
+    plain = bake_mesh(vertices, normals, triangles, lamps)
+    hair = bake_mesh(vertices, normals, triangles, lamps, all_round=np.ones(len(vertices), bool))
+    assert (plain.visibility[0] == 1).all() and (plain.visibility[1] == 0).all()
+    assert (hair.visibility == 1).all()
+
+
+def test_the_same_seed_gives_the_same_mesh_bake() -> None:
+    vertices, normals, triangles = _table()
+    lamps = rig_directions(6).numpy()
+    first, second, third = (bake_mesh(vertices, normals, triangles, lamps, seed=seed) for seed in (3, 3, 4))
+    assert (first.visibility == second.visibility).all() and (first.gather != second.gather).nnz == 0
+    assert (first.visibility != third.visibility).any()
