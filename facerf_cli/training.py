@@ -1,4 +1,4 @@
-"""Training of the Reflectance Network on the synthetic bank, top to bottom."""
+"""Training of the Reflectance Network, on the synthetic bank or a prepared dataset, top to bottom."""
 
 import json
 import math
@@ -19,8 +19,7 @@ from facerf_cli.files.images import write_display
 from facerf_cli.network.losses import root_loss, si_mse
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.pipeline import load_network
-from facerf_cli.stage.bank import Bank
-from facerf_cli.stage.samples import Sample, draw_sample
+from facerf_cli.stage.samples import Sample, SampleSource
 
 DEFAULT_NETWORK = ReflectanceSettings()
 CPU = torch.device("cpu")
@@ -46,7 +45,7 @@ class TrainSettings:
 
 
 def train(
-    bank: Bank,
+    source: SampleSource,
     folder: Path,
     settings: TrainSettings = TrainSettings(),
     network_settings: ReflectanceSettings = DEFAULT_NETWORK,
@@ -54,7 +53,7 @@ def train(
     device: torch.device = CPU,
     report: Callable[[dict[str, float]], None] = lambda row: None,
 ) -> Path:
-    """Train on `bank` until the time is up; returns the checkpoint, `folder/last.safetensors`.
+    """Train on what `source` draws until the time is up; returns the checkpoint, `folder/last.safetensors`.
 
     `start_from` is a checkpoint whose weights to begin with, and whose settings hold then. Samples are drawn
     on the CPU, the network runs on `device`. Rows go to `report` and `folder/log.jsonl`.
@@ -62,48 +61,61 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
     generator = torch.Generator().manual_seed(settings.seed)
-    network = load_network(start_from)[0] if start_from else ReflectanceNetwork(network_settings)
-    network_settings = network.settings
-    network.set_mean_face(*bank.mean_face())
-    network = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = _network(source, network_settings, start_from, device)
     average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.98)
     )
-    train_heads = torch.arange(settings.held_out_heads + 1, len(bank.geometries))
-    held_out = _held_out_samples(bank, settings)
+    heads, held_out = source.heads(settings.held_out_heads)
+    validation = _held_out_samples(source, held_out)
     begin, step, drawing = time.monotonic(), 0, 0.0
+
+    def finish(row: dict[str, float]) -> Path:
+        row["si_mse"] = _validate(average, network.settings, validation, folder / "validation.png")
+        return _save(folder / "last.safetensors", average, network.settings, settings, source, row)
+
     with (folder / "log.jsonl").open("a") as log:
         while (elapsed := time.monotonic() - begin) < settings.max_seconds and step < settings.max_steps:
             _set_rate(optimizer, settings, step, elapsed)
             drawn_at = time.monotonic()
-            heads = train_heads[torch.randint(len(train_heads), (settings.batch,), generator=generator)]
-            sample = draw_sample(bank, heads, settings.lights, generator)
+            chosen = heads[torch.randint(len(heads), (settings.batch,), generator=generator)]
+            sample = source.draw(chosen, settings.lights, generator)
             drawing += time.monotonic() - drawn_at
-            loss = _loss(network, sample.to(device), settings.bf16)
-            if not loss.isfinite():
-                raise FacerfError(f"the loss is not finite at step {step} (heads {heads.tolist()})")
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_clip)
-            optimizer.step()
+            loss = _step(network, optimizer, sample.to(device), settings)
+            if not math.isfinite(loss):
+                raise FacerfError(f"the loss is not finite at step {step} (heads {chosen.tolist()})")
             step += 1
             _update_average(average, network, min(settings.ema_decay, step / (step + 10)))
-            row = {
-                "step": step,
-                "seconds": elapsed,
-                "loss": float(loss.detach()),
-                "drawing": drawing / (elapsed + 1e-6),
-            }
+            row = {"step": step, "seconds": elapsed, "loss": loss, "drawing": drawing / (elapsed + 1e-6)}
             if step % settings.validate_every == 0:
-                row["si_mse"] = _validate(average, network_settings, held_out, folder / "validation.png")
-                _save(folder / "last.safetensors", average, network_settings, settings, bank, row)
+                finish(row)
             log.write(json.dumps(row) + "\n")
             log.flush()
             report(row)
-    row = {"step": step, "seconds": time.monotonic() - begin}
-    row["si_mse"] = _validate(average, network_settings, held_out, folder / "validation.png")
-    return _save(folder / "last.safetensors", average, network_settings, settings, bank, row)
+    return finish({"step": step, "seconds": time.monotonic() - begin})
+
+
+def _network(
+    source: SampleSource, settings: ReflectanceSettings, start_from: Path | None, device: torch.device
+) -> ReflectanceNetwork:
+    """The network to train, with the mean face that the source knows."""
+    network = load_network(start_from)[0] if start_from else ReflectanceNetwork(settings)
+    network.set_mean_face(*source.mean_face())
+    moved: ReflectanceNetwork = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return moved
+
+
+def _step(
+    network: ReflectanceNetwork, optimizer: torch.optim.Optimizer, sample: Sample, settings: TrainSettings
+) -> float:
+    """One step down the gradient; the loss before it. A loss that is not finite moves nothing."""
+    loss = _loss(network, sample, settings.bf16)
+    if loss.isfinite():
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_clip)
+        optimizer.step()
+    return float(loss.detach())
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, settings: TrainSettings, step: int, elapsed: float) -> None:
@@ -130,10 +142,9 @@ def _update_average(average: dict[str, Tensor], network: ReflectanceNetwork, dec
             average[name].lerp_(tensor, 1 - decay)
 
 
-def _held_out_samples(bank: Bank, settings: TrainSettings) -> list[Sample]:
+def _held_out_samples(source: SampleSource, heads: Tensor) -> list[Sample]:
     generator = torch.Generator().manual_seed(12345)
-    heads = torch.arange(1, settings.held_out_heads + 1)
-    return [draw_sample(bank, chunk, 6, generator) for chunk in heads.view(-1, 4) for _ in range(4)]
+    return [source.draw(chunk, 6, generator) for chunk in torch.split(heads, 4) for _ in range(4)]
 
 
 @torch.no_grad()
@@ -167,14 +178,14 @@ def _save(
     weights: dict[str, Tensor],
     network_settings: ReflectanceSettings,
     settings: TrainSettings,
-    bank: Bank,
+    source: SampleSource,
     row: dict[str, float],
 ) -> Path:
     metadata: dict[str, Any] = {
         "network": network_settings.as_dict(),
         "layout_version": LAYOUT_VERSION,
-        "licence": bank.provenance["licence"],
-        "provenance": bank.provenance,
+        "licence": source.provenance["licence"],
+        "provenance": source.provenance,
         "training": asdict(settings),
         "metrics": row,
     }

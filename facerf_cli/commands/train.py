@@ -1,4 +1,4 @@
-"""`facerf train`: bake synthetic heads, then train the Reflectance Network on them."""
+"""`facerf train`: the Reflectance Network, on synthetic heads baked for it or on a prepared dataset."""
 
 import re
 from dataclasses import replace
@@ -13,35 +13,54 @@ from facerf_cli.records import STDERR
 
 if TYPE_CHECKING:
     from facerf_cli.stage.bank import Bank
+    from facerf_cli.stage.samples import SampleSource
 
+_OF_THE_BANK = ("heads_from", "heads", "views", "bank")
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 
 
 def train(
     context: typer.Context,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the run.")],
+    dataset: Annotated[
+        Path | None,
+        typer.Option(
+            "--dataset",
+            metavar="DIR",
+            help="Train on this prepared dataset (prepare-dataset, relight-dataset) in the place of heads.",
+            show_default="synthetic heads",
+        ),
+    ] = None,
     heads_from: Annotated[
         str, typer.Option(metavar="NAME|PATH", help="Face model that the synthetic heads are drawn from.")
     ] = "builtin",
     fit_with: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Face model that they are fitted with, as photos are.")
+        str,
+        typer.Option(metavar="NAME|PATH", help="Face model that they are, or the dataset was, fitted with."),
     ] = "builtin",
     heads: Annotated[int, typer.Option(min=16, help="Synthetic heads to bake.")] = 240,
     views: Annotated[int, typer.Option(min=1, help="Fitted views of each head.")] = 8,
     bank: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where baked heads are kept.", show_default="DIR/bank")
     ] = None,
+    texture_size: Annotated[
+        int, typer.Option(min=32, max=1024, metavar="PX", help="Side of a dataset's textures.")
+    ] = 128,
     max_time: Annotated[str, typer.Option(metavar="TIME", help="Stop after 90s, 45m or 2h.")] = "2h",
     start_from: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Checkpoint whose weights to begin with.", show_default="none"),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes that bake.")] = 2,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes that bake, or unwrap.")] = 2,
 ) -> None:
-    """Train the Reflectance Network on synthetic heads, without a light stage.
+    """Train the Reflectance Network on synthetic heads, without a light stage, or on a prepared dataset.
 
     Heads are drawn from a face model and their light transport is baked once; skins, lights and cameras are
     drawn anew at every step. DIR gets last.safetensors (for --checkpoint), log.jsonl and validation.png.
+
+    A dataset is unwrapped once into DATASET/textures-PX; its split train is trained on, its split validation
+    measured (si_mse in the log), its split test left alone. Sources are those of relight-dataset, or, where
+    there are none, the stacks under lights that are drawn.
     """
     from facerf_cli.pipeline import load_network
     from facerf_cli.training import TrainSettings
@@ -49,15 +68,37 @@ def train(
 
     settings = settings_of(context)
     training = TrainSettings(max_seconds=_seconds(max_time), seed=settings.seed)
+    if dataset is not None:
+        _refuse_the_banks_options(context)
     if start_from:
         load_network(start_from)  # a bad file is named before hours of baking
-    filled = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
+    source: SampleSource
+    if dataset is not None:
+        source = _open_dataset(dataset, fit_with, texture_size, jobs)
+    else:
+        source = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
     report = _Progress(training.max_seconds, settings)
     with report:
         checkpoint = run_training(
-            filled, output, training, start_from=start_from, device=torch_device(settings), report=report.row
+            source, output, training, start_from=start_from, device=torch_device(settings), report=report.row
         )
     print(checkpoint)
+
+
+def _refuse_the_banks_options(context: typer.Context) -> None:
+    for name in _OF_THE_BANK:
+        given = context.get_parameter_source(name)
+        if given is not None and given.name == "COMMANDLINE":
+            option = f"--{name.replace('_', '-')}"
+            raise UsageError(
+                f"{option} is for synthetic heads, and --dataset takes their place; give one of them"
+            )
+
+
+def _open_dataset(folder: Path, fit_with: str, side: int, jobs: int) -> "SampleSource":
+    from facerf_cli.stage.captured import open_captured
+
+    return open_captured(folder, fit_with, side, jobs)
 
 
 def _seconds(text: str) -> float:

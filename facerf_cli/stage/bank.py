@@ -14,6 +14,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.stage.samples import Sample, draw_sample
 from facerf_cli.stage.shards import in_shards
 from facerf_cli.stage.views import build_views
 
@@ -52,6 +53,14 @@ class Bank:
     def side(self) -> int:
         """Texels along a side of every field."""
         return int(self.geometries[0].normals.shape[-1])
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Indices of the heads to train on, and of the first `held_out` after the mean face."""
+        return torch.arange(held_out + 1, len(self.geometries)), torch.arange(1, held_out + 1)
+
+    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """One sample of every head in `heads` [B], with `lights` target lights."""
+        return draw_sample(self, heads, lights, generator)
 
     def draw_view(self, head: int, generator: torch.Generator) -> View:
         """A random view of a head."""

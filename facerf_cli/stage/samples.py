@@ -4,6 +4,7 @@ Skins, lights and the camera are drawn anew for every sample (DESIGN, 'Baked tra
 """
 
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -11,10 +12,12 @@ from torch import Tensor
 
 from facerf_cli.network.reflectance import MEAN_RADIANCE
 from facerf_cli.raster.texture import inpaint
-from facerf_cli.stage.bank import Bank
 from facerf_cli.stage.lights import draw_light
 from facerf_cli.stage.shading import bend, diffuse_irradiance, highlights, scatter, unit
 from facerf_cli.stage.skin import Skin, draw_skin
+
+if TYPE_CHECKING:
+    from facerf_cli.stage.bank import Bank
 
 _SOURCE_HIGHLIGHTS = 10  # of the source's lights, the brightest ones also shine
 _VIEW_DISTANCE_M = 1.2  # of the crop camera from a face
@@ -42,7 +45,28 @@ class Sample:
         return Sample(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
-def draw_sample(bank: Bank, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+class SampleSource(Protocol):
+    """What training draws from: the bank of baked heads, or a prepared dataset."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """For the checkpoint; its 'licence' is the words for the whole."""
+
+    @property
+    def side(self) -> int:
+        """Texels along a side of every field."""
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Whom to train on, and at most `held_out` whom to validate on; numbers that `draw` takes."""
+
+    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """One sample of every head in `heads` [B], with `lights` target lights."""
+
+    def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the mean face, head frame."""
+
+
+def draw_sample(bank: "Bank", heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
     """Draw one sample of every head in `heads` [B], with `lights` target lights."""
     faces = [_draw_face(bank, int(head), lights, generator) for head in heads]
     skin = draw_skin(len(faces), bank.side, generator)
@@ -55,7 +79,7 @@ def draw_sample(bank: Bank, heads: Tensor, lights: int, generator: torch.Generat
     target = _warped(target.flatten(1, 2), warp).view(target.shape)
     albedo = _warped(skin.albedo, warp)
     weight = torch.stack([face.weight for face in faces])
-    source, target = _photograph(source, target, albedo, visible, generator)
+    source, target = photograph(source, target, albedo, visible, generator)
     source = torch.stack([inpaint(s, v[0]) for s, v in zip(source, visible, strict=True)])
     return Sample(
         source=source,
@@ -89,7 +113,7 @@ class _Face:
     fitted_normals_target: Tensor
 
 
-def _draw_face(bank: Bank, head: int, lights: int, generator: torch.Generator) -> _Face:
+def _draw_face(bank: "Bank", head: int, lights: int, generator: torch.Generator) -> _Face:
     geometry = bank.geometries[head]
     view = bank.draw_view(head, generator)
     directions = geometry.directions
@@ -98,7 +122,7 @@ def _draw_face(bank: Bank, head: int, lights: int, generator: torch.Generator) -
     rotation_target = rotation_source if same_pose else bank.draw_view(head, generator).rotation
     turn = rotation_target @ rotation_source.T
     in_target = directions @ rotation_target.T
-    chosen = _draw_target_lights(in_target, lights, generator)
+    chosen = draw_target_lights(in_target, lights, generator)
     view_target = _views(geometry.positions, rotation_target)
     facing = torch.einsum("cij,cij->ij", geometry.normals, view_target)
     true_facing = _warped(facing[None, None], view.warp[None])[0]
@@ -127,8 +151,8 @@ def _views(positions: Tensor, rotation: Tensor) -> Tensor:
     return unit(camera_in_head.view(3, 1, 1) - positions, 0)
 
 
-def _draw_target_lights(in_camera: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Lights mostly in front, where photographs are lit from; some from the side and behind."""
+def draw_target_lights(in_camera: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Numbers [count] of lights [L, 3], mostly in front, as photographs are lit; some from elsewhere."""
     preference = torch.sigmoid(6 * (in_camera[:, 2] + 0.1)) + 0.05
     return torch.multinomial(preference, count, generator=generator)
 
@@ -179,12 +203,12 @@ def _warped(fields: Tensor, warp: Tensor) -> Tensor:
     return F.grid_sample(fields, 2 * warp - 1, padding_mode="border", align_corners=False)
 
 
-def _photograph(
+def photograph(
     source: Tensor, target: Tensor, albedo: Tensor, visible: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """What a camera makes of the source, and both at the exposure that the network works at.
+    """What a camera makes of sources [B, 3, T, T]; and these and targets [B, L, 3, T, T] exposed to train.
 
-    Target textures are scaled so that the face's mean albedo becomes `MEAN_RADIANCE`; see
+    Targets are scaled so that the mean of `albedo` over the visible face becomes `MEAN_RADIANCE`; see
     network.reflectance.
     """
     faces = len(source)
