@@ -1,11 +1,16 @@
 """What tests share. The data of `../shared` is not in the repository; tests that need it skip without it."""
 
 import os
+import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+from facerf_cli.face import importers
+from facerf_cli.face.importers import SourceModel, carry_over
+from facerf_cli.face.morphable import MorphableModel
 
 SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "shared"))
 
@@ -15,6 +20,26 @@ def shared_data() -> Path:
     if not (SHARED / "data").is_dir():
         pytest.skip(f"{SHARED / 'data'} is not here (set FACERF_SHARED)")
     return SHARED / "data"
+
+
+@pytest.fixture(scope="session")
+def ict_source(shared_data: Path) -> SourceModel:
+    """ICT-FaceKit with a few of its shapes."""
+    wanted = ("generic_neutral_mesh", "identity000", "identity001", "jawOpen")
+    wanted += tuple(f"{stem}_{side}" for stem in ("eyeBlink", "eyeLookDown", "eyeLookOut") for side in "LR")
+    archive = shared_data / "ict_facekit" / "ICT-FaceKit-master.tar.xz"
+    raw = {}
+    with tarfile.open(archive, "r|*") as tar:
+        for member in tar:
+            if Path(member.name).stem in wanted and "FaceXModel/" in member.name:
+                raw[Path(member.name).stem] = tar.extractfile(member).read()
+    return importers._ict_source(archive, raw)
+
+
+@pytest.fixture(scope="session")
+def ict_model(ict_source: SourceModel) -> MorphableModel:
+    """What an import makes of `ict_source`."""
+    return carry_over(ict_source)
 
 
 @pytest.fixture(autouse=True)

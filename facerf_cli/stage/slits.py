@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from facerf_cli.face.topology import LANDMARK_UV
 
 _COLUMNS = 33  # across a slit, at which its width is read
-_OVERLAP_M = 0.0004  # closed edges cross by this: subdivision rounds them off again
+_LIP_OVERLAP_M, _LID_OVERLAP_M = 0.0004, 0.0008  # closed edges cross by this: subdivision rounds them off
 _LIP_REACH_M, _LID_REACH_M = 0.006, 0.004  # what yields around a slit: one standard deviation
 _LIP_MARGIN_UV = np.array([0, 0.04])  # where the edges of the lips are looked for
 _LID_RINGS = 5  # from the inner border of the lids, among which their edges are
@@ -20,22 +20,22 @@ class Slit:
     """A slit between an upper and a lower edge.
 
     upper, lower: vertex ids of the edges from left to right; weight [N] in [-1, 1]: how far each vertex goes
-    along when the slit opens by 1, up (positive: the upper side) or down.
+    along when the slit opens by 1, up (positive: the upper side) or down; overlap_m: of closed edges.
     """
 
     upper: np.ndarray
     lower: np.ndarray
     weight: np.ndarray
+    overlap_m: float
 
-    def closing(self, shape: np.ndarray, only_crossed: bool = False) -> np.ndarray:
-        """Offsets along y [N] that bring the edges of a head [N, 3] together; or that part crossed ones."""
+    def closing(self, shape: np.ndarray) -> np.ndarray:
+        """Offsets along y [N] that bring the edges of a head [N, 3] together, or part crossed ones."""
         ends = [shape[edge][[0, -1], 0] for edge in (self.upper, self.lower)]
         columns = np.linspace(max(ends[0][0], ends[1][0]), min(ends[0][1], ends[1][1]), _COLUMNS)
         upper, lower = (
             np.interp(columns, *_rising(shape[edge, 0], shape[edge, 1])) for edge in (self.upper, self.lower)
         )
-        width = upper - lower
-        width = np.minimum(width, 0) if only_crossed else width + _OVERLAP_M
+        width = upper - lower + self.overlap_m
         width = np.convolve(np.pad(width, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         width *= np.minimum(1, np.minimum(np.arange(_COLUMNS), np.arange(_COLUMNS)[::-1]) / 2)
         return -self.weight * np.interp(shape[:, 0], columns, width, left=0, right=0)
@@ -58,7 +58,7 @@ def eye_slit(mean: np.ndarray, shut: np.ndarray, loop: np.ndarray, triangles: np
     upper = min((ring[above[ring]] for ring in rings), key=lambda ids: shut[ids[middle[ids]], 1].mean())
     lower = max((ring[~above[ring]] for ring in rings), key=lambda ids: shut[ids[middle[ids]], 1].mean())
     edges = upper[np.argsort(mean[upper, 0])], lower[np.argsort(mean[lower, 0])]
-    return Slit(*edges, _weight(mean, *edges, np.unique(triangles), above, _LID_REACH_M, 0.7))
+    return Slit(*edges, _weight(mean, *edges, np.unique(triangles), above, _LID_REACH_M, 0.7), _LID_OVERLAP_M)
 
 
 def _rings(loop: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
@@ -78,7 +78,7 @@ def lip_slit(mean: np.ndarray, uv: np.ndarray, skin: np.ndarray, soft: np.ndarra
     fall = np.linalg.norm(jaw, axis=-1)
     above = fall < fall[lips].max() / 2
     edges = _edges(mean, lips, above, mean[lips, 0].min(), mean[lips, 0].max())
-    return Slit(*edges, _weight(mean, *edges, soft, above, _LIP_REACH_M, 0.5))
+    return Slit(*edges, _weight(mean, *edges, soft, above, _LIP_REACH_M, 0.5), _LIP_OVERLAP_M)
 
 
 def _edges(
