@@ -144,8 +144,8 @@ def _scatterings(head: HeadMesh, baked: np.ndarray, appearance: Appearance) -> l
         passes = max(1, math.ceil((2.2 * sigma_mm / 1000 / reach_m) ** 2))
         sigma_m = max(sigma_mm / 1000 / math.sqrt(passes), 1e-6)
         kernel = weights * np.exp(-0.5 * (distance / sigma_m) ** 2) + 1e-12 * (distance == 0)
-        kernel /= kernel.sum(1, keepdims=True)
-        kept = kernel > 1e-3
+        kept = kernel > 1e-3 * kernel.max(1, keepdims=True)
+        kernel /= (kernel * kept).sum(1, keepdims=True)
         rows = np.broadcast_to(np.arange(len(skin))[:, None], near.shape)[kept]
         other = np.setdiff1d(np.arange(count), skin)
         matrix = csr_matrix(
