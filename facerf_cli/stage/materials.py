@@ -56,15 +56,12 @@ class Surface:
 
 
 def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
-    """One person, and what he or she wears; `side` is the canvas's."""
+    """One person, and what he or she wears; `side`, the canvas's, only sets how fine the skin is."""
     people = draw_people(1, generator)
-    window = Window(side, CANVAS_SPAN)
-    skin = paint_skin(people, window, generator, painted_eyes=False)
     eye, eye_traits = eyeball(_SIDE, people, generator)
     frame, frame_kind = _frame(generator)
     cloth, cloth_kind = _cloth(generator)
     materials = {
-        "skin": Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0]),
         "eye": Material(*eye),
         "mouth": _mouth(generator),
         "teeth": _teeth(people, generator),
@@ -72,6 +69,8 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
         "hair": _hair(people, generator),
         "frame": frame,
     }
+    skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
+    materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
     traits = named(people, 0)
     traits["random_texture"] = bool(people.random_texture[0])
     traits["ita_deg"] = round(float(ita_deg(bare_skin(people)[0].double().numpy())), 1)

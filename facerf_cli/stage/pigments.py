@@ -123,7 +123,7 @@ def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
     absorbed = eumelanin[..., None] * torch.tensor([0.419, 0.697, 1.37])
     absorbed = absorbed + pheomelanin[..., None] * torch.tensor([0.187, 0.4, 1.05])
     pigmented = torch.exp(-5.89 * absorbed.sqrt()) + torch.tensor([0.011, 0.0095, 0.0085])
-    white = torch.tensor([0.46, 0.44, 0.40])
+    white = torch.tensor([0.44, 0.41, 0.36])
     return pigmented + grey[..., None] * (white - pigmented)
 
 

@@ -45,7 +45,7 @@ def draw_relief(
     dents = noise(count, window, 6.0, generator, octaves=1)
     coarse = 0.6 + 0.5 * age + 0.4 * people.oiliness.view(-1, 1, 1, 1)
     grain = 0.03 * min(1.0, min(window.texel_mm)) * grain
-    height = coarse * (_pore_places(window) * (grain + 0.03 * pores) + 0.018 * dents)
+    height = coarse * (_pore_places(window) * (grain + 0.022 * pores) + 0.014 * dents)
     lips = mask(window, "lips", 1.5)
     lines = noise(count, window, (1.7, 9.0), generator, octaves=1)
     height = height * (1 - lips) + lips * 0.07 * lines
@@ -103,7 +103,7 @@ def _wrinkles(people: People, window: Window, generator: torch.Generator) -> Ten
         [common[:, :-1].repeat_interleave(2, 1), common[:, -1:].expand(-1, folds - 2 * pairs)], 1
     )
     own = 0.7 + 0.6 * torch.rand(count, folds, generator=generator)
-    strength = depth * (0.15 + 1.6 * grown) * (0.25 + common) * own
+    strength = depth * (0.08 + 1.8 * grown) * (0.25 + common) * own
     places = basis @ (points + jitter)  # [B, N, 2]
     amount = strength[:, fold] * taper * _STEP_MM
     face = torch.arange(count).repeat_interleave(len(fold))

@@ -205,7 +205,7 @@ def _random_colours(
 def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, middle: Tensor) -> Tensor:
     """Brows and beard over the skin; brows grey later than the rest."""
     streaks = (1 + 0.25 * fine + 0.12 * middle).clamp(0.3, 1.8)
-    beard_grey, brow_grey = 0.7 * people.grey**1.5, 0.6 * (people.grey - 0.5).clamp_min(0)
+    beard_grey, brow_grey = 0.7 * people.grey**1.5, 0.45 * (people.grey - 0.5).clamp_min(0)
     for cover, melanin, grey in ((hair.beard, 0.8, beard_grey), (hair.brows, 1.3, brow_grey)):
         colour = hair_albedo(people.hair_eumelanin * melanin, people.hair_pheomelanin, grey)
         albedo = albedo + cover * (colour[..., None, None] * streaks - albedo)

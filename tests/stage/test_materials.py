@@ -36,6 +36,10 @@ def test_the_same_seed_draws_the_same_person(people: list[Appearance]) -> None:
     assert again.traits == people[0].traits
     assert torch.equal(again.materials["skin"].albedo, people[0].materials["skin"].albedo)
     assert people[1].traits != people[0].traits
+    finer = draw_appearance(2 * SIDE, torch.Generator().manual_seed(1))
+    assert finer.traits == people[0].traits  # the side changes how fine, not who
+    small, large = (person.materials["skin"].albedo.mean((1, 2)) for person in (people[0], finer))
+    assert torch.allclose(small, large, rtol=0.1)
 
 
 def test_traits_name_the_physical_parameters(people: list[Appearance]) -> None:
