@@ -21,15 +21,16 @@ MAX_VERTICES = 250_000
 _LINE_DEG = (0, 20, 36, 46, 54, 60, 64, 67, 72, 75, 85, 95, 103, 112, 130, 150, 180)
 _LINE_M = (0, 0.001, 0.004, -0.003, -0.022, -0.040, -0.058, -0.076, -0.078)
 _LINE_EAR_M = (0.046, 0.048, 0.043, 0.022, -0.018, -0.052, -0.066, -0.068)
-_RECEDES = (0.0, 0.35, 1.0, 0.9, 0.35, 0, 0, 0, 0)  # share of `recession` at the first azimuths
+_RECEDES = (0.0, 0.35, 1.0, 1.0, 0.6, 0.3, 0.1, 0, 0)  # share of `recession` at the first azimuths
 _MEAN_FOREHEAD_M = 0.096
 _FACE_DEG = 50.0  # within this azimuth and below the fringe there is face
 _CHIN_M = -0.13
+_RAGGED_M = 0.002  # unrest of the hairline
 _ROWS_LEFT = 1e-4  # shortest step of a wisp, metres
 
 
 def draw_hair(head: HeadMesh, random: np.random.Generator) -> tuple[HeadMesh | None, HairStyle]:
-    """Draw a style and grow it on a head (none if bald), which may wear clothes: long hair falls over them."""
+    """Draw a style and grow it on a head, which may wear clothes: long hair falls over them."""
     style = draw_style(random)
     hair = grow_hair(head, style, random)
     return hair if len(hair.vertices) else None, style
@@ -49,7 +50,8 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     paths = wisps.grow(length)
     before = _before_face(paths, style)
     first = np.where(before.any(1), before.argmax(1), style.segments + 1)
-    length = length * np.where(first <= style.segments, np.maximum(first - 0.7, 0.3) / style.segments, 1)
+    last = np.maximum(first - 0.7, 0.3) / style.segments
+    length = length * np.where(before.any(1), last**style.crowding, 1)
     paths = wisps.grow(length)
     leader = _leaders(roots, style, random)
     paths = _clumped(paths, leader, style, random)
@@ -91,7 +93,8 @@ def _roots(
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     centre = corners.mean(1)
     margin = scalp_margin_m(centre, style)
-    chance = area * np.clip(margin / 0.007 + 0.25, 0, 1) ** 1.5
+    ragged = margin + random.normal(0, _RAGGED_M, len(margin))
+    chance = area * np.clip(ragged / 0.007 + 0.25, 0, 1) ** 1.5
     chance = chance * (1 - style.thinning * _bare_top(centre))
     if style.comb == "parted":  # all roots show there, so it takes more of them
         chance = chance * (1 + 3 * np.exp(-(((centre[:, 0] - style.parting_mm / 1000) / 0.008) ** 2)))
@@ -120,6 +123,11 @@ def _lengths(
     return length * edge * random.uniform(0.75, 1.08, len(roots)) / 1000
 
 
+def _shares(style: HairStyle) -> np.ndarray:
+    """How far along the wisp each of its rows lies [segments + 1]."""
+    return np.linspace(0, 1, style.segments + 1) ** style.crowding
+
+
 def _smoothstep(x: np.ndarray) -> np.ndarray:
     x = np.clip(x, 0, 1)
     return x * x * (3 - 2 * x)
@@ -146,9 +154,10 @@ class _Wisps:
         """Paths [W, segments + 1, 3] of wisps of these lengths [W]."""
         style, steps = self.style, self.style.segments
         points, rows = self.roots, [self.roots]
-        step = np.maximum(length_m / steps, _ROWS_LEFT)[:, None]
+        shares = _shares(style)
         for index in range(steps):
-            share = index / steps
+            share = shares[index]
+            step = np.maximum(length_m * (shares[index + 1] - share), _ROWS_LEFT)[:, None]
             normal = self.normals if index == 0 else self.hull.normals(points)
             held = 0.1 + 0.9 * _smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair just hangs
             held = np.where(length_m > 0.08, held, 1)
@@ -161,7 +170,7 @@ class _Wisps:
             way = way - (np.minimum(inward, 0) * touches)[:, None] * normal
             way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
             points = points + step * way
-            points = self._in_layer(points, (index + 1) / steps, length_m)
+            points = self._in_layer(points, shares[index + 1], length_m)
             rows.append(points)
         return np.stack(rows, 1)
 
@@ -227,7 +236,7 @@ def _clumped(
     paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: np.random.Generator
 ) -> np.ndarray:
     """Wisps drawn toward their clump's leader, the more the nearer the tip."""
-    share = np.linspace(0, 1, paths.shape[1])
+    share = _shares(style)
     pull = style.clump * random.uniform(0.3, 1, len(paths))[:, None] * share**0.8
     apart = paths[leader] - paths
     reach = np.linalg.norm(apart, axis=-1)
@@ -246,7 +255,7 @@ def _curled(
     """Each path wound into a helix about itself, with some of its own unrest."""
     along = _tangents(paths)
     across = np.cross(along, normals)
-    share = np.linspace(0, 1, paths.shape[1])
+    share = _shares(style)
     pace = random.uniform(0.8, 1.2, (len(paths), 1))[leader] / (style.wave_mm / 1000)
     turns = pace * length_m[:, None] * share
     begin = random.uniform(0, 2 * np.pi, (len(paths), 1))[leader]  # a clump curls in step
@@ -278,7 +287,7 @@ def _ribbons(
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
     roll = random.uniform(-1.0, 1.0, (wisps, 1, 1))
     across = np.cos(roll) * across + np.sin(roll) * np.cross(along, across)
-    share = np.linspace(0, 1, rows)
+    share = _shares(style)
     taper = np.minimum(1, 0.6 + 3 * share) * (1 - share**2.5 * (0.4 if style.comb == "out" else 0.8))
     half = 0.5 * style.width_mm / 1000 * random.uniform(0.6, 1.3, (wisps, 1)) * taper
     left, right = paths - half[..., None] * across, paths + half[..., None] * across

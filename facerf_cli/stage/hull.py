@@ -64,8 +64,9 @@ class Hull:
 def hull_of(head: HeadMesh, smooth_cells: float = 0.8) -> Hull:
     """The hull of a head's skin, and of the clothes where it wears some."""
     corners = head.vertices[head.triangles[np.isin(head.part[head.triangles[:, 0]], _outer())]].astype(float)
-    mixes = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, 1], [1, 0, 1], [1, 1, 1]])
-    points = np.concatenate([np.einsum("k,fkc->fc", mix / mix.sum(), corners) for mix in mixes])
+    coarse = corners[np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1) > _ARC_M]
+    sampled = [corners.mean(1), corners[:, 0], *(coarse[:, k] for k in (1, 2))]
+    points = np.concatenate([*sampled, *((coarse[:, k] + coarse[:, k - 1]) / 2 for k in range(3))])
     hull = Hull(_middle(points), np.zeros((1, _AZIMUTHS)))
     out, azimuth, arc = hull._coordinates(points)
     rows = int((np.pi / 2 * _RADIUS_M - _LOWEST_M) / _ARC_M) + 2

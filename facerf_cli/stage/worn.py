@@ -1,8 +1,8 @@
 """What a synthetic head wears besides hair: glasses, and a garment about neck and shoulders.
 
-Both are measured on the head itself. Glasses: rims before the eyes, as near as nose, brows and cheeks let them,
-a bridge over the nose, and temples along the head to the ears. Clothes: rings about the neck, lofted down and out
-to the shoulders, kept off the skin.
+Both are measured on the head itself. Glasses: rims before the eyes, as near as nose, brows and cheeks let
+them, a bridge over the nose, and temples along the head to the ears. Clothes: rings about the neck, lofted
+down and out to the shoulders, kept off the skin.
 """
 
 import numpy as np
@@ -23,6 +23,8 @@ _TUBE = 10  # vertices around a tube
 _AROUND = 144  # vertices around the neck
 _CUT_M = 0.16  # below the chin
 _OFF_SKIN_M = 0.004  # of cloth
+_BELOW_M = -0.06  # height under which cloth may touch skin
+_ASIDE_M = 0.008  # of cloth that still lies over a vertex of the skin
 
 
 def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Generator) -> HeadMesh:
@@ -128,7 +130,7 @@ def _settled(
     need = max(float((face.front(rim) + clear_m - rim[:, 2]).max()) for rim in rims)
     eyes = landmarks_m[np.arange(36, 48), 2].max() + 0.009  # room for the lashes
     need = max(need, eyes - float(np.mean([rim[:, 2].mean() for rim in rims])))
-    return [rim + [0, 0, need] for rim in rims]
+    return [rim + np.array([0, 0, need]) for rim in rims]
 
 
 def _upper(rim: np.ndarray) -> np.ndarray:
@@ -150,7 +152,7 @@ def _bridge(rims: list[np.ndarray], face: _Face, width: float, depth: float, lev
     path[:, 1] += 0.003 * arch
     path[:, 2] += 0.002 * arch
     path[:, 2] = np.maximum(path[:, 2], face.front(path) + depth + _GAP_M)
-    path[1:-1, 2] = (path[:-2, 2] + 2 * np.maximum(path[1:-1, 2], path[1:-1, 2]) + path[2:, 2]) / 4
+    path[1:-1, 2] = (path[:-2, 2] + 2 * path[1:-1, 2] + path[2:, 2]) / 4
     path[:, 2] += np.maximum(face.front(path) + depth + 0.5 * _GAP_M - path[:, 2], 0).max() * arch**0.25
     return _tube(path, np.array([0, 0, 1.0]), width, depth, closed=False)
 
@@ -181,7 +183,7 @@ def _temple(rim: np.ndarray, face: _Face, thick: float, high: float) -> HeadMesh
 
 
 def _tube(path: np.ndarray, up: np.ndarray, across_m: float, up_m: float, closed: bool) -> HeadMesh:
-    """A rounded bar along `path` [N, 3]: `across_m` and `up_m` are half its thickness aside of and along `up`."""
+    """A rounded bar along `path` [N, 3], half as thick as `up_m` along `up` and as `across_m` across it."""
     count = len(path)
     along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
@@ -214,13 +216,13 @@ def _tube(path: np.ndarray, up: np.ndarray, across_m: float, up_m: float, closed
 def draw_clothes(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
     """A garment from the neck to the shoulders, as part "cloth", for a bare head."""
     kind = str(random.choice(GARMENTS))
-    hull = hull_of(head)
+    hull, skin = hull_of(head), _Skin(head)
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     collar = _collar_line(kind, azimuth, _chin_m(head), random)
-    garment = _body(kind, hull, azimuth, collar, _chin_m(head) - _CUT_M, random)
+    garment = _body(kind, hull, skin, azimuth, collar, _chin_m(head) - _CUT_M, random)
     if kind != "shirt":
         return garment
-    return joined(garment, _lapels(hull, azimuth, collar, random))
+    return joined(garment, _lapels(hull, skin, azimuth, collar, random))
 
 
 def _chin_m(head: HeadMesh) -> float:
@@ -250,6 +252,7 @@ def _collar_line(kind: str, azimuth: np.ndarray, chin: float, random: np.random.
 def _body(
     kind: str,
     hull: Hull,
+    skin: "_Skin",
     azimuth: np.ndarray,
     collar: np.ndarray,
     bottom: float,
@@ -275,7 +278,7 @@ def _body(
     outline = (np.abs(np.sin(azimuth) / wide) ** 2.6 + np.abs(np.cos(azimuth) / deep) ** 2.6) ** (-1 / 2.6)
     outline = np.maximum(outline, start_radius + 0.012)
     aside = np.sin(azimuth) ** 2
-    fall = random.uniform(0.30, 0.45)  # of the shoulders, height by width
+    fall = random.uniform(0.24, 0.38)  # of the shoulders, height by width
     sloped = fall * (outline - start_radius) * aside
     drop = np.maximum(start - sloped - bottom, 0.02)
     for share in np.linspace(0, 1, 34)[1:]:
@@ -287,7 +290,7 @@ def _body(
     rings = np.stack([_ring(hull, azimuth, radius, level) for radius, level in rows])
     band_rows = len(rows) - 33
     rings[band_rows:] += _folds(rings[band_rows:], azimuth, random)
-    rings[3:] = _off_skin(rings[3:], hull)
+    rings[3:] = skin.lifted(rings[3:])
     return _loft("cloth", rings, closed=True)
 
 
@@ -321,18 +324,29 @@ def _ring_normals(rings: np.ndarray) -> np.ndarray:
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
-def _off_skin(rings: np.ndarray, hull: Hull) -> np.ndarray:
-    """Pushed along the skin's normals to where the hull is `_OFF_SKIN_M` away."""
-    for _ in range(8):
-        short = np.maximum(_OFF_SKIN_M - hull.height(rings), 0)
-        if not (short > 1e-5).any():
-            break
-        normal = hull.normals(rings)
-        rings = rings + (short * np.maximum((normal * hull.rays(rings)).sum(-1), 0.3))[..., None] * normal
-    return rings
+class _Skin:
+    """The skin of a head below its chin, which cloth must not come nearer to than `_OFF_SKIN_M`."""
+
+    def __init__(self, head: HeadMesh) -> None:
+        low = (head.part == PARTS.index("skin")) & (head.vertices[:, 1] < _BELOW_M)
+        self.points, self.normals = head.vertices[low].astype(float), head.normals[low].astype(float)
+        self._tree = cKDTree(self.points)
+
+    def lifted(self, rings: np.ndarray) -> np.ndarray:
+        """Rings [R, N, 3], moved along the normals of the skin that they come too near to."""
+        for _ in range(4):
+            distance, near = self._tree.query(rings)
+            facing = (self.normals[near] * _ring_normals(rings)).sum(-1) > 0
+            off = ((rings - self.points[near]) * self.normals[near]).sum(-1)
+            aside = np.sqrt(np.maximum(distance**2 - off**2, 0))  # far where the skin has ended
+            short = np.where(facing & (aside < _ASIDE_M), np.maximum(_OFF_SKIN_M - off, 0), 0)
+            rings = rings + short[..., None] * self.normals[near]
+        return rings
 
 
-def _lapels(hull: Hull, azimuth: np.ndarray, collar: np.ndarray, random: np.random.Generator) -> HeadMesh:
+def _lapels(
+    hull: Hull, skin: _Skin, azimuth: np.ndarray, collar: np.ndarray, random: np.random.Generator
+) -> HeadMesh:
     """A shirt's collar: a stand about the neck, folded over to two points before the throat."""
     gap = random.uniform(0.10, 0.3)
     around = np.linspace(gap, 2 * np.pi - gap, 120)
@@ -350,7 +364,7 @@ def _lapels(hull: Hull, azimuth: np.ndarray, collar: np.ndarray, random: np.rand
         radius = top_radius + 0.005 + 0.022 * share**1.2
         rows.append((radius, level))
     rings = np.stack([_ring(hull, around, radius, level) for radius, level in rows])
-    rings[4:] = _off_skin(rings[4:], hull)
+    rings[4:] = skin.lifted(rings[4:])
     return _loft("cloth", rings, closed=False)
 
 
