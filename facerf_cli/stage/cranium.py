@@ -63,7 +63,8 @@ def template(u: np.ndarray, level: np.ndarray) -> np.ndarray:
     0 at `TOP_M`, `CROWN_LEVEL` at the pole.
     """
     azimuth_deg = (u - 0.5) * 2 * HALF_ANGLE_DEG
-    across, y = (spline.ev(-level * (TOP_M - BOTTOM_M) * 1000, azimuth_deg) for spline in _profiles())
+    length = -level * (TOP_M - BOTTOM_M) * 1000
+    across, y = ((s.ev(length, azimuth_deg) + s.ev(length, -azimuth_deg)) / 2 for s in _profiles())
     azimuth = np.radians(azimuth_deg)
     return np.stack([across * np.sin(azimuth), y, across * np.cos(azimuth)], -1)
 

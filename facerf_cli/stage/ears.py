@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from facerf_cli.stage.eyeballs import capped
+
 # Outline in the ear's plane, millimetres: back from the canal, up; round from the front of the helix.
 _OUTLINE_MM = """
 -6 8 | -5 17 | -1 27 | 7 34.5 | 17 36 | 26 31 | 30.5 21 | 30.5 9 | 27 -3 | 21.5 -14 | 15.5 -22 | 8 -27 | 0 -26
@@ -36,8 +38,7 @@ def ear() -> tuple[np.ndarray, np.ndarray]:
     front = front - _SINK_MM * forward * _step(rho[:, None], 0.7, 1.0)
     back = back - _SINK_MM * forward
     sheet = np.concatenate([_placed(plane, front), _placed(plane, back)[-2::-1]])
-    rings = len(sheet)
-    return sheet.reshape(-1, 3), _triangles(rings)
+    return sheet.reshape(-1, 3), capped(len(sheet), _SPOKES)[:, ::-1]
 
 
 def hollow_mm(points: np.ndarray) -> np.ndarray:
@@ -66,10 +67,10 @@ def _relief(rho: np.ndarray, plane: np.ndarray) -> np.ndarray:
     antihelix = 2.6 * np.exp(-(((rho - 0.57) / 0.10) ** 2)) * _step(a, 2, 10) * (1 - lobe)
     bowl = -11.0 * np.exp(-((((a - 5.5) / 7.5) ** 2 + ((b + 0.5) / 10.0) ** 2) ** 1.6))
     crus = 4.0 * np.exp(-(((b - 5.5 - 0.25 * a) / 2.2) ** 2)) * _step(-a, -9, 2) * _step(a, -9, -2)
-    fossa = -2.0 * np.exp(-((((a - 11) / 6) ** 2 + ((b - 22) / 6) ** 2)))
+    fossa = -2.0 * np.exp(-(((a - 11) / 6) ** 2 + ((b - 22) / 6) ** 2))
     tragus = 6.5 * np.exp(-((((a + 4.0) / 3.2) ** 2 + ((b + 2.0) / 6.0) ** 2) ** 1.5))
-    antitragus = 2.6 * np.exp(-((((a - 6) / 4.5) ** 2 + ((b + 13) / 2.8) ** 2)))
-    plump = 1.5 * np.exp(-((((a - 6) / 9) ** 2 + ((b + 21) / 6) ** 2)))
+    antitragus = 2.6 * np.exp(-(((a - 6) / 4.5) ** 2 + ((b + 13) / 2.8) ** 2))
+    plump = 1.5 * np.exp(-(((a - 6) / 9) ** 2 + ((b + 21) / 6) ** 2))
     turned = -2.6 * np.clip((rho - 0.9) / 0.1, 0, 1) ** 2
     bend = -_BEND_MM * ((b - 6) / 30) ** 2
     return bend + helix + scapha + antihelix + bowl + crus + fossa + tragus + antitragus + plump + turned
@@ -86,17 +87,6 @@ def _placed(plane: np.ndarray, height: np.ndarray) -> np.ndarray:
     up = up * np.cos(lean) + normal * np.sin(lean)
     normal = np.cross(up, back) * -1
     return plane[..., :1] * back + plane[..., 1:] * up + height[..., None] * normal
-
-
-def _triangles(rings: int) -> np.ndarray:
-    ring, spoke = np.meshgrid(np.arange(rings - 1), np.arange(_SPOKES), indexing="ij")
-    a, b = ring * _SPOKES + spoke, ring * _SPOKES + (spoke + 1) % _SPOKES
-    c, d = a + _SPOKES, b + _SPOKES
-    faces = np.stack([a, d, c, a, b, d], -1).reshape(-1, 3)
-    last = (rings - 1) * _SPOKES
-    faces = np.where(faces < _SPOKES, 0, np.where(faces >= last, last, faces))
-    i, j, k = faces.T
-    return faces[(i != j) & (j != k) & (k != i)]
 
 
 def _step(value: np.ndarray, start: float, end: float) -> np.ndarray:

@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from facerf_cli.stage.openings import outline
-
 RADIUS_MM = 12.0
 _CORNEA_RISE_MM, _CORNEA_HALF_DEG = 0.9, 30.0
 _LID_MM = 1.5  # from the ball to the lid's outer edge
 _CLEARANCE_MM = 0.5  # of skin before the ball, at least; the cornea needs more
-_PRIOR_MM = 4.0  # how much the lids' shape may move the ball against its usual place
+_PRIOR_MM = np.array([4.0, 4.0, 8.0])  # by how much the lids' shape may move the ball from its usual place
+_ITERATIONS = 8
 _USUAL_MM = np.array([0.0, 1.0, -9.0])  # centre from the middle between the lids' corners
 _RINGS, _SEGMENTS = np.array([0, 2, *range(4, 92, 3), 96, 103, 112, 125, 140, 160, 180.0]), 64
 
@@ -24,16 +23,14 @@ def fitted_centre(margin: np.ndarray, skin: np.ndarray) -> np.ndarray:
     share = (margin - corners[0]) @ along / (along @ along)
     middle = margin[(share > 0.2) & (share < 0.8)]
     centre = usual.copy()
-    for _ in range(8):
+    for _ in range(_ITERATIONS):
         offset = centre - middle
         distance = np.linalg.norm(offset, axis=-1)
         slope = offset / distance[:, None]
-        residual = distance - RADIUS_MM - _LID_MM
-        weight = len(middle) * (1 / _PRIOR_MM) ** 2
-        system = slope.T @ slope + weight * np.diag([4.0, 4, 1]) * 0.25
-        step = slope.T @ residual + weight * np.array([4.0, 4, 1]) * 0.25 * (centre - usual)
-        centre = centre - np.linalg.solve(system, step)
-    for _ in range(20):
+        trust = len(middle) / _PRIOR_MM**2
+        step = slope.T @ (distance - RADIUS_MM - _LID_MM) + trust * (centre - usual)
+        centre = centre - np.linalg.solve(slope.T @ slope + np.diag(trust), step)
+    for _ in range(_ITERATIONS):
         depth = RADIUS_MM + _CLEARANCE_MM - np.linalg.norm(skin - centre, axis=-1)
         if depth.max() <= 0:
             break
@@ -41,19 +38,15 @@ def fitted_centre(margin: np.ndarray, skin: np.ndarray) -> np.ndarray:
     return centre
 
 
-def margin_uv(name: str) -> np.ndarray:
-    """(u, v) [N, 2] of the lids' margin, from one corner over the upper lid to the other and back."""
-    return outline(name)
-
-
 def eyeball(centre: np.ndarray, gaze_deg: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices [V, 3] in millimetres, triangles [F, 3] and uv [V, 2] of a ball that looks along the gaze."""
     angle, turn = np.meshgrid(np.radians(_RINGS), np.arange(_SEGMENTS) / _SEGMENTS * 2 * np.pi, indexing="ij")
     share = np.clip(angle / np.radians(_CORNEA_HALF_DEG), 0, 1)
     radius = RADIUS_MM + _CORNEA_RISE_MM * (1 - share**2) ** 2
-    local = np.stack(
-        [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1
-    ) * radius[..., None]
+    local = (
+        np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], -1)
+        * radius[..., None]
+    )
     azimuth, elevation = np.radians(gaze_deg)
     forward = np.array(
         [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
@@ -63,12 +56,14 @@ def eyeball(centre: np.ndarray, gaze_deg: tuple[float, float]) -> tuple[np.ndarr
     vertices = centre + local.reshape(-1, 3) @ np.stack([side, up, forward])
     reach = np.minimum(angle / (np.pi / 2), 1)
     uv = 0.5 + 0.5 * np.stack([reach * np.cos(turn), -reach * np.sin(turn)], -1).reshape(-1, 2)
-    return (*_one_pole(vertices, ring_triangles(len(_RINGS), _SEGMENTS)), uv)
+    return vertices, capped(len(_RINGS), _SEGMENTS), uv
 
 
 def ring_triangles(rings: int, segments: int) -> np.ndarray:
-    """Triangles [F, 3] between rings that are closed in themselves, rings going away from the viewer and
-    segments counter-clockwise as he sees them: counter-clockwise for him too."""
+    """Triangles [F, 3] between closed rings of vertices.
+
+    They are counter-clockwise for a viewer who sees each ring so, and the next ring behind and around it.
+    """
     ring, segment = np.meshgrid(np.arange(rings - 1), np.arange(segments), indexing="ij")
     a = ring * segments + segment
     b = ring * segments + (segment + 1) % segments
@@ -76,11 +71,10 @@ def ring_triangles(rings: int, segments: int) -> np.ndarray:
     return np.stack([a, c, d, a, d, b], -1).reshape(-1, 3)
 
 
-def _one_pole(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first and the last ring's vertices, which coincide, taken for one."""
-    last = len(vertices) - _SEGMENTS
-    merged = triangles.copy()
-    merged[triangles < _SEGMENTS] = 0
-    merged[triangles >= last] = last
-    a, b, c = merged.T
-    return vertices, merged[(a != b) & (b != c) & (c != a)]
+def capped(rings: int, segments: int) -> np.ndarray:
+    """`ring_triangles` where the first and the last ring are one point each, of which one vertex is used."""
+    faces = ring_triangles(rings, segments)
+    last = (rings - 1) * segments
+    faces = np.where(faces < segments, 0, np.where(faces >= last, last, faces))
+    a, b, c = faces.T
+    return faces[(a != b) & (b != c) & (c != a)]

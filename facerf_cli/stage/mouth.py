@@ -7,7 +7,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.stage.eyeballs import ring_triangles
+from facerf_cli.stage.eyeballs import capped, ring_triangles
 
 # From the rim back: how far behind it, and how much wider and taller than it, in millimetres.
 _BAG_MM = ((0, 0, 0), (1.5, 0.2, 2), (4, 0.2, 5), (9, 0, 8), (18, -1, 10), (28, -5, 9), (38, -11, 4))
@@ -56,7 +56,7 @@ def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.nda
     """Both rows behind the lips' rim [N, 3]: vertices [V, 3] in millimetres, triangles [F, 3], uv [V, 2]."""
     rows = [_row(_UPPER_WIDTHS_MM, _UPPER_HEIGHTS_MM, 1.0), _row(_LOWER_WIDTHS_MM, _LOWER_HEIGHTS_MM, -1.0)]
     placed = [place(row) for place, row in zip(_places(landmarks_mm, rim), rows, strict=True)]
-    one = _capped(_TOOTH_RINGS, _TOOTH_SEGMENTS)
+    one = capped(_TOOTH_RINGS, _TOOTH_SEGMENTS)
     count = _TOOTH_RINGS * _TOOTH_SEGMENTS
     number = 2 * 2 * len(_UPPER_WIDTHS_MM)
     triangles = (one + count * np.arange(number)[:, None, None]).reshape(-1, 3)
@@ -68,21 +68,28 @@ def gums_and_tongue(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """The ridges that the teeth stand in, and the tongue behind the lower ones, each as `teeth`."""
     upper, lower = _places(landmarks_mm, rim)
-    triangles, uv = _capped(_GUM_RINGS, _GUM_SEGMENTS), _ring_uv(_GUM_RINGS, _GUM_SEGMENTS)
+    triangles, uv = capped(_GUM_RINGS, _GUM_SEGMENTS), _ring_uv(_GUM_RINGS, _GUM_SEGMENTS)
     gums = [(upper(_ridge(1.0)), triangles[:, ::-1], uv), (lower(_ridge(-1.0)), triangles, uv)]
-    angle, turn = np.meshgrid(np.linspace(0, np.pi, _GUM_RINGS), np.arange(_GUM_SEGMENTS) / _GUM_SEGMENTS, indexing="ij")
+    angle, turn = np.meshgrid(
+        np.linspace(0, np.pi, _GUM_RINGS), np.arange(_GUM_SEGMENTS) / _GUM_SEGMENTS, indexing="ij"
+    )
     around = 2 * np.pi * turn
     ball = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1)
     tongue = ball.reshape(-1, 3) * _TONGUE_HALF_MM
-    tongue[:, 1] -= 0.012 * (tongue[:, 2] - _TONGUE_HALF_MM[2] * 0.2) ** 2 * (tongue[:, 2] > 0.2 * _TONGUE_HALF_MM[2])
-    tongue[:, 1] -= 1.6 * np.exp(-((tongue[:, 0] / 3.0) ** 2)) * (tongue[:, 1] > 0)
+    tongue[:, 1] -= (
+        0.012 * (tongue[:, 2] - _TONGUE_HALF_MM[2] * 0.2) ** 2 * (tongue[:, 2] > 0.2 * _TONGUE_HALF_MM[2])
+    )
+    tongue[:, 1] -= 1.6 * np.exp(-((tongue[:, 0] / 3.0) ** 2)) * (tongue[:, 1] > 1e-6)
     return [*gums, (lower(tongue + _TONGUE_MM), triangles, uv)]
 
 
 def _places(
     landmarks_mm: np.ndarray, rim: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]:
-    """What carries points [V, 3] from the upper and the lower row's own frame (the incisors' edge) into the mouth."""
+    """What carries points [V, 3] from the upper and the lower row's own frame into the mouth.
+
+    A row's origin is the middle of its incisors' edge.
+    """
     scale, turn, shift = _skull(landmarks_mm)
     drop = _jaw(landmarks_mm, scale, turn, shift)
     above = rim[:, 1] > rim[:, 1].mean()
@@ -94,8 +101,12 @@ def _places(
         closed = points * [0.94, 1, 0.94] + _EDGE_MM + [0, _OVERLAP_MM, -_OVERJET_MM]
         return drop(closed) @ turn.T * scale + shift
 
-    backs = [_too_near(place(np.zeros((1, 3))), lip) for place, lip in ((upper, rim[above]), (lower, rim[~above]))]
-    return (lambda points: upper(points) - [0, 0, backs[0]]), (lambda points: lower(points) - [0, 0, backs[1]])
+    backs = [
+        _too_near(place(np.zeros((1, 3))), lip) for place, lip in ((upper, rim[above]), (lower, rim[~above]))
+    ]
+    return (lambda points: upper(points) - [0, 0, backs[0]]), (
+        lambda points: lower(points) - [0, 0, backs[1]]
+    )
 
 
 def _skull(landmarks_mm: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -162,8 +173,8 @@ def _row(widths: tuple[float, ...], heights: tuple[float, ...], up: float) -> np
         tangent = curve(centre, 1)
         angle = np.arctan2(-tangent[1], tangent[0])
         tooth = _tooth(width, height, 6.0 if centre < 20 else 9.0) * [1, up, 1]
-        rotated = Rotation.from_rotvec([0, angle, 0]).apply(tooth) + [x, 0, z]
-        sides.append(rotated)
+        turned = Rotation.from_rotvec([0, angle, 0]).apply(tooth)
+        sides.append(turned + np.array([x, 0, z]))
     right = np.concatenate(sides)
     mirrored = right.reshape(-1, _TOOTH_RINGS, _TOOTH_SEGMENTS, 3) * [-1, 1, 1]
     if up < 0:
@@ -187,15 +198,6 @@ def _tooth(width: float, height: float, depth: float) -> np.ndarray:
     front = -depth / 2 * thin[:, None] - 0.5 * (1 - bulge)[:, None]
     y = np.broadcast_to((height * (1 - np.cos(np.pi * level)) / 2)[:, None], x.shape)
     return np.stack([x, y, z + front], -1).reshape(-1, 3)
-
-
-def _capped(rings: int, segments: int) -> np.ndarray:
-    """Triangles of a closed tube whose first and last rings are points each."""
-    faces = ring_triangles(rings, segments)
-    last = (rings - 1) * segments
-    faces = np.where(faces < segments, 0, np.where(faces >= last, last, faces))
-    i, j, k = faces.T
-    return faces[(i != j) & (j != k) & (k != i)]
 
 
 def _ring_uv(rings: int, segments: int) -> np.ndarray:

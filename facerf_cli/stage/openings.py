@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline, RBFInterpolator
+from scipy.interpolate import CubicSpline
+from scipy.spatial.distance import cdist
 
 from facerf_cli.face.regions import CHART_MM
 from facerf_cli.face.topology import LANDMARK_UV, grid_uv
@@ -25,8 +26,10 @@ _SMOOTHING = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """uv [N, 2] as (u, level); triangles [F, 3]; the rim of each cut opening as vertex ids in order; `same` [N]
-    names the vertex that stands for each place (the two sides of the seam are one place)."""
+    """Samples [N, 2] as (u, level), triangles [F, 3], and each cut opening's rim as vertex ids in order.
+
+    `same` [N] names the vertex that stands for each place: the two sides of the seam are one place.
+    """
 
     u_level: np.ndarray
     triangles: np.ndarray
@@ -96,8 +99,8 @@ class Lip:
 def lips(name: str) -> tuple[Lip, Lip]:
     """The two sides of an opening, as if each went on into it.
 
-    The chart drops from the lid to the eyeball, and from lip to lip, within a cell or two, which a fine sample
-    of the rim would see.
+    The chart drops from the lid to the eyeball, and from lip to lip, within a cell or two, which a fine
+    sample of the rim would see.
     """
     points, line = grid_uv().double().numpy() * CHART_MM, outline(name) * CHART_MM
     signed, _ = _signed(points, line)
@@ -111,9 +114,24 @@ def lips(name: str) -> tuple[Lip, Lip]:
         opening = (signed > -_BLURRED_MM) | (~own & between & (signed > -_SIDE_MM) & ~at_corner)
         sources = np.flatnonzero(~opening & (signed > -_SOURCE_MM) & (own | at_corner))
         replaced = np.flatnonzero(opening)
-        field = RBFInterpolator(points[sources], np.eye(len(sources)), smoothing=_SMOOTHING)
-        sides.append(Lip(name, upper, replaced, sources, field(points[replaced])))
+        weights = _thin_plate(points[sources], points[replaced])
+        sides.append(Lip(name, upper, replaced, sources, weights))
     return sides[0], sides[1]
+
+
+def _thin_plate(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Weights [M, N] that carry values at `known` [N, 2] on to `wanted` [M, 2]."""
+
+    def rows(points: np.ndarray) -> np.ndarray:
+        squared = cdist(points, known, "sqeuclidean")
+        plate = 0.5 * squared * np.log(np.maximum(squared, 1e-12))
+        return np.concatenate([plate, np.ones((len(points), 1)), points - known.mean(0)], 1)
+
+    system = np.zeros((len(known) + 3,) * 2)
+    system[: len(known)] = rows(known)
+    system[len(known) :, : len(known)] = system[: len(known), len(known) :].T
+    system[np.arange(len(known)), np.arange(len(known))] += _SMOOTHING
+    return np.linalg.solve(system.T, rows(wanted).T).T[:, : len(known)]
 
 
 def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
@@ -224,7 +242,9 @@ def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     """Samples beside the rim evened out, so that none of their triangles stays squeezed."""
-    edges = np.unique(np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), -1), axis=0)
+    edges = np.unique(
+        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), -1), axis=0
+    )
     count = np.bincount(edges.ravel(), minlength=len(points))
     distance = np.abs(_signed(points, polygon)[0])
     free = (side < 0) & (distance < _RELAXED_MM)
@@ -239,7 +259,7 @@ def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: n
 
 
 def _rim(inner: np.ndarray) -> np.ndarray:
-    """The border of the triangles that were cut out, as vertex ids in order, counter-clockwise from outside."""
+    """The border of the triangles that were cut out, in order, counter-clockwise from outside."""
     edges = np.concatenate([inner[:, [0, 1]], inner[:, [1, 2]], inner[:, [2, 0]]])
     pairs = {(int(a), int(b)) for a, b in edges}
     onward = {a: b for a, b in pairs if (b, a) not in pairs}

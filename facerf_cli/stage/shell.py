@@ -21,7 +21,8 @@ from facerf_cli.stage.openings import Sheet, lips, outline, skin_sheet
 _EYES = {"eye_left": (36, 39, ((37, 41), (38, 40))), "eye_right": (42, 45, ((43, 47), (44, 46)))}
 _LIPS = ((61, 67), (62, 66), (63, 65))
 _SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
-_AROUND_EYE_MM = 9.0
+_OVERSHUT_LIDS_MM = 0.5  # a lid drawn further over the other one is cut free of it, or it would fold
+_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0
 _EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
 _EAR_OUT_MM = 1.5
 _LID_RIM = ((0.0, 0.25, 0.25), (0.25, 0.6, 0.55))  # toward the ball (share), inward and down (mm)
@@ -63,7 +64,9 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
             parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, rings[-1])]
             parts.append(_part("teeth", *mouth.teeth(landmarks_mm, rings[-1])))
     parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
-    head = _part("skin", np.concatenate(skin), np.concatenate(triangles), np.concatenate(uv), np.concatenate(same))
+    head = _part(
+        "skin", np.concatenate(skin), np.concatenate(triangles), np.concatenate(uv), np.concatenate(same)
+    )
     return joined(head, *parts)
 
 
@@ -73,7 +76,7 @@ def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
         name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
         for name, (_, _, pairs) in _EYES.items()
     }
-    found = [name for name, gap in gaps.items() if gap > _SHUT_LIDS_MM]
+    found = [name for name, gap in gaps.items() if not -_OVERSHUT_LIDS_MM < gap <= _SHUT_LIDS_MM]
     parted = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
     return (*found, "mouth") if parted > _SHUT_LIPS_MM else tuple(found)
 
@@ -105,7 +108,8 @@ def _surroundings(subdivisions: int) -> Surroundings:
 
 
 def _on_chart(u_level: np.ndarray) -> np.ndarray:
-    return ((u_level >= 0) & (u_level <= 1)).all(-1)
+    inside: np.ndarray = (u_level >= 0) & (u_level <= 1)
+    return inside[:, 0] & inside[:, 1]
 
 
 @cache
@@ -162,9 +166,7 @@ def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
     ids = np.concatenate([rim[None], first + np.arange(rings * count).reshape(rings, count)])
     a, b = ids[:-1], np.roll(ids[:-1], -1, 1)
     c, d = ids[1:], np.roll(ids[1:], -1, 1)
-    return np.concatenate(
-        [np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)]
-    )
+    return np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
 
 
 def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
@@ -177,8 +179,10 @@ def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
 
 def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
     """The skin drawn in behind the ear's bowl."""
-    depth = ears.hollow_mm((skin_mm - root) * [side, 1, 1])
-    return skin_mm - depth[:, None] * [side, 0, 0]
+    near = np.flatnonzero((np.abs(skin_mm - root) < _AROUND_EAR_MM).all(-1))
+    drawn = skin_mm.copy()
+    drawn[near, 0] -= side * ears.hollow_mm((skin_mm[near] - root) * [side, 1, 1])
+    return drawn
 
 
 def _ear(root: np.ndarray, side: float) -> HeadMesh:
@@ -194,16 +198,17 @@ def _part(
     name: str, vertices_mm: np.ndarray, triangles: np.ndarray, uv: np.ndarray, same: np.ndarray | None = None
 ) -> HeadMesh:
     """A piece of mesh of one part, without vertices that no triangle uses."""
-    used, packed = np.unique(triangles, return_inverse=True)
+    used = np.zeros(len(vertices_mm), bool)
+    used[triangles] = True
     stands = np.arange(len(vertices_mm)) if same is None else same
     normals = _normals(vertices_mm, triangles, stands)[used]
     return HeadMesh(
         vertices=(vertices_mm[used] / 1000).astype(np.float32),
         normals=normals.astype(np.float32),
-        triangles=packed.reshape(-1, 3).astype(np.int64),
-        part=np.full(len(used), PARTS.index(name), np.uint8),
+        triangles=(np.cumsum(used) - 1)[triangles],
+        part=np.full(len(normals), PARTS.index(name), np.uint8),
         uv=uv[used].astype(np.float32),
-        tangents=np.zeros((len(used), 3), np.float32),
+        tangents=np.zeros((len(normals), 3), np.float32),
     )
 
 
