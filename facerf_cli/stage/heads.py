@@ -25,6 +25,7 @@ _LID_GAP_M, _LID_REACH_M = (
     0.0002,
     0.0008,
 )  # lids stay this far off the ball; those nearer than the reach yield
+_SLIDE_UV = 0.03  # a vertex's shift in the texture by subdivision; more is a seam
 _SKIN, _EYE, _MOUTH = (HEAD_PARTS.index(name) for name in ("skin", "eye", "mouth"))
 
 
@@ -169,9 +170,12 @@ def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
         fine = (owner == _SKIN) | (owner == _EYE)
         step, divided = _loop(triangles[fine], refine.shape[0])
         refine = step @ refine
+        flat_uv = np.zeros((step.shape[1], 2))
+        flat_uv[triangles.reshape(-1)] = uv.reshape(-1, 2)
         triangles = np.concatenate([divided, triangles[~fine]])
         owner = np.concatenate([np.repeat(owner[fine], 4), owner[~fine]])
-        uv = np.concatenate([_quartered(uv[fine]), uv[~fine]])
+        divided_uv = _quartered(uv[fine]) + _slide(step, flat_uv, divided, _quartered(uv[fine]))
+        uv = np.concatenate([divided_uv, uv[~fine]])
     eyes = _eyes(head, triangles[owner == _EYE], refine)
     source, split, kinds, flat = _cut(triangles, owner, uv)
     parts = np.array([PARTS.index(name) for name in HEAD_PARTS], np.uint8)
@@ -241,6 +245,16 @@ def _quartered(uv: np.ndarray) -> np.ndarray:
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1)
     return corners.reshape(-1, 3, 2)
+
+
+def _slide(step: csr_matrix, flat_uv: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """How far subdivision moves corners [F, 3, 2] in the texture, as it moves the vertices on the surface.
+
+    Where neighbours lie on both sides of the seam at the back (or around an eyeball's back), it is zero.
+    """
+    moved = (step @ flat_uv)[triangles] - uv
+    moved[..., 0] -= _TURN * np.round(moved[..., 0] / _TURN)
+    return np.where(np.abs(moved).max(-1, keepdims=True) < _SLIDE_UV, moved, 0.0)
 
 
 def _loop(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
