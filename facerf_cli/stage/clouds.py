@@ -37,8 +37,8 @@ class Layer:
 def draw_layers(random: Random) -> list[Layer]:
     """No cloud, a veil, cumulus, or both, as the draw has it."""
     layers = []
-    if random.random() < 0.55:
-        tile, cover = noise_tile(random, 1.9, 3), random.uniform(0.05, 0.7)
+    if random.random() < 0.5:
+        tile, cover = noise_tile(random, 1.9, 3), random.uniform(0.05, 0.65)
         threshold = float(np.quantile(tile, 1 - cover))
         size_km = random.uniform(8, 25)
         layers.append(

@@ -52,8 +52,8 @@ def draw_land(random: Random, houses: float = 0.45) -> Land:
         lines.append(_houses(random))
     if random.random() < 0.2:
         lines.append(replace(_trees(random), haze=0.0))
-    patches_m, grain = float(np.exp(random.uniform(1, 4.5))), random.uniform(0.05, 0.35)
-    dark = np.exp(random.uniform(-1.0, 0.2))
+    patches_m, grain = float(np.exp(random.uniform(1, 4.5))), random.uniform(0.05, 0.45)
+    dark = np.exp(random.uniform(-1.3, 0.15))
     return Land(pair * dark, noise_tile(random, 1.5, 2), patches_m, grain, tuple(lines))
 
 
@@ -125,7 +125,9 @@ def _ground(grid: Grid, land: Land, level: np.ndarray) -> np.ndarray:
     sharp = np.exp(-_EYE_M / down * grid.pixel_rad / 0.15)  # far ground is seen as its mean
     near = np.clip((down - 0.01) / 0.2, 0, 1)
     patches = np.clip(0.5 + 0.7 * near * look_up(land.tile, x / land.patches_m, z / land.patches_m), 0, 1)
-    grain = np.exp(land.grain * sharp * look_up(land.tile, x / 1.7, z / 1.7) * 0.7)
+    rough = look_up(land.tile, x / 1.7, z / 1.7)
+    rough = rough - 1.5 * np.clip(-0.7 - rough, 0, None)  # hollows are in shadow
+    grain = np.exp(0.7 * land.grain * sharp * rough)
     mixed = land.ground[0] + (land.ground[1] - land.ground[0]) * patches[..., None]
     radiance = np.zeros(grid.directions.shape)
     radiance[half:] = mixed * grain[..., None] * np.broadcast_to(level, radiance.shape)[half:]
@@ -150,7 +152,8 @@ def _before(
     if line.windows:
         panes = (np.sin(u * 2 * np.pi * 32) > 0.1) & (np.sin(v * 2 * np.pi * 36) > 0.0)
         texture = np.where(panes, 0.35, texture)
-    albedo = around(grid, line.albedo)
+    foot = np.clip(elevation[band] / np.maximum(tops, 1e-3), 0, 1)
+    albedo = around(grid, line.albedo) * (0.3 + 0.7 * foot)[..., None]  # less light reaches what is low
     own = texture[..., None] * albedo * level * (1 - line.haze) + line.haze * horizon
     result = scene.copy()
     result[band] += share[band, :, None] * (own - scene[band])

@@ -25,7 +25,7 @@ def sun(grid: Grid, random: Random) -> np.ndarray:
     beam = beam * share * sun_is_seen(land, azimuth_deg, elevation_deg)
     lit = stand_under(grid, sky, land, centre, beam)
     lit = lit + paint(disc(grid, centre, SUN_RADIUS_DEG), beam / SUN_SR)
-    return np.asarray(lit * np.array([0.88, 1.0, 1.2]) ** random.uniform(0, 1.3))  # a camera's daylight white
+    return np.asarray(lit * np.array([0.88, 1.0, 1.2]) ** random.uniform(0, 2.2))  # a camera's daylight white
 
 
 def dusk(grid: Grid, random: Random) -> np.ndarray:
@@ -38,11 +38,11 @@ def dusk(grid: Grid, random: Random) -> np.ndarray:
     height = np.clip(grid.directions[..., 1], 0, 1)
     beside = 0.5 + 0.5 * np.cos(grid.azimuths_rad - np.radians(azimuth_deg))
     zenith_rgb = np.array([random.uniform(0.35, 0.85), 0.6, random.uniform(0.9, 1.4)])
-    belt_rgb = np.array([1.0, 0.75, 0.95]) ** random.uniform(0, 2.5)
-    glow_rgb = np.array([1.0, random.uniform(0.25, 0.55), random.uniform(0.05, 0.3)])
-    glow = np.exp(random.uniform(0.5, 3.3)) * beside ** random.uniform(2, 20)
+    belt_rgb = np.array([1.0, 0.75, 0.95]) ** random.uniform(0, 1.7)
+    glow_rgb = np.array([1.0, random.uniform(0.2, 0.55), random.uniform(0.03, 0.3)])
+    glow = np.exp(random.uniform(1.3, 4.0)) * beside ** random.uniform(2, 20)
     belt = np.exp(-height / random.uniform(0.1, 0.4))
-    low = np.exp(-height / random.uniform(0.06, 0.25))
+    low = np.exp(-height / random.uniform(0.05, 0.2))
     wide = (0.35 + 0.65 * beside) * (1 - 0.6 * height)
     sky = paint(wide * (1 - 0.6 * belt), zenith_rgb) + paint(wide * belt, belt_rgb)
     sky += paint(glow * low, glow_rgb)

@@ -18,8 +18,8 @@ _PEAK = 60000.0  # what half floats hold, with room
 KINDS: dict[str, Callable[[Grid, Random], np.ndarray]] = {
     kind.__name__: kind for kind in (sun, dusk, overcast, windows, hall, studio, night, stage)
 }
-# How often each is drawn, were there fifteen maps.
-MIX = (*3 * ("sun",), *2 * ("dusk", "overcast", "windows", "hall", "studio"), "night", "stage")
+# How often each is drawn, were there sixteen maps.
+MIX = (*4 * ("sun",), *2 * ("dusk", "overcast", "windows", "hall", "studio"), "night", "stage")
 
 
 def kind_of(index: int, seed: int, kinds: Sequence[str] = MIX) -> str:

@@ -18,6 +18,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.raster.texture import normal_map
+from facerf_cli.stage.skies import kind_of
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 WIDTHS = (4, 8, 8)
@@ -216,3 +217,12 @@ def test_wrong_usage(
 def test_an_output_folder_that_cannot_be(given: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert relight(given, tmp_path / "file/out", "--light", "0,0") == 2
+
+
+def test_procedural_maps_by_seed(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"astronaut_{index:05d}_{kind_of(index, 4)}" for index in range(2)]
+    assert relight(given, tmp_path, "--envmap", "procedural:2", "--seed", "4", "--composite", "face") == 0
+    assert made(tmp_path) == [name + suffix for name in names for suffix in (".exr", ".png")]
+    assert read_image(tmp_path / f"{names[0]}.exr").pixels.max() > 0
+    assert relight(given, tmp_path, "--envmap", "procedural:none") == 2
+    assert "write procedural:N" in capsys.readouterr().err

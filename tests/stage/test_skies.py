@@ -4,8 +4,8 @@ import pytest
 from facerf_cli.errors import UsageError
 from facerf_cli.stage.clouds import Layer, cover
 from facerf_cli.stage.daylight import SUN_RADIUS_DEG
-from facerf_cli.stage.interiors import Lights, draw_room
 from facerf_cli.stage.landscape import Land, Skyline, stand_under, sun_is_seen
+from facerf_cli.stage.rooms import Lights, draw_room
 from facerf_cli.stage.skies import KINDS, MIX, draw_sky, kind_of, parse_envmaps
 from facerf_cli.stage.sky_grid import (
     Rectangle,
