@@ -36,10 +36,16 @@ def test_the_same_seed_draws_the_same_person(people: list[Appearance]) -> None:
     assert again.traits == people[0].traits
     assert torch.equal(again.materials["skin"].albedo, people[0].materials["skin"].albedo)
     assert people[1].traits != people[0].traits
-    finer = draw_appearance(2 * SIDE, torch.Generator().manual_seed(1))
-    assert finer.traits == people[0].traits  # the side changes how fine, not who
-    small, large = (person.materials["skin"].albedo.mean((1, 2)) for person in (people[0], finer))
-    assert torch.allclose(small, large, rtol=0.1)
+
+
+def test_the_side_changes_how_fine_and_not_who() -> None:
+    for seed in range(3):
+        coarse, fine = (draw_appearance(side, torch.Generator().manual_seed(seed)) for side in (96, 192))
+        assert coarse.traits == fine.traits
+        assert torch.equal(coarse.materials["eye"].albedo, fine.materials["eye"].albedo)
+        if not coarse.traits["random_texture"]:
+            means = [person.materials["skin"].albedo.mean((1, 2)) for person in (coarse, fine)]
+            assert torch.allclose(*means, rtol=0.1)
 
 
 def test_traits_name_the_physical_parameters(people: list[Appearance]) -> None:
@@ -91,10 +97,11 @@ def test_hair_is_lighter_at_its_tips_and_dark_people_have_dark_eyes() -> None:
     for _ in range(24):
         person = draw_appearance(16, generator)
         hair = person.materials["hair"].albedo.mean((0, 2))
-        tips.append(float(hair[-4:].mean() / hair[:4].mean()))
+        if float(person.traits["grey"]) < 0.3 and person.traits["hair_colour"] != "black":
+            tips.append(float(hair[-4:].mean() / hair[:4].mean()))
         if float(person.traits["melanin"]) > 0.035:
             irises.append(person.traits["iris"])
-    assert sum(ratio > 1 for ratio in tips) >= 20
+    assert len(tips) > 3 and min(tips) > 1
     assert irises and set(irises) == {"brown"}
 
 
