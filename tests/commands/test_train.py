@@ -40,3 +40,21 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
     assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
     assert f"{start}: its weights do not fit" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("options", [["--heads", "20"], ["--bank", "bank"], ["--heads-from", "builtin"]])
+def test_a_dataset_and_heads_exclude_each_other(
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "--dataset", str(tmp_path), "-o", str(tmp_path / "run"), *options]) == 2
+    assert capsys.readouterr().err.strip().splitlines() == [
+        f"facerf: error: {options[0]} is for synthetic heads, and --dataset takes their place; "
+        "give one of them"
+    ]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--dataset", str(tmp_path), "-o", str(tmp_path / "run")]) == 1
+    assert f"{tmp_path}/dataset.json: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
