@@ -113,7 +113,9 @@ class Surroundings:
         known = template(*uv[self._rings].T)
         self._known, self._wanted = known, template(*u_level.T)
         covariance = _kernel(known, known) + 1e-7 * np.eye(len(known))
-        self._carry = np.linalg.solve(covariance, _kernel(known, self._wanted)).T.astype(np.float32)
+        inverse = np.linalg.inv(covariance)
+        chunks = np.array_split(self._wanted, 16)
+        self._carry = np.concatenate([(_kernel(c, known) @ inverse).astype(np.float32) for c in chunks])
 
     def positions(self, vertices_mm: np.ndarray) -> np.ndarray:
         """The surface [N, 3] in millimetres that goes on from the chart's `vertices_mm` [V, 3]."""
