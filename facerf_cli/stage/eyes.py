@@ -1,13 +1,14 @@
 """Eyes: the texture of a separate eyeball, and eyes painted flat between the lids of the chart."""
 
+import math
+
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.noise import plain_noise
 from facerf_cli.stage.people import People
-from facerf_cli.stage.window import Window, mask, places_mm
+from facerf_cli.stage.window import LANDMARK_MM, Window, mask, places_mm
 
 _CORNERS = ((36, 39), (42, 45))
 _IRIS_DEG, _RADIUS_MM = 29.0, 12.0  # of the iris, from the gaze axis; of the ball
@@ -49,7 +50,8 @@ def eyeball(
     wet = torch.ones(1, side, side)
     relief = 0.01 * torch.cat([plain_noise((side, side), 14, generator) for _ in range(2)])
     relief = relief * (angle > _IRIS_DEG)
-    traits: dict[str, float | str | bool] = {"iris": names[0], "pupil_mm": round(2 * 0.2094 * pupil_deg, 2)}
+    pupil_mm = 2 * _RADIUS_MM * math.radians(pupil_deg)
+    traits: dict[str, float | str | bool] = {"iris": names[0], "pupil_mm": round(pupil_mm, 2)}
     roughness = torch.where(angle < _IRIS_DEG, 0.08, 0.14)[None]
     return (albedo.clamp(0.003, 0.9), 0.03 * wet, roughness, relief), traits
 
@@ -97,8 +99,7 @@ def paint_eyes(albedo: Tensor, people: People, window: Window, generator: torch.
     eye = uniform(0.32, 0.58) * torch.tensor([1.0, 0.93, 0.88]).view(1, 3, 1, 1)
     eye = eye.expand(-1, 3, window.side, window.side)
     for inner, outer in _CORNERS:
-        u, v = LANDMARK_UV[[inner, outer]].mean(0)
-        centre_x, centre_y = float((u - 0.5) * 244.87), float(v * 174)
+        centre_x, centre_y = (float(mm) for mm in LANDMARK_MM[[inner, outer]].mean(0))
         out = (((x - centre_x - shift_x) / 6.4) ** 2 + ((y - centre_y - shift_y) / 6.0) ** 2).sqrt()
         iris, pupil = torch.sigmoid(14 * (1 - out)), torch.sigmoid(14 * (0.38 - out))
         eye = eye * (1 - iris) + iris * colours.view(-1, 3, 1, 1) * (1 - 0.9 * pupil)

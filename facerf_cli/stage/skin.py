@@ -71,7 +71,8 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
     middle = noise(count, window, 9, generator)
     fine = torch.randn(count, 1, window.side, window.side, generator=generator)
     pores = noise(count, window, 2.0, generator, octaves=2)
-    melanin, blood = _pigments(people, window, coarse, middle, 0.7 * pores + 0.3 * fine, generator)
+    grain = (0.7 * pores + 0.3 * fine) * min(1.0, 2 / sum(window.texel_mm)) ** 1.5  # texels average over it
+    melanin, blood = _pigments(people, window, coarse, middle, grain, generator)
     hair = draw_facial_hair(people, window, generator)
     relief, depth = draw_relief(people, window, pores, 1 - hair.cover, generator)
     melanin, blood = melanin * (1 + 0.3 * depth), blood * (1 + 0.4 * depth)
