@@ -43,7 +43,8 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     """
     roots, root_normals, margin = _roots(head, style, random)
     if not len(roots):
-        return _ribbons(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 3)), style, random)
+        none = np.zeros((0, style.segments + 1, 3))
+        return _ribbons(none, none, none[:, 0], style, random)
     hull = hull_of(head)
     length = _lengths(roots, margin, style, random)
     wisps = _Wisps(roots, root_normals, style, hull, random)
@@ -296,7 +297,7 @@ def _ribbons(
     uv = np.stack(np.broadcast_arrays(random.uniform(0, 1, (wisps, 1)), share), -1)
 
     def woven(a: np.ndarray, b: np.ndarray, tip: np.ndarray) -> np.ndarray:
-        pairs = np.stack([a[:, :-1], b[:, :-1]], 2).reshape(wisps, -1, a.shape[-1])
+        pairs = np.stack([a[:, :-1], b[:, :-1]], 2).reshape(wisps, 2 * (rows - 1), a.shape[-1])
         return np.concatenate([pairs, tip[:, -1:]], 1).reshape(-1, a.shape[-1]).astype(np.float32)
 
     first = np.arange(rows - 2)[:, None] * 2

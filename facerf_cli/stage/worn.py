@@ -6,6 +6,7 @@ down and out to the shoulders, kept off the skin.
 """
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from facerf_cli.stage.hull import Hull, hull_of
@@ -23,6 +24,8 @@ _TUBE = 10  # vertices around a tube
 _AROUND = 144  # vertices around the neck
 _CUT_M = 0.16  # below the chin
 _OFF_SKIN_M = 0.004  # of cloth
+_BANDS_M = {"turtleneck": 0.045, "shirt": 0.006}  # height of the neckline's band, where it is fixed
+_FLARE_M = 0.012  # how much wider than its narrowest a neck still is a neck
 _BELOW_M = -0.06  # height under which cloth may touch skin
 _ASIDE_M = 0.008  # of cloth that still lies over a vertex of the skin
 
@@ -219,6 +222,7 @@ def draw_clothes(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
     hull, skin = hull_of(head), _Skin(head)
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     collar = _collar_line(kind, azimuth, _chin_m(head), random)
+    collar = _on_neck(hull, azimuth, collar, _BANDS_M.get(kind, 0.01))
     garment = _body(kind, hull, skin, azimuth, collar, _chin_m(head) - _CUT_M, random)
     if kind != "shirt":
         return garment
@@ -249,6 +253,15 @@ def _collar_line(kind: str, azimuth: np.ndarray, chin: float, random: np.random.
     return line
 
 
+def _on_neck(hull: Hull, azimuth: np.ndarray, line: np.ndarray, band: float) -> np.ndarray:
+    """The neckline [N], raised where the foot of its band would lie on the shoulders of a short neck."""
+    levels = line + np.arange(0, 0.06, 0.003)[:, None]
+    radius = np.stack([_radius(hull, azimuth, level - band) for level in levels])
+    slender = radius < radius.min(0) + _FLARE_M
+    raised = np.take_along_axis(levels, slender.argmax(0)[None], 0)[0]
+    return gaussian_filter1d(raised - line, 5, mode="wrap") + line
+
+
 def _body(
     kind: str,
     hull: Hull,
@@ -260,7 +273,7 @@ def _body(
 ) -> HeadMesh:
     """Rings from inside the neckline over its band down to the shoulders, and straight down to the cut."""
     neck = _radius(hull, azimuth, collar) + _OFF_SKIN_M + (0.012 if kind == "wide neck" else 0)
-    band = {"turtleneck": 0.045, "shirt": 0.006}.get(kind, random.uniform(0.010, 0.02))
+    band = _BANDS_M.get(kind, random.uniform(0.010, 0.02))
     thick = 0.006 if kind == "turtleneck" else 0.0025
     rows = [(neck - 0.0025, collar - 0.012), (neck - 0.002, collar - 0.003), (neck, collar)]
     rows += [(neck + thick, collar - 0.0025)]
