@@ -18,14 +18,13 @@ from facerf_cli.stage.cranium import Surroundings, on_chart, template
 from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
 from facerf_cli.stage.openings import Sheet, lips, outline, skin_sheet
 
-_EYES = {"eye_left": (36, 39, ((37, 41), (38, 40))), "eye_right": (42, 45, ((43, 47), (44, 46)))}
+_LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
 _LIPS = ((61, 67), (62, 66), (63, 65))
 _SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
 _OVERSHUT_LIDS_MM = 0.5  # a lid drawn further over the other one is cut free of it, or it would fold
 _AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0
 _EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
 _EAR_OUT_MM = 1.5
-_LID_RIM = ((0.0, 0.25, 0.25), (0.25, 0.6, 0.55))  # toward the ball (share), inward and down (mm)
 
 
 def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: int) -> HeadMesh:
@@ -43,38 +42,41 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
     roots = {side: _ear_root(skin_mm, sheet, side) for side in (-1.0, 1.0)}
     for side, root in roots.items():
         skin_mm = _hollowed(skin_mm, root, side)
-    around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _EYES}
-    balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _EYES}
+    around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _LIDS}
+    balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _LIDS}
     normals = _normals(skin_mm, sheet.triangles, sheet.same)
-    skin, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
     parts = [_ear(root, side) for side, root in roots.items()]
-    count = len(skin_mm)
-    same = [sheet.same]
-    for name, rim in sheet.rims.items():
-        edge, inward, down = skin_mm[rim], _inward(skin_mm[rim], normals[rim]), -normals[rim]
-        rings = _lips(edge, inward, down) if name == "mouth" else _lid(edge, inward, down, balls[name])
-        strip = _strip(rim, count, len(rings))
-        skin.append(np.concatenate(rings))
-        uv.append(np.tile(uv[0][rim], (len(rings), 1)))
-        triangles.append(strip)
-        same.append(count + np.arange(len(rings) * len(rim)))
-        count += len(rings) * len(rim)
-        if name == "mouth":
-            parts.append(_part("mouth", *mouth.bag(rings[-1])))
-            parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, rings[-1])]
-            parts.append(_part("teeth", *mouth.teeth(landmarks_mm, rings[-1])))
     parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
-    head = _part(
-        "skin", np.concatenate(skin), np.concatenate(triangles), np.concatenate(uv), np.concatenate(same)
-    )
-    return joined(head, *parts)
+    rims = {}
+    for name, rim in sheet.rims.items():
+        edge, down = skin_mm[rim], -normals[rim]
+        inward = _inward(edge, normals[rim])
+        rims[name] = _lips(edge, inward, down) if name == "mouth" else _lid(edge, inward, balls[name], down)
+    if "mouth" in rims:
+        inner = rims["mouth"][-1]
+        parts.append(_part("mouth", *mouth.bag(inner)))
+        parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, inner)]
+        parts.append(_part("teeth", *mouth.teeth(landmarks_mm, inner)))
+    return joined(_rimmed(skin_mm, sheet, rims), *parts)
+
+
+def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]) -> HeadMesh:
+    """The skin with the rims' rings [N, 3] added to its openings; a rim has the uv of its edge."""
+    vertices, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
+    for name, rings in rims.items():
+        triangles.append(_strip(sheet.rims[name], sum(map(len, vertices)), len(rings)))
+        vertices += rings
+        uv += [uv[0][sheet.rims[name]]] * len(rings)
+    count = sum(map(len, vertices))
+    same = np.concatenate([sheet.same, np.arange(len(skin_mm), count)])
+    return _part("skin", np.concatenate(vertices), np.concatenate(triangles), np.concatenate(uv), same)
 
 
 def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
     """Which openings are wide enough to be cut."""
     gaps = {
         name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
-        for name, (_, _, pairs) in _EYES.items()
+        for name, pairs in _LIDS.items()
     }
     found = [name for name, gap in gaps.items() if not -_OVERSHUT_LIDS_MM < gap <= _SHUT_LIDS_MM]
     parted = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
@@ -139,15 +141,13 @@ def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
 
 
-def _lid(edge: np.ndarray, inward: np.ndarray, down: np.ndarray, ball: np.ndarray) -> list[np.ndarray]:
+def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
     """Rings of a lid's margin, from its edge to just under the eyeball's surface."""
-    rings = []
     low = edge + 0.6 * inward
     to_ball = low - ball
     foot = ball + to_ball / np.linalg.norm(to_ball, axis=-1, keepdims=True) * (eyeballs.RADIUS_MM - 0.3)
     rounded = edge + 0.2 * inward + 0.15 * down
-    rings = [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
-    return rings
+    return [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
 
 
 def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
