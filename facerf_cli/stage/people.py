@@ -56,10 +56,10 @@ def draw_people(count: int, generator: torch.Generator) -> People:
 
     tone = uniform(0, 1)
     melanin = LIGHTEST * (DARKEST / LIGHTEST) ** tone
-    age = uniform(18, 75)
+    age = 18 + 57 * uniform(0, 1) ** 1.6
     fair = (0.62 - tone).clamp(0, 1) / 0.62 * share(0.75)  # only the fair-skinned have fair hair
     red = share(0.06) * (tone < 0.4)
-    grey = ((age - 35 + uniform(-12, 12)) / 40).clamp(0, 1) ** 1.3
+    grey = ((age - 45 + uniform(-12, 12)) / 35).clamp(0, 1) ** 1.3
     bearded = share(0.5)
     style = uniform(0, 1)
     full, moustached, chin = style < 0.2, (style > 0.2) & (style < 0.27), (style > 0.27) & (style < 0.36)
