@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import check_landmarks, from_landmarks
+from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
 from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
 from facerf_cli.face.gauss_newton import (
     FitState,
@@ -40,6 +40,9 @@ _USUAL = FitSettings()
 LOST_IOD = 0.15  # landmarks that lie this far off in the mean belong to no face, or to another one
 _PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # all cameras' landmarks are taken to this one's picture
 _CROP_STEPS = 12
+# The last bits of linear algebra depend on where memory happens to lie. Results are rounded far above those
+# and far below what can be measured, so that the same input gives the same bytes.
+_DECIMALS = 6
 _CROP_STRIDE = 5  # every so many vertices hold the crop's pose
 
 
@@ -79,7 +82,8 @@ class JointFit:
     @property
     def mean_error_iod(self) -> float:
         """The mean over the cameras that have landmarks."""
-        return float(np.mean([error for error in self.error_iod if error is not None]))
+        errors = [error for error in self.error_iod if error is not None]
+        return round(float(np.mean(errors)), _DECIMALS)
 
     def vertices_world(self, model: MorphableModel) -> Tensor:
         """The mesh in the world [V, 3], float64."""
@@ -178,13 +182,15 @@ def _fit_found(
     coefficients = (head.coordinates @ basis.spread.mT)[0]
     to_world = cameras[first].rotation.mT
     fit = JointFit(
-        rotation=to_world @ head.rotation[0],
-        translation_m=to_world @ (head.translation_m[0] - cameras[first].translation_m),
-        alpha=coefficients[: len(model.identity)],
-        beta=coefficients[len(model.identity) :],
+        rotation=(to_world @ head.rotation[0]).round(decimals=_DECIMALS + 1),
+        translation_m=(to_world @ (head.translation_m[0] - cameras[first].translation_m)).round(
+            decimals=_DECIMALS
+        ),
+        alpha=coefficients[: len(model.identity)].round(decimals=_DECIMALS),
+        beta=coefficients[len(model.identity) :].round(decimals=_DECIMALS),
         error_iod=(),
     )
-    return fit, errors_iod.tolist()
+    return fit, errors_iod.round(decimals=_DECIMALS).tolist()
 
 
 def _eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
@@ -219,19 +225,19 @@ def fit_in_crop(
     """
     vertices_world = joint.vertices_world(model)
     fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
-    crop = from_landmarks(fitted_px, crop_px)
+    crop = _rounded(from_landmarks(fitted_px, crop_px))
     in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
     ids = _facing(in_camera)[::_CROP_STRIDE]
     target_px = torch.from_numpy(crop.to_crop(camera.project(vertices_world[ids]).numpy()))
     head = (vertices_world[ids] - joint.translation_m) @ joint.rotation
     rotation, translation_m = _pose_in_crop(head, target_px, camera.rotation @ joint.rotation, crop.camera)
     off_px = (project(head @ rotation.mT + translation_m, crop.camera) - target_px).norm(dim=-1).mean()
-    seen_px = fitted_px if landmarks_px is None else landmarks_px
+    seen_px = np.round(fitted_px, _DECIMALS) if landmarks_px is None else landmarks_px
     fit = FaceFit(
         model=model.name,
         crop=crop,
-        rotation=rotation.float(),
-        translation_m=translation_m.float(),
+        rotation=rotation.round(decimals=_DECIMALS + 1).float(),
+        translation_m=translation_m.round(decimals=_DECIMALS).float(),
         alpha=joint.alpha.float(),
         beta=joint.beta.float(),
         landmarks_px=torch.from_numpy(crop.to_crop(seen_px)).float(),
@@ -239,6 +245,11 @@ def fit_in_crop(
     )
     iod_px = crop.camera.focal_px * IOD_M / _eyes_depth_m(rotation, translation_m)
     return fit, float(off_px / iod_px)
+
+
+def _rounded(crop: Crop) -> Crop:
+    x0_px, y0_px, side_px = (round(length, _DECIMALS) for length in (crop.x0_px, crop.y0_px, crop.side_px))
+    return Crop(x0_px, y0_px, side_px, crop.size_px)
 
 
 def _facing(vertices_camera: Tensor) -> Tensor:
