@@ -96,7 +96,7 @@ class Captured:
         row = int(torch.randint(len(pairs), (), generator=generator))
         pair = pairs[row]
         with self._opened(subject, pair.source_camera) as file:
-            source, texture = _View.of(file), self._written(subject, row)
+            source, texture = View.of(file), self._written(subject, row)
             if texture is None:
                 texture = _lit(file, torch.from_numpy(np.array(weights[row])))
         return self._face(subject, pair.target_camera, source, texture, pair.target_light, lights, generator)
@@ -107,7 +107,7 @@ class Captured:
         camera, other = (cameras[int(i)] for i in torch.randint(len(cameras), (2,), generator=generator))
         same = torch.rand((), generator=generator) < _SAME_POSE_SHARE
         with self._opened(subject, camera) as file:
-            source = _View.of(file)
+            source = View.of(file)
             texture = _lit(file, draw_light(source.directions, generator))
         return self._face(subject, camera if same else other, source, texture, None, lights, generator)
 
@@ -115,14 +115,15 @@ class Captured:
         self,
         subject: str,
         target_camera: str,
-        source: "_View",
+        source: "View",
         texture: Tensor,
         first_light: int | None,
         lights: int,
         generator: torch.Generator,
     ) -> "_Face":
         with self._opened(subject, target_camera) as file:
-            target = _View.of(file)
+            target = View.of(file)
+            lights = min(lights, len(target.directions))
             chosen = draw_target_lights(target.directions, lights, generator)
             if first_light is not None:  # the pair's own, and others beside it
                 rest = chosen[chosen != first_light]
@@ -150,7 +151,7 @@ class Captured:
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """A subject in one camera's crop, unwrapped: fields [.., T, T] of the fitted chart, camera space."""
 
     rotation: Tensor  # [3, 3] head_to_camera
@@ -160,14 +161,14 @@ class _View:
     lit: Tensor  # [3, T, T] under a constant map of radiance 1
 
     @staticmethod
-    def of(file: Any) -> "_View":
+    def of(file: Any) -> "View":
         """What a texture file holds beside the lights."""
-        return _View(*(file.get_tensor(name).float() for name in _View.__dataclass_fields__))
+        return View(*(file.get_tensor(name).float() for name in View.__dataclass_fields__))
 
 
 @dataclass(frozen=True)
 class _Face:
-    source: _View
+    source: View
     texture: Tensor  # [3, T, T] of the source
     target: Tensor  # [L, 3, T, T]
     lights: Tensor  # [L, 3] in the target's camera space

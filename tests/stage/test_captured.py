@@ -13,7 +13,7 @@ from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceSettings
 from facerf_cli.pipeline import load_network
 from facerf_cli.raster.texture import unwrap
-from facerf_cli.stage.captured import Captured, open_captured
+from facerf_cli.stage.captured import Captured, View, open_captured
 from facerf_cli.stage.dataset import Dataset
 from facerf_cli.stage.map_weights import name_maps
 from facerf_cli.stage.recipes import draw_pairs, load_pairs, pairs_path, picture_path, settle_pairs
@@ -117,6 +117,19 @@ def test_the_pairs_light_is_among_the_targets(lazy: Captured) -> None:
         rotations = [_rotation(lazy, pair.target_camera) for pair in pairs]
         numbers = {int((world @ rotation.T @ face.lights[0]).argmax()) for rotation in rotations}
         assert numbers & wanted and len(face.lights) == 2
+
+
+def test_a_target_of_another_camera_has_its_normals_and_lights(lazy: Captured) -> None:
+    with lazy._opened("0000", "C0") as file:
+        source = View.of(file)
+    face = lazy._face("0000", "C1", source, source.lit, 5, 3, torch.Generator().manual_seed(0))
+    with lazy._opened("0000", "C1") as file:
+        target = View.of(file)
+        assert torch.equal(face.target[0], file.get_tensor("olats")[5].float())
+    torch.testing.assert_close(face.normals_target, target.normals, atol=2e-3, rtol=0)
+    torch.testing.assert_close(face.lights[0], target.directions[5])
+    assert float((face.lights[0] - source.directions[5]).norm()) > 0.1
+    assert bool((face.weight <= target.visible).all())
 
 
 def _rotation(captured: Captured, camera: str) -> torch.Tensor:
