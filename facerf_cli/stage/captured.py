@@ -202,10 +202,20 @@ def open_captured(
 
 def _provenance(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
     name = dataset.folder.resolve().name
-    own = dataset.provenance
     return {
         "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",
-        "dataset": own,
+        "dataset": dataset.provenance,
         "fitted_with": f"{model.name} ({model.licence})",
-        "licence": str(own.get("licence", f"that of the dataset {name}")),
+        "licence": _licence(dataset.provenance, name),
     }
+
+
+def _licence(provenance: dict[str, Any], name: str) -> str:
+    """The words that the dataset or its capture has for its licence, if any."""
+    found = provenance.get("capture")
+    capture = found if isinstance(found, dict) else {}
+    if words := provenance.get("licence") or capture.get("licence"):
+        return str(words)
+    if capture.get("synthetic") is True and "face_model_licence" in capture:  # by `facerf synth-stage`
+        return f"MIT; the heads' shapes: {capture['face_model_licence']}"
+    return f"that of the dataset {name}"

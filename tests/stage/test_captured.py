@@ -185,6 +185,28 @@ def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path:
         open_captured(none.folder, "builtin", SIDE, 1)
 
 
+@pytest.mark.parametrize(
+    ("provenance", "words"),
+    [
+        ({"licence": "CC0"}, "CC0"),
+        ({"capture": {"licence": "for research"}}, "for research"),
+        (
+            {"capture": {"synthetic": True, "face_model_licence": "MIT (USC)"}},
+            "MIT; the heads' shapes: MIT (USC)",
+        ),
+        ({"capture": "a stage"}, "that of the dataset"),
+    ],
+)
+def test_the_licence_is_what_the_dataset_says(
+    dataset: Dataset, lazy: Captured, tmp_path: Path, provenance: dict[str, object], words: str
+) -> None:
+    for part in ("olat", "fits", f"textures-{SIDE}"):
+        (tmp_path / part).symlink_to(dataset.folder / part)
+    content = json.loads((dataset.folder / "dataset.json").read_text()) | {"provenance": provenance}
+    (tmp_path / "dataset.json").write_text(json.dumps(content))
+    assert words in open_captured(tmp_path, "builtin", SIDE, 1, LIGHTS).provenance["licence"]
+
+
 def test_the_mean_face_is_that_of_the_model(lazy: Captured) -> None:
     normals, visibility, directions = lazy.mean_face()
     assert len(visibility) == len(directions) == LIGHTS
