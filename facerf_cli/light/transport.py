@@ -21,6 +21,10 @@ _RISE_SHARE = 0.5  # this share of its neighbours' rise, up to as much again as 
 _BLUR_NEIGHBOURS = 24
 _SAME_SURFACE_COSINE = 0.6  # of two normals, for near vertices to share their view of the surroundings
 _NO_WEIGHT = 1e-4
+_STRAND_STRIDE, _NEAR = (
+    5,
+    4,
+)  # of a strand's vertices this many share a traced one; the means are over so many
 _R2 = np.array([0.7548776662466927, 0.5698402909980532], np.float32)  # 1 / p, 1 / p^2 with p^3 = p + 1
 
 
@@ -48,7 +52,7 @@ class BakeSettings:
 
     lamp_samples: int = 4
     lamp_radius_deg: float = 1.5
-    bounce_samples: int = 32
+    bounce_samples: int = 16
     bounce_blur_texels: float = 1.5
     bounce_blur_m: float = 0.002
 
@@ -109,20 +113,46 @@ def bake_mesh(
     """Bake the vertices [V, 3] (m) with unit normals [V, 3] of a mesh, lit from unit directions [L, 3].
 
     Only `wanted` [V] bool vertices are baked, and for the lights alone those that light bounces from.
-    `all_round` [V] bool ones (hair) are lit on both sides, at a single ray a lamp: they are many and finer
-    than any penumbra. Unless the lamps are points, shadows are smoothed by a mean over a vertex's own edges,
-    which keeps their outlines off the triangles' zigzag.
+    `all_round` [V] bool ones (hair) are lit on both sides, at a single ray a lamp, and only every
+    `_STRAND_STRIDE`-th is traced, for the rest are near it: they are many and finer than any penumbra.
+    Unless the lamps are points, shadows are smoothed by a mean over a vertex's own edges, which keeps their
+    outlines off the triangles' zigzag.
     """
     nothing = np.zeros(len(vertices), bool)
     baked = ~nothing if wanted is None else wanted
     surface = _Surface.of(vertices, normals, triangles, nothing if all_round is None else all_round)
     shifts = np.random.default_rng(seed).random((len(vertices), 2), np.float32)
-    gather = _gather(surface, baked, settings, shifts)
+    strands = np.flatnonzero(surface.all_round)
+    traced_strands = strands[::_STRAND_STRIDE]
+    near = _nearest_of(surface.vertices, strands, traced_strands)
+    untraced = surface.all_round.copy()
+    untraced[traced_strands] = False
+    gather = _gather(surface, baked & ~untraced, settings, shifts)
+    gather = _filled(gather, strands[baked[strands]], near[baked[strands], 0])
     sources = np.bincount(gather.indices, minlength=len(vertices)) > 0
+    traced = (baked | sources) & ~untraced
+    traced[traced_strands] = True
     visibility = np.zeros((len(directions), len(vertices)), np.float32)
     for light, direction in enumerate(directions):
-        visibility[light] = _lamp_share(surface, direction, baked | sources, settings, shifts)
+        share = _lamp_share(surface, direction, traced, settings, shifts)
+        share[strands] = share[near].mean(-1)
+        visibility[light] = share
     return MeshTransport(directions, visibility, gather, baked)
+
+
+def _nearest_of(vertices: np.ndarray, strands: np.ndarray, traced: np.ndarray) -> np.ndarray:
+    """The traced strand vertices nearest to each of the strands' [N, k]."""
+    if not len(strands):
+        return np.zeros((0, 1), np.int64)
+    _, nearest = cKDTree(vertices[traced]).query(vertices[strands], range(1, min(_NEAR, len(traced)) + 1))
+    return traced[nearest]
+
+
+def _filled(gather: csr_matrix, rows: np.ndarray, copied: np.ndarray) -> csr_matrix:
+    """`gather` with the rows [N] set to the copies of others [N]."""
+    source = np.arange(gather.shape[0])
+    source[rows] = copied
+    return gather[source]
 
 
 def _spread(shifts: np.ndarray, chosen: np.ndarray, sample: int) -> tuple[np.ndarray, np.ndarray]:
