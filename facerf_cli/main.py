@@ -26,6 +26,7 @@ from facerf_cli.commands.predict_olat import predict_olat
 from facerf_cli.commands.prepare_dataset import prepare_dataset
 from facerf_cli.commands.relight import relight
 from facerf_cli.commands.relight_dataset import relight_dataset
+from facerf_cli.commands.synth_stage import synth_stage
 from facerf_cli.commands.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
@@ -34,6 +35,7 @@ VERBS: tuple[Callable[..., Any], ...] = (
     relight,
     predict_olat,
     fit_geometry,
+    synth_stage,
     prepare_dataset,
     relight_dataset,
     train,

@@ -16,6 +16,9 @@ from facerf_cli import __version__
 # IPTC's vocabulary of digital sources (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model.
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
 
+# The same for pictures that are computed throughout.
+COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
+
 # Shared by the log and the progress bars, so that they do not overwrite each other.
 STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
