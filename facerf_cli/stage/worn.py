@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.stage.hull import Hull, hull_of
 from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
 
@@ -23,6 +24,7 @@ _TUBE = 10  # vertices around a tube
 
 _AROUND = 144  # vertices around the neck
 _CUT_M = 0.16  # below the chin
+_LOWEST_CHIN_M = -0.085
 _OFF_SKIN_M = 0.004  # of cloth
 _BANDS_M = {"turtleneck": 0.045, "shirt": 0.006}  # height of the neckline's band, where it is fixed
 _FLARE_M = 0.012  # how much wider than its narrowest a neck still is a neck
@@ -230,10 +232,10 @@ def draw_clothes(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
 
 
 def _chin_m(head: HeadMesh) -> float:
-    """Height of the chin's underside, where the profile of the skin steps back to the neck."""
-    skin = head.vertices[head.part == PARTS.index("skin")].astype(float)
-    middle = skin[(np.abs(skin[:, 0]) < 0.006) & (skin[:, 1] < -0.045) & (skin[:, 2] > 0.085)]
-    return float(middle[:, 1].min()) if len(middle) else -0.078
+    """Height of the chin's underside, at most so low: an open mouth takes no garment with it."""
+    skin = head.part == PARTS.index("skin")
+    nearest = np.linalg.norm(head.uv[skin] - LANDMARK_UV[_CHIN], axis=-1).argmin()
+    return max(float(head.vertices[skin][nearest, 1]) - 0.003, _LOWEST_CHIN_M)
 
 
 def _collar_line(kind: str, azimuth: np.ndarray, chin: float, random: np.random.Generator) -> np.ndarray:
