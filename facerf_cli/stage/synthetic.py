@@ -146,9 +146,11 @@ def open_capture(folder: Path, settings: StageSettings) -> None:
 
 
 def close_capture(folder: Path, settings: StageSettings) -> None:
-    """Put the records of all finished subjects into stage.json."""
-    records = sorted(folder.glob("*/subject.json"))
-    subjects = {path.parent.name: json.loads(path.read_text(encoding="utf-8")) for path in records}
+    """Put the traits of all finished subjects into stage.json."""
+    records = {path.parent.name: path for path in sorted(folder.glob("*/subject.json"))}
+    subjects = {
+        name: json.loads(path.read_text(encoding="utf-8"))["traits"] for name, path in records.items()
+    }
     _write_json(folder / "stage.json", describe_stage(settings) | {"subjects": subjects})
 
 
@@ -169,7 +171,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     pose_deg = random.normal(0, _POSE_STD_DEG)
     side = _canvas_side(size_px)
     appearance = draw_appearance(side, generator)
-    bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), 1 if size_px <= 384 else 2)
+    bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     chart_vertices = model.vertices(alpha[None], beta[None])[0]
     landmarks_m = model.landmarks(chart_vertices[None])[0].numpy()
     dressed = joined(bare, draw_clothes(bare, random))
@@ -193,6 +195,11 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
 
 def _canvas_side(size_px: int) -> int:
     return 512 if size_px <= 256 else 1024
+
+
+def _subdivisions(size_px: int) -> int:
+    """How often the head's mesh is halved, for vertices about as fine as pixels."""
+    return 0 if size_px <= 96 else 1 if size_px <= 384 else 2
 
 
 def _eyes_closed(model: MorphableModel, beta: Tensor) -> Tensor:
@@ -273,10 +280,11 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
     cosines = np.clip(transport.directions @ subject.mesh.normals.T, 0, None)
     bounce = (transport.gather @ (transport.visibility * cosines).T).T
 
-    def in_chart(values: np.ndarray) -> Tensor:
-        field = np.einsum("lnk,nk->ln", values[:, skin[near]], weights)
+    def in_chart(baked: np.ndarray) -> Tensor:
+        field = np.einsum("lnk,nk->ln", baked[:, skin[near]], weights)
         shape = (len(field), _TRANSPORT_SIDE, _TRANSPORT_SIDE)
-        return torch.from_numpy((np.clip(field, 0, 1) * 255).round().astype(np.uint8).reshape(shape))
+        values = (np.clip(field, 0, 1) * 255).round().astype(np.uint8)
+        return torch.from_numpy(np.ascontiguousarray(values.reshape(shape)))
 
     tensors = {
         "vertices": subject.chart_vertices.contiguous(),
