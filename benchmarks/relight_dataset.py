@@ -22,8 +22,8 @@ from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import StackHeader, read_olats, write_olat_stack
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.stage.relighting import multiply
-from facerf_cli.stage.skies import draw_sky
+from facerf_cli.stage.data.relighting import multiply
+from facerf_cli.stage.sky.skies import draw_sky
 
 _ROUNDS = 5
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.light.sphere import latlong_solid_angles
-from facerf_cli.stage.skies import KINDS, MIX, draw_sky
+from facerf_cli.stage.sky.skies import KINDS, MIX, draw_sky
 
 EDGES = np.array([-9, -1, -0.5, -0.25, 0, 0.25, 0.5, 1, 1.5, 2, 3, 9])  # log10 of radiance to the median's
 CHROMA_EDGES = np.array([-9, -1, -0.5, -0.2, 0.2, 0.5, 1, 9])  # log2 of red to blue

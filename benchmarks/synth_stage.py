@@ -32,7 +32,7 @@ GOOD_SHARE, GOOD_ERROR = 0.98, 0.05
 
 
 def landmark_errors(subject: Path) -> tuple[float, float] | None:
-    """Mean error of all 68 points and of the 51 inner ones over the inter-ocular distance; None if unfound."""
+    """Mean error of all 68 points and of the 51 inner ones, in inter-ocular distances; None if unfound."""
     lit = np.mean([read_image(path).pixels for path in sorted((subject / "C0").glob("*.exr"))], 0)
     faces = detect_landmarks(to_display(lit))
     if len(faces) != 1:

@@ -36,7 +36,7 @@ def envmap(
     """
     from facerf_cli import __version__
     from facerf_cli.files.images import write_exr
-    from facerf_cli.stage.skies import KINDS, MIX, draw_sky, kind_of
+    from facerf_cli.stage.sky.skies import KINDS, MIX, draw_sky, kind_of
 
     kinds = tuple(dict.fromkeys(kind)) if kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:

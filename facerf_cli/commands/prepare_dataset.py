@@ -21,8 +21,8 @@ from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
-    from facerf_cli.stage.dataset import Split
-    from facerf_cli.stage.layouts import Capture
+    from facerf_cli.stage.data.dataset import Split
+    from facerf_cli.stage.data.layouts import Capture
 
 _CROP_STEP_PX, _CROP_MOST_PX = 8, 4096
 log = logging.getLogger(LOGGER_NAME)
@@ -41,7 +41,7 @@ class _Prepare:
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A subject's files."""
-        from facerf_cli.stage.prepare import subject_outputs
+        from facerf_cli.stage.data.prepare import subject_outputs
 
         return subject_outputs(_capture(self.capture, self.layout), item.name, self.folder)
 
@@ -49,7 +49,7 @@ class _Prepare:
         """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
         import torch
 
-        from facerf_cli.stage.prepare import prepare_subject
+        from facerf_cli.stage.data.prepare import prepare_subject
 
         capture, model = _capture(self.capture, self.layout), _face_model(self.face_model)
         threads = torch.get_num_threads()
@@ -69,7 +69,7 @@ class _Prepare:
 @cache
 def _capture(folder: Path, layout: str) -> "Capture":
     """The capture's description, once a process; it is an input of the whole run."""
-    from facerf_cli.stage.layouts import read_capture
+    from facerf_cli.stage.data.layouts import read_capture
 
     try:
         return read_capture(folder, layout)
@@ -117,8 +117,8 @@ def prepare_dataset(
     fits, a sheet a subject, index.html to look through, and dataset.json at the end. A second run goes on
     where the first was cut off.
     """
-    from facerf_cli.stage.dataset import DATASET_FILE, Split
-    from facerf_cli.stage.prepare import preparation_key
+    from facerf_cli.stage.data.dataset import DATASET_FILE, Split
+    from facerf_cli.stage.data.prepare import preparation_key
 
     settings = settings_of(context)
     drawn = Split.parse(split)
@@ -153,7 +153,7 @@ def _check_subjects(capture: "Capture", output: Path, split: "Split") -> None:
 
 def _model_digest(name: str) -> str:
     from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH
-    from facerf_cli.stage.prepare import sha256_of
+    from facerf_cli.stage.data.prepare import sha256_of
 
     _face_model(name)  # a file that is none is named first
     return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
@@ -161,7 +161,7 @@ def _model_digest(name: str) -> str:
 
 def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) -> None:
     """Raise where finished subjects were prepared otherwise: a dataset is of one kind."""
-    from facerf_cli.stage.prepare import prepared_subjects
+    from facerf_cli.stage.data.prepare import prepared_subjects
 
     earlier = {} if overwrite else prepared_subjects(capture, output)
     other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
@@ -177,10 +177,10 @@ def _finish(
 ) -> None:
     """Write the page and `dataset.json` of the subjects that are finished."""
     from facerf_cli.files.atomic import atomic_path
-    from facerf_cli.stage.dataset import DATASET_FILE
-    from facerf_cli.stage.documents import write_document
-    from facerf_cli.stage.index_page import index_page
-    from facerf_cli.stage.prepare import describe_dataset, prepared_subjects
+    from facerf_cli.stage.data.dataset import DATASET_FILE
+    from facerf_cli.stage.data.documents import write_document
+    from facerf_cli.stage.data.index_page import index_page
+    from facerf_cli.stage.data.prepare import describe_dataset, prepared_subjects
 
     records = prepared_subjects(capture, output)
     if not records:

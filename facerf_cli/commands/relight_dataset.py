@@ -16,7 +16,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.records import STDERR
 
 if TYPE_CHECKING:
-    from facerf_cli.stage.dataset import Dataset
+    from facerf_cli.stage.data.dataset import Dataset
 
 
 def relight_dataset(
@@ -60,10 +60,10 @@ def relight_dataset(
     the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
     and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
     """
-    from facerf_cli.stage.dataset import read_dataset
-    from facerf_cli.stage.map_weights import name_maps
-    from facerf_cli.stage.recipes import RELIT, draw_pairs, pairs_path, settle_pairs
-    from facerf_cli.stage.skies import parse_envmaps
+    from facerf_cli.stage.data.dataset import read_dataset
+    from facerf_cli.stage.data.map_weights import name_maps
+    from facerf_cli.stage.data.recipes import RELIT, draw_pairs, pairs_path, settle_pairs
+    from facerf_cli.stage.sky.skies import parse_envmaps
 
     settings = settings_of(context)
     prepared = read_dataset(dataset)
@@ -98,14 +98,14 @@ class _Relight:
 
     def outputs_of(self, item: Item) -> list[Path]:
         """The sources of its pairs."""
-        from facerf_cli.stage.recipes import picture_path
+        from facerf_cli.stage.data.recipes import picture_path
 
         return [picture_path(self.dataset, item.name, index) for index in range(self.per_subject)]
 
     def __call__(self, item: Item) -> Outcome:
         """Write the sources that are missing."""
-        from facerf_cli.stage.recipes import load_pairs
-        from facerf_cli.stage.relighting import relight_subject
+        from facerf_cli.stage.data.recipes import load_pairs
+        from facerf_cli.stage.data.relighting import relight_subject
 
         pairs, weights = load_pairs(self.dataset)[item.name]
         made = relight_subject(self.dataset, pairs, weights, self.memory_bytes, self.overwrite)

@@ -92,7 +92,7 @@ def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
     """The maps of `procedural:N`; of several such words, the most."""
     if not words:
         return []
-    from facerf_cli.stage.skies import kind_of, parse_envmaps
+    from facerf_cli.stage.sky.skies import kind_of, parse_envmaps
 
     most = max(len(parse_envmaps(word, seed)) for word in words)
     if most > _MOST_FRAMES:
@@ -134,7 +134,7 @@ def read_map(path: Path | DrawnMap) -> "Tensor":
     import torch
 
     if isinstance(path, DrawnMap):
-        from facerf_cli.stage.skies import draw_sky
+        from facerf_cli.stage.sky.skies import draw_sky
 
         return torch.from_numpy(draw_sky(path.index, path.seed, DRAWN_WIDTH_PX)[0])
     from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image

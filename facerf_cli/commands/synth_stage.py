@@ -77,7 +77,8 @@ class _Photograph:
 
     def outputs_of(self, item: Item) -> list[Path]:
         """The person's folder, and the bake."""
-        return [item.output_base, *([self._transport_of(item)] if self.transport else [])]
+        transport = self._transport_of(item)
+        return [item.output_base] if transport is None else [item.output_base, transport]
 
     def __call__(self, item: Item) -> Outcome:
         import torch

@@ -96,7 +96,7 @@ def _refuse_the_banks_options(context: typer.Context) -> None:
 
 
 def _open_dataset(folder: Path, fit_with: str, side: int, jobs: int) -> "SampleSource":
-    from facerf_cli.stage.captured import open_captured
+    from facerf_cli.stage.data.captured import open_captured
 
     return open_captured(folder, fit_with, side, jobs)
 

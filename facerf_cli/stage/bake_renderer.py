@@ -18,8 +18,8 @@ from torch import Tensor
 from facerf_cli.light.transport import MeshTransport
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.stage.materials import Appearance, Surface, sample
-from facerf_cli.stage.mesh import PARTS, HeadMesh
+from facerf_cli.stage.appearance.materials import Appearance, Surface, sample
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.shading import (
     Cosines,
     Strands,

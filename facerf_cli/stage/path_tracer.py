@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
+from facerf_cli.stage.appearance.materials import Appearance, Material
+from facerf_cli.stage.appearance.window import CANVAS_SPAN
 from facerf_cli.stage.bake_renderer import StageCamera
-from facerf_cli.stage.materials import Appearance, Material
-from facerf_cli.stage.mesh import PARTS, HeadMesh
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.shading import LOBES
-from facerf_cli.stage.window import CANVAS_SPAN
 
 _LIGHT = "light.to_world"
 

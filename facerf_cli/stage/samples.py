@@ -12,9 +12,9 @@ from torch import Tensor
 
 from facerf_cli.network.reflectance import MEAN_RADIANCE
 from facerf_cli.raster.texture import inpaint
+from facerf_cli.stage.appearance.skin import Skin, draw_skin
 from facerf_cli.stage.lights import draw_light
 from facerf_cli.stage.shading import bend, diffuse_irradiance, highlights, scatter, unit
-from facerf_cli.stage.skin import Skin, draw_skin
 
 if TYPE_CHECKING:
     from facerf_cli.stage.bank import Bank

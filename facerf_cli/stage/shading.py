@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.stage.skin import Skin
+from facerf_cli.stage.appearance.skin import Skin
 
 LOBES = ((1.0, 0.75), (0.55, 0.25))  # (roughness factor, weight): a broad lobe and an oily one
 _STRAND_LOBES = ((-0.12, 1.0), (0.17, 2.0))  # (shift in radians toward the tip, width factor)

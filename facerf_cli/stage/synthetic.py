@@ -26,13 +26,13 @@ from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.stage import bake_renderer, path_tracer
+from facerf_cli.stage.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.stage.bake_renderer import StageCamera
 from facerf_cli.stage.geometries import GeometrySettings, draw_coefficients
-from facerf_cli.stage.hair import draw_hair, scalp_cover
-from facerf_cli.stage.heads import build_head
-from facerf_cli.stage.materials import Appearance, canvas_uv, draw_appearance, with_scalp
-from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
-from facerf_cli.stage.worn import draw_clothes, draw_glasses
+from facerf_cli.stage.head.hair import draw_hair, scalp_cover
+from facerf_cli.stage.head.heads import build_head
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.head.worn import draw_clothes, draw_glasses
 
 FORMAT = "facerf-stage-1"
 Renderer = Literal["bake", "mitsuba"]

@@ -5,7 +5,7 @@ import pytest
 
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
-from facerf_cli.stage.skies import draw_sky
+from facerf_cli.stage.sky.skies import draw_sky
 
 
 def test_writes_seeded_maps_and_skips_finished_ones(

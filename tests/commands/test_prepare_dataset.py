@@ -21,9 +21,9 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
-from facerf_cli.stage.dataset import Dataset, read_dataset
-from facerf_cli.stage.layouts import read_capture
-from tests.stage.capture import Truth, write_capture
+from facerf_cli.stage.data.dataset import Dataset, read_dataset
+from facerf_cli.stage.data.layouts import read_capture
+from tests.stage.data.capture import Truth, write_capture
 
 LIGHTS = 12
 Given = tuple[Path, dict[str, Truth]]

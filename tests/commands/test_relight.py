@@ -18,7 +18,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.raster.texture import normal_map
-from facerf_cli.stage.skies import kind_of
+from facerf_cli.stage.sky.skies import kind_of
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 WIDTHS = (4, 8, 8)

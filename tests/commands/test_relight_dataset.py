@@ -15,7 +15,7 @@ import pytest
 
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
-from tests.stage.dataset_fixture import write_small_dataset
+from tests.stage.data.dataset_fixture import write_small_dataset
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
 

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
-from facerf_cli.stage.layouts import read_capture
+from facerf_cli.stage.data.layouts import read_capture
 
 LIGHTS = 6
 Said = pytest.CaptureFixture[str]

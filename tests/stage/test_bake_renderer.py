@@ -10,14 +10,14 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings, MeshTransport, bake_mesh
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer
+from facerf_cli.stage.appearance.materials import Appearance, Material
 from facerf_cli.stage.bake_renderer import (
     RenderSettings,
     StageCamera,
     photograph,
     scattered_irradiance,
 )
-from facerf_cli.stage.materials import Appearance, Material
-from facerf_cli.stage.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
 POINT_LAMP = BakeSettings(lamp_radius_deg=0, bounce_samples=0)

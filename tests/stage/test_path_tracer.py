@@ -10,9 +10,9 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.transport import BakeSettings, bake_mesh
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer, path_tracer
+from facerf_cli.stage.appearance.materials import Appearance, Material
 from facerf_cli.stage.bake_renderer import RenderSettings, StageCamera
-from facerf_cli.stage.materials import Appearance, Material
-from facerf_cli.stage.mesh import PARTS, HeadMesh
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.path_tracer import PathSettings
 
 LAMPS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
@@ -136,7 +136,7 @@ def test_a_seed_repeats_a_picture() -> None:
 def test_the_benchmark_holds_on_a_small_picture_of_the_builtin_head() -> None:
     from benchmarks import transport as benchmark
     from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.stage.materials import draw_appearance
+    from facerf_cli.stage.appearance.materials import draw_appearance
 
     model = load_face_model()
     generator = torch.Generator().manual_seed(1)

@@ -2,8 +2,8 @@ import math
 
 import torch
 
+from facerf_cli.stage.appearance.skin import Skin, draw_skin
 from facerf_cli.stage.shading import bend, diffuse_irradiance, highlights, scatter, unit
-from facerf_cli.stage.skin import Skin, draw_skin
 
 
 def _skin(side: int = 4, specular: float = 0.04, roughness: float = 0.5) -> Skin:

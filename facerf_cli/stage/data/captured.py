@@ -1,0 +1,221 @@
+"""Training samples from a prepared dataset: photographed lights in the place of the bank's shading.
+
+Textures come from `textures.py`. A source is what `relight-dataset` wrote, unwrapped; with --lazy it is
+the lights' weights times the stack's textures, which is the same, for unwrapping is linear. Without any pairs
+its light is drawn as the bank's is.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import safe_open
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.topology import grid_triangles
+from facerf_cli.light.sphere import RIG_LIGHTS
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.raster.texture import inpaint, normal_map
+from facerf_cli.stage.data.dataset import Dataset, read_dataset
+from facerf_cli.stage.data.recipes import load_pairs
+from facerf_cli.stage.data.textures import build_textures, sources_path, texture_path
+from facerf_cli.stage.geometries import GeometrySettings, bake_head
+from facerf_cli.stage.lights import draw_light
+from facerf_cli.stage.samples import Sample, draw_target_lights, photograph
+
+_SAME_POSE_SHARE = 0.5
+_MEAN_SIDE = 64  # of the mean face's shadows, as the network holds them
+
+
+@dataclass(frozen=True, eq=False)
+class Captured:
+    """A prepared dataset and its textures, as training takes it; heads are places in `dataset.subjects`."""
+
+    dataset: Dataset
+    model: MorphableModel
+    side: int
+    provenance: dict[str, Any]
+    sources: dict[str, Path]  # of each subject whose sources were written and unwrapped
+    rig_lights: int = RIG_LIGHTS  # of the mean face's shadows
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """The heads of the split train, and at most `held_out` of the split validation."""
+        places = {subject: place for place, subject in enumerate(self.dataset.subjects)}
+        train, validation = (
+            [places[subject] for subject in self.dataset.splits[split] if self.dataset.cameras[subject]]
+            for split in ("train", "validation")
+        )
+        for split, found in (("train", train), ("validation", validation)):
+            if not found:
+                raise InputError(
+                    f"{self.dataset.folder}: no subject in the split {split}; "
+                    "run prepare-dataset with another --split"
+                )
+        return torch.tensor(train), torch.tensor(validation[:held_out])
+
+    def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the face model's mean."""
+        settings = GeometrySettings(_MEAN_SIDE, self.rig_lights, bake=BakeSettings(bounce_samples=0))
+        mean = bake_head(self.model, 0, 0, settings)
+        normals = normal_map(mean["vertices"], grid_triangles(), _MEAN_SIDE)
+        return normals, mean["visibility"].float() / 255, mean["directions"]
+
+    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """One sample of every subject in `heads` [B], with `lights` target lights.
+
+        The albedo of real skin is not known: the exposure is taken from the face under a constant map of
+        radiance 1 in its place, which is the albedo less what other parts of the face hide of the map.
+        """
+        faces = [self._draw_face(self.dataset.subjects[int(head)], lights, generator) for head in heads]
+        visible = torch.stack([face.source.visible for face in faces])
+        source, target = photograph(
+            torch.stack([face.texture for face in faces]),
+            torch.stack([face.target for face in faces]),
+            torch.stack([face.source.lit for face in faces]),
+            visible,
+            generator,
+        )
+        return Sample(
+            source=torch.stack([inpaint(s, v[0]) for s, v in zip(source, visible, strict=True)]),
+            visible=visible,
+            normals_source=torch.stack([face.source.normals for face in faces]),
+            normals_target=torch.stack([face.normals_target for face in faces]),
+            lights=torch.stack([face.lights for face in faces]),
+            target=target,
+            weight=torch.stack([face.weight for face in faces]),
+        )
+
+    def _draw_face(self, subject: str, lights: int, generator: torch.Generator) -> "_Face":
+        pairs, weights = load_pairs(self.dataset).get(subject, ([], None))
+        if weights is None:
+            return self._draw_freely(subject, lights, generator)
+        row = int(torch.randint(len(pairs), (), generator=generator))
+        pair = pairs[row]
+        with self._opened(subject, pair.source_camera) as file:
+            source, texture = View.of(file), self._written(subject, row)
+            if texture is None:
+                texture = _lit(file, torch.from_numpy(np.array(weights[row])))
+        return self._face(subject, pair.target_camera, source, texture, pair.target_light, lights, generator)
+
+    def _draw_freely(self, subject: str, lights: int, generator: torch.Generator) -> "_Face":
+        """A sample of a subject without pairs: camera, light and target drawn here."""
+        cameras = self.dataset.cameras[subject]
+        camera, other = (cameras[int(i)] for i in torch.randint(len(cameras), (2,), generator=generator))
+        same = torch.rand((), generator=generator) < _SAME_POSE_SHARE
+        with self._opened(subject, camera) as file:
+            source = View.of(file)
+            texture = _lit(file, draw_light(source.directions, generator))
+        return self._face(subject, camera if same else other, source, texture, None, lights, generator)
+
+    def _face(
+        self,
+        subject: str,
+        target_camera: str,
+        source: "View",
+        texture: Tensor,
+        first_light: int | None,
+        lights: int,
+        generator: torch.Generator,
+    ) -> "_Face":
+        with self._opened(subject, target_camera) as file:
+            target = View.of(file)
+            lights = min(lights, len(target.directions))
+            chosen = draw_target_lights(target.directions, lights, generator)
+            if first_light is not None:  # the pair's own, and others beside it
+                rest = chosen[chosen != first_light]
+                chosen = torch.cat([torch.tensor([first_light]), rest])[:lights]
+            olats = file.get_slice("olats")
+            pictures = torch.stack([olats[int(light)] for light in chosen]).float()
+        turn = target.rotation @ source.rotation.T
+        return _Face(
+            source=source,
+            texture=texture,
+            target=pictures,
+            lights=target.directions[chosen],
+            normals_target=torch.einsum("dc,cij->dij", turn, source.normals),  # as `pipeline.predict_olat`
+            weight=target.visible * (0.3 + 0.7 * source.visible),
+        )
+
+    def _opened(self, subject: str, camera: str) -> Any:
+        return safe_open(texture_path(self.dataset, self.side, subject, camera), framework="pt")
+
+    def _written(self, subject: str, row: int) -> Tensor | None:
+        """The unwrapped source [3, T, T] of a subject's pair, where sources were written."""
+        if subject not in self.sources:
+            return None
+        return torch.from_numpy(np.load(self.sources[subject], mmap_mode="r")[row].astype(np.float32))
+
+
+@dataclass(frozen=True)
+class View:
+    """A subject in one camera's crop, unwrapped: fields [.., T, T] of the fitted chart, camera space."""
+
+    rotation: Tensor  # [3, 3] head_to_camera
+    directions: Tensor  # [L, 3]
+    normals: Tensor  # [3, T, T]
+    visible: Tensor  # [1, T, T]
+    lit: Tensor  # [3, T, T] under a constant map of radiance 1
+
+    @staticmethod
+    def of(file: Any) -> "View":
+        """What a texture file holds beside the lights."""
+        return View(*(file.get_tensor(name).float() for name in View.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class _Face:
+    source: View
+    texture: Tensor  # [3, T, T] of the source
+    target: Tensor  # [L, 3, T, T]
+    lights: Tensor  # [L, 3] in the target's camera space
+    normals_target: Tensor
+    weight: Tensor  # [1, T, T]
+
+
+def _lit(file: Any, weights: Tensor) -> Tensor:
+    """The texture [3, T, T] of a file's lights under weights [L, 3]."""
+    olats = file.get_tensor("olats")  # [L, 3, T, T]
+    channels = [weights[:, c] @ olats[:, c].flatten(1).float() for c in range(3)]
+    return torch.stack(channels).view(olats.shape[1:])
+
+
+def open_captured(
+    folder: Path, face_model: str, side: int, jobs: int, rig_lights: int = RIG_LIGHTS
+) -> Captured:
+    """The dataset in a folder, its textures made where they are missing; the split test is left alone."""
+    dataset, model = read_dataset(folder), load_face_model(face_model)
+    if model.name != dataset.face_model:
+        raise InputError(
+            f"{folder}: fitted with the face model {dataset.face_model}, not {model.name}; give --fit-with"
+        )
+    subjects = [*dataset.splits["train"], *dataset.splits["validation"]]
+    captured = Captured(dataset, model, side, _provenance(dataset, model), {}, rig_lights)
+    captured.heads(1)  # a split without subjects is named before anything is unwrapped
+    build_textures(dataset, face_model, side, subjects, jobs)
+    written = {subject: sources_path(dataset, side, subject) for subject in subjects}
+    return replace(captured, sources={name: path for name, path in written.items() if path.exists()})
+
+
+def _provenance(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
+    name = dataset.folder.resolve().name
+    return {
+        "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",
+        "dataset": dataset.provenance,
+        "fitted_with": f"{model.name} ({model.licence})",
+        "licence": _licence(dataset.provenance, name),
+    }
+
+
+def _licence(provenance: dict[str, Any], name: str) -> str:
+    """The words that the dataset or its capture has for its licence, if any."""
+    found = provenance.get("capture")
+    capture = found if isinstance(found, dict) else {}
+    if words := provenance.get("licence") or capture.get("licence"):
+        return str(words)
+    if capture.get("synthetic") is True and "face_model_licence" in capture:  # by `facerf synth-stage`
+        return f"MIT; the heads' shapes: {capture['face_model_licence']}"
+    return f"that of the dataset {name}"

@@ -1,0 +1,207 @@
+"""Captures of light stages on disk, read into one form: lamps, calibrated cameras, linear pictures.
+
+`stage.json` (layout 'stage') lies beside the pictures and says what they are:
+
+    {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
+     "colour_space": "lin_rec709", "black_level": 0.0,
+     "pattern": "{subject}/{camera}/{light}.exr",
+     "lights": [{"id": "L000", "direction": [x, y, z], "intensity": [r, g, b]}],
+     "cameras": [{"id": "C0", "width": 256, "height": 256, "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
+                  "world_to_camera": 3 x 4 or 4 x 4}],
+     "subjects": {"0000": {traits}}, "provenance": {...}}
+
+Directions are unit vectors of the world toward the light. K is in pixels whose centres lie at index + 0.5.
+world_to_camera has OpenCV's axes (y down, z forward); it becomes DESIGN's (y up, z toward the camera) here
+and nowhere else. Intensities are linear Rec.709 in DESIGN's unit of light; the black level is linear too.
+Without `subjects` whoever has pictures is one.
+"""
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from facerf_cli.colour import named_space
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.joint_fit import PosedCamera
+from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
+from facerf_cli.stage.data.documents import Node, read_document, unique_ids
+
+STAGE_FILE, STAGE_FORMAT = "stage.json", "facerf-stage-1"
+MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
+_FIELDS = ("subject", "camera", "light")
+_LONGEST_SIDE_PX = 65_536
+_ORTHONORMAL_OFF = 1e-3
+_ASPECT_OFF = 0.01  # of fx from fy: a face crop has square pixels
+_OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A capture in DESIGN's axes and units; `pattern` holds {subject}, {camera} and {light}."""
+
+    folder: Path
+    pattern: str
+    colour_space: str
+    black_level: float
+    light_ids: tuple[str, ...]
+    directions_world: np.ndarray  # [L, 3] unit, toward the lights
+    intensities: np.ndarray  # [L, 3] positive
+    cameras: dict[str, PosedCamera]
+    subjects: dict[str, dict[str, Any]]  # traits by subject, sorted
+    provenance: dict[str, Any]
+
+    def frame_path(self, subject: str, camera: str, light: str) -> Path:
+        """The picture of a subject seen by a camera under one light."""
+        return self.folder / _filled(self.pattern, subject=subject, camera=camera, light=light)
+
+    def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
+        """That picture [H, W, 3] under a light of rgb 1, linear Rec.709, float32.
+
+        Values that are NaN or infinite count as 0, with a warning. What noise or a wide gamut brings below
+        the black level stays negative here, so that sums are not biased.
+        """
+        path = self.frame_path(subject, camera, self.light_ids[light])
+        picture = read_image(path, self.colour_space, non_finite="zero")
+        pixels = picture.pixels if picture.alpha is None else picture.pixels * picture.alpha[..., None]
+        posed = self.cameras[camera]
+        if pixels.shape[:2] != (posed.height_px, posed.width_px):
+            raise InputError(
+                f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels; camera {camera} has "
+                f"{posed.width_px} x {posed.height_px}"
+            )
+        return (pixels - np.float32(self.black_level)) / self.intensities[light].astype(np.float32)
+
+
+def read_capture(folder: Path, layout: str = "stage") -> Capture:
+    """Read a capture's description in one of `LAYOUTS`; no pictures yet."""
+    if layout not in LAYOUTS:
+        raise UsageError(f"--layout {layout}: not known; there is {', '.join(sorted(LAYOUTS))}")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder")
+    return LAYOUTS[layout](folder)
+
+
+def _read_stage(folder: Path) -> Capture:
+    root = read_document(folder / STAGE_FILE, "a capture has one, see the manual of `facerf prepare-dataset`")
+    for key, value in (("format", STAGE_FORMAT), ("axes", "opencv"), ("unit", "m")):
+        if root[key].value != value:
+            raise root[key].wrong(f"'{value}'")
+    lights, cameras = root["lights"].items(MOST_LIGHTS), root["cameras"].items(MOST_CAMERAS)
+    for key, nodes in (("lights", lights), ("cameras", cameras)):
+        if not nodes:
+            raise root[key].wrong("one entry at least")
+    light_ids, camera_ids = unique_ids(lights), unique_ids(cameras)
+    pattern, subjects = _pattern(root["pattern"]), root.get("subjects")
+    return Capture(
+        folder=folder,
+        pattern=pattern,
+        colour_space=_colour_space(root["colour_space"]),
+        black_level=float(root["black_level"].array()),
+        light_ids=tuple(light_ids),
+        directions_world=np.stack([node["direction"].unit() for node in lights]),
+        intensities=np.stack([_intensity(node) for node in lights]),
+        cameras={name: _camera(node) for name, node in zip(camera_ids, cameras, strict=True)},
+        subjects=(
+            {name: {} for name in _found_subjects(folder, pattern, camera_ids, light_ids)}
+            if subjects is None
+            else {name: node.table() for name, node in sorted(subjects.entries(MOST_SUBJECTS).items())}
+        ),
+        provenance={} if (node := root.get("provenance")) is None else node.table(),
+    )
+
+
+LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": _read_stage}
+
+
+def _colour_space(node: Node) -> str:
+    try:
+        named_space(node.text())
+    except UsageError as error:
+        raise InputError(f"{node.where}: {error}") from None
+    return node.text()
+
+
+def _intensity(light: Node) -> np.ndarray:
+    intensity = light["intensity"].array(3)
+    if not (intensity > 0).all():
+        name = light["id"].name()
+        raise light["intensity"].wrong(f"light in every channel (lamp {name} cannot be divided out)")
+    return intensity
+
+
+def _camera(node: Node) -> PosedCamera:
+    width, height = (node[key].whole(1, _LONGEST_SIDE_PX) for key in ("width", "height"))
+    if width * height > PHOTO_LIMIT_PX:
+        raise node["width"].wrong(f"a picture of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels")
+    k = node["K"].array(3, 3)
+    fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
+    if not (min(fx, fy) > 0 and np.allclose(k, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * fx)):
+        raise node["K"].wrong("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0")
+    if abs(fx / fy - 1) > _ASPECT_OFF:
+        raise node["K"].wrong("fx within 1 % of fy (square pixels)")
+    rotation, translation_m = _pose(node["world_to_camera"])
+    return PosedCamera(
+        focal_px=(float(fx), float(fy)),
+        centre_px=(float(cx), float(cy)),
+        width_px=width,
+        height_px=height,
+        rotation=torch.from_numpy(_OPENCV_TO_OURS @ rotation),
+        translation_m=torch.from_numpy(_OPENCV_TO_OURS @ translation_m),
+    )
+
+
+def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3], the nearest to what is written, and translation [3]."""
+    rows = len(node.value) if isinstance(node.value, list) else 0
+    matrix = node.array(4 if rows == 4 else 3, 4)
+    if rows == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise node.wrong("0 0 0 1 in the last row")
+    u, stretch, vh = np.linalg.svd(matrix[:3, :3])
+    if not np.abs(stretch - 1).max() < _ORTHONORMAL_OFF or np.linalg.det(u @ vh) < 0:
+        raise node.wrong("a rotation without stretch or reflection, and a translation in metres")
+    return u @ vh, matrix[:3, 3]
+
+
+def _pattern(node: Node) -> str:
+    """A relative path that names each field, and leads nowhere else."""
+    pattern = node.text()
+    parts = pattern.split("/")
+    plain = re.sub(r"\{(subject|camera|light)\}", "", pattern)
+    if (
+        any(f"{{{field}}}" not in pattern for field in _FIELDS)
+        or not plain.isprintable()
+        or re.search(r"[{}\\:*?]", plain)
+        or any(part in ("", ".", "..") for part in parts)
+        or len(pattern) > 500
+    ):
+        raise node.wrong("a path below the capture with {subject}, {camera} and {light} in it")
+    return pattern
+
+
+def _filled(pattern: str, **names: str) -> str:
+    for field, name in names.items():
+        pattern = pattern.replace(f"{{{field}}}", name)
+    return pattern
+
+
+def _found_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[str]) -> Iterator[str]:
+    """Whoever has a picture, in order: the files or folders at the pattern's part that names the subject."""
+    parts = pattern.split("/")
+    depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
+    expression = re.escape("/".join(parts[: depth + 1]))
+    for field in _FIELDS:
+        first, *rest = expression.split(re.escape(f"{{{field}}}"))
+        named = [f"(?P<{field}>[^/]+)", *[f"(?P={field})"] * (len(rest) - 1)] if rest else []
+        expression = first + "".join(name + part for name, part in zip(named, rest, strict=True))
+    above = _filled("/".join([*parts[:depth], "*"]), camera="*", light="*")
+    relatives = (path.relative_to(folder).as_posix() for path in folder.glob(above) if path.name[0] != ".")
+    matches = (re.fullmatch(expression, relative) for relative in relatives)
+    for name in sorted({match["subject"] for match in matches if match}):
+        paths = (folder / _filled(pattern, subject=name, camera=c, light=i) for c in cameras for i in lights)
+        if any(path.exists() for path in paths):
+            yield Node(f"{folder}: a subject", name).name()

@@ -1,0 +1,124 @@
+"""Environment maps as the weights of a dataset's lights.
+
+**In which frame a map stands.** A stack's lights are in its crop's camera space, d_crop = R_fit
+R_world_to_head d_world, so they differ from camera to camera although the lamps stay where they are. A map
+must stay where it is, too: it is weighed once, over the lamps' directions in the world, and the same weights
+serve every camera and every subject. To each camera that is the map turned by R_fit R_world_to_head. A
+rotation is one about the world's vertical. Captures name their axes as they like, so `world_to_map` finds the
+vertical by the heads: the world's axis that is nearest to their up is the map's y, the one nearest to where
+they look is its z.
+"""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
+from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.light.envmap import check_envmap, rotated_weights
+from facerf_cli.stage.data.dataset import Dataset
+from facerf_cli.stage.sky.skies import ProceduralMaps, draw_sky
+from facerf_cli.stage.threads import one_thread
+
+_HEADS_ASKED = 16  # for the vertical
+_PROCEDURAL = re.compile(r"procedural:(\d+):(\d+):(\d+)")
+
+
+def name_maps(maps: Sequence[Path] | ProceduralMaps) -> list[str]:
+    """What pairs call the maps by."""
+    if isinstance(maps, ProceduralMaps):
+        return [f"procedural:{index}:{maps.seed}:{maps.width_px}" for index in range(len(maps))]
+    return [str(path.absolute()) for path in maps]
+
+
+def read_map(name: str) -> Tensor:
+    """The lat-long map [H, W, 3] that a pair names, linear; an InputError says what is wrong with it."""
+    if drawn := _PROCEDURAL.fullmatch(name):
+        return torch.from_numpy(draw_sky(int(drawn[1]), int(drawn[2]), int(drawn[3]))[0])
+    envmap = torch.from_numpy(read_image(name, limit_px=ENVMAP_LIMIT_PX).pixels)
+    try:
+        check_envmap(envmap)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    return envmap
+
+
+@dataclass(frozen=True, eq=False)
+class MapWork:
+    """A map, the lights that it is weighed over, and how it is turned."""
+
+    name: str
+    directions: Tensor  # [L, 3] in the map's axes: `map_directions`
+    rotations_deg: tuple[float, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class MapWeights:
+    """The lights' weights under a map that is turned, times 2 to the power of `exposure_ev`."""
+
+    weights: np.ndarray  # [R, L, 3]
+    exposure_ev: int
+
+
+Weighed = MapWeights | str  # or what is wrong with the map
+
+
+def weigh_map(work: MapWork) -> Weighed:
+    """The weights of one map at all its rotations, exposed, or what is wrong with it."""
+    try:
+        envmap = read_map(work.name)
+    except InputError as error:
+        return str(error)
+    with one_thread():
+        weights = rotated_weights(envmap, work.directions, (0.0, *work.rotations_deg))
+    mean = float(weights[0].double().sum(0).mean()) / 4  # of the radiance: pi sum(w) is its integral
+    if not mean > 0:
+        return f"{work.name}: there is no light in this map"
+    exposure_ev = -round(math.log2(mean))
+    return MapWeights((weights[1:] * 2.0**exposure_ev).numpy(), exposure_ev)
+
+
+def map_directions(dataset: Dataset) -> Tensor:
+    """The lights of a dataset [L, 3] in the maps' axes, float64."""
+    return torch.from_numpy(dataset.directions_world @ world_to_map(dataset).T)
+
+
+def world_to_map(dataset: Dataset) -> np.ndarray:
+    """The world's axes renamed [3, 3] (a signed permutation), so that y is up and z is where faces look.
+
+    By the first heads of the dataset: a stack's lights and its rotation say how its head stands in the world.
+    """
+    heads = [
+        _world_to_head(dataset, subject, cameras[0])
+        for subject, cameras in list(dataset.cameras.items())[:_HEADS_ASKED]
+        if cameras
+    ]
+    mean = np.mean(heads, 0)
+    candidates = [
+        np.eye(3)[list(order)] * np.array(signs)[:, None]
+        for order, signs in product(permutations(range(3)), product((1, -1), repeat=3))
+    ]
+    proper = [turn for turn in candidates if np.linalg.det(turn) > 0]
+    return max(proper, key=lambda turn: 2 * turn[1] @ mean[1] + turn[2] @ mean[2])  # up counts most
+
+
+def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
+    """The rotation [3, 3] that takes the world's lights to a stack's, seen from the head."""
+    path = dataset.stack_path(subject, camera)
+    header = read_olat_header(path)
+    if len(header.directions) != len(dataset.directions_world):
+        raise InputError(
+            f"{path}: {len(header.directions)} lights, the dataset has {len(dataset.directions_world)}; "
+            "run prepare-dataset again"
+        )
+    in_head = header.directions @ header.rotation
+    u, _, vt = np.linalg.svd(in_head.T @ dataset.directions_world)
+    return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)

@@ -1,0 +1,267 @@
+"""From a capture to prepared data, a subject at a time: landmarks, one head, crops, OLAT stacks, a sheet.
+
+Pictures are read one by one, twice: once for the fully lit sum that the face is found on, once for the stack.
+Never more than one camera's sum is held.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli import __version__
+from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit, quality_of, save_fit
+from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
+from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.overlay import draw_fit
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.images import write_display
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.report import contact_sheet, mark_light
+from facerf_cli.stage.data.dataset import (
+    FORMAT,
+    SPLITS,
+    Split,
+    constant_weights,
+    fit_path,
+    record_path,
+    sheet_path,
+    stack_header,
+    stack_path,
+)
+from facerf_cli.stage.data.documents import read_document, write_document
+from facerf_cli.stage.data.layouts import Capture
+
+_TILE_PX = 192  # of the sheets
+_SHOWN_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # the sheets' three lights, to the camera
+_COLOUR_SPACE = "lin_rec709"
+
+
+def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
+    """All files of a subject; the last of them is written last."""
+    paths = [place(folder, subject, camera) for camera in capture.cameras for place in (stack_path, fit_path)]
+    return [*paths, sheet_path(folder, subject), record_path(folder, subject)]
+
+
+def prepare_subject(
+    capture: Capture, subject: str, model: MorphableModel, folder: Path, crop_px: int, key: str
+) -> dict[str, Any]:
+    """Write a subject's stacks, fits, sheet and record; give the record. `key` is of `preparation_key`."""
+    record_path(folder, subject).unlink(missing_ok=True)
+    landmarks = [_find_landmarks(capture, subject, camera) for camera in capture.cameras]
+    try:
+        joint = fit_views(model, list(capture.cameras.values()), landmarks)
+    except InputError as error:
+        raise InputError(f"{subject}: {error}") from None
+    cameras, rows = {}, []
+    for camera, landmarks_px, error_iod in zip(capture.cameras, landmarks, joint.error_iod, strict=True):
+        seen_px = None if error_iod is None else landmarks_px  # lost ones are as good as none
+        error_iod = joint.mean_error_iod if error_iod is None else error_iod
+        posed = capture.cameras[camera]
+        fit, off_iod = fit_in_crop(model, joint, posed, seen_px, error_iod, crop_px)
+        rows.append(_write_camera(capture, subject, camera, model, joint, fit, folder))
+        cameras[camera] = {
+            "face_found": seen_px is not None,
+            "error_iod": round(error_iod, 5),
+            "quality": fit.quality,
+            "crop_off_iod": round(off_iod, 5),
+        }
+    write_display(sheet_path(folder, subject), contact_sheet(np.concatenate(rows), len(rows[0])))
+    record = {
+        "prepared": key,
+        "error_iod": round(joint.mean_error_iod, 5),
+        "quality": quality_of(joint.mean_error_iod),
+        "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
+        "cameras": cameras,
+    }
+    write_document(record_path(folder, subject), record)
+    return record
+
+
+def _find_landmarks(capture: Capture, subject: str, camera: str) -> np.ndarray | None:
+    """Landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
+    weights = constant_weights(capture.directions_world)
+    posed = capture.cameras[camera]
+    lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
+    for light, weight in enumerate(weights):
+        lit += weight * capture.frame(subject, camera, light)
+    faces = detect_landmarks(to_display(lit))
+    return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
+
+
+def _write_camera(
+    capture: Capture,
+    subject: str,
+    camera: str,
+    model: MorphableModel,
+    joint: JointFit,
+    fit: FaceFit,
+    folder: Path,
+) -> np.ndarray:
+    """Write a camera's stack and fit; give its tiles [6, h, w, 3] of the sheet."""
+    posed = capture.cameras[camera]
+    world_to_crop = (
+        fit.rotation.double() @ joint.rotation.mT
+    )  # through the head: lights turn with the normals
+    directions = capture.directions_world @ world_to_crop.numpy().T
+    source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
+    inside = fit.crop.valid(posed.height_px, posed.width_px)
+    metadata = {
+        "Software": f"facerf {__version__}",
+        "facerf:version": __version__,
+        "facerf:input": f"{subject}/{camera}",
+        "facerf:face_model": model.name,
+        "facerf:face_model_licence": model.licence,
+    }
+    header = stack_header(model, fit, directions, source, inside, metadata)
+    if not header.seen.any():
+        raise InputError(f"{subject}: camera {camera} does not see the face that the others do")
+    shown: dict[int, np.ndarray] = dict.fromkeys(_lights_shown(directions), source)
+    crops = _crops(capture, subject, camera, fit.crop, header, shown)
+    write_olat_stack(stack_path(folder, subject, camera), header, crops)
+    with atomic_path(fit_path(folder, subject, camera)) as temporary:
+        save_fit(temporary, fit)
+    return _tiles(header, fit, model, shown)
+
+
+def _crops(
+    capture: Capture, subject: str, camera: str, crop: Crop, header: StackHeader, shown: dict[int, np.ndarray]
+) -> Iterator[Tensor]:
+    """A camera's pictures in the crop [1, 3, S, S], one by one; `shown` keeps those whose numbers it has.
+
+    The header's source fills up on the way; `write_olat_stack` writes it last. Only here, where the crop has
+    averaged noise, do values below the black level become 0.
+    """
+    for light, weight in enumerate(constant_weights(header.directions)):
+        picture = np.maximum(crop.apply(capture.frame(subject, camera, light)), 0)
+        np.add(header.source, weight * picture, out=header.source)
+        if light in shown:
+            shown[light] = picture
+        yield torch.from_numpy(picture).permute(2, 0, 1)[None]
+
+
+def _lights_shown(directions: np.ndarray) -> list[int]:
+    """Three lights of the sheet: those nearest to a lamp in front, on the left and on the right."""
+    wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHOWN_AZEL_DEG])
+    return (wanted @ directions.T).argmax(1).tolist()
+
+
+def _tiles(
+    header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
+) -> np.ndarray:
+    """Fully lit, the fit over it, what the mask leaves of it, three single lights: [6, h, w, 3].
+
+    Linear, exposed for display: each on its own, but the three lights alike.
+    """
+    side_px = fit.crop.size_px
+    lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
+    overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
+    masked = lit * (0.1 + 0.9 * header.seen[..., None])
+    single = np.stack([shown[light] for light in _lights_shown(header.directions)])
+    single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
+    small = Crop(0.0, 0.0, float(side_px), min(side_px, _TILE_PX))
+    tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])
+    for tile, light in zip(tiles[3:], _lights_shown(header.directions), strict=True):
+        mark_light(tile, header.directions[light], 1.0)
+    return tiles
+
+
+def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int) -> str:
+    """What a subject's files depend on besides its pictures, as a short digest."""
+    content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
+    """The records of the subjects that are finished, by subject."""
+    return {
+        subject: read_document(record_path(folder, subject), "").table()
+        for subject in capture.subjects
+        if all(path.exists() for path in subject_outputs(capture, subject, folder))
+    }
+
+
+def describe_dataset(
+    capture: Capture,
+    records: Mapping[str, Mapping[str, Any]],
+    split: Split,
+    seed: int,
+    model: MorphableModel,
+    face_model_sha256: str,
+    crop_px: int,
+) -> dict[str, Any]:
+    """The content of `dataset.json`; subjects without a record are those that failed."""
+    splits = split.of(capture.subjects, seed)
+    return {
+        "format": FORMAT,
+        "capture": capture.folder.resolve().name,
+        "face_model": model.name,
+        "crop_px": crop_px,
+        "colour_space": _COLOUR_SPACE,
+        "axes": "x right, y up, z toward the camera; metres; pixel centres at index + 0.5",
+        **_calibration(capture),
+        "splits": {name: [subject for subject in splits[name] if subject in records] for name in SPLITS},
+        "subjects": {
+            subject: {"traits": traits, **_status(records.get(subject))}
+            for subject, traits in capture.subjects.items()
+        },
+        "provenance": {
+            "software": f"facerf {__version__}",
+            "face_model_licence": model.licence,
+            "face_model_sha256": face_model_sha256,
+            "split_seed": seed,
+            "capture": capture.provenance,
+        },
+    }
+
+
+def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
+    if record is None:
+        return {"status": "failed"}
+    known = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
+    return {"status": "done", **known, "cameras": list(record["cameras"])}
+
+
+def _calibration(capture: Capture) -> dict[str, Any]:
+    """Lights, cameras and what was done to the pictures' values."""
+    lights = zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
+    gains = zip(capture.light_ids, (1 / capture.intensities).tolist(), strict=True)
+    return {
+        "rig": {"lights": [{"id": name, "direction_world": direction} for name, direction in lights]},
+        "cameras": [
+            {
+                "id": name,
+                "width": posed.width_px,
+                "height": posed.height_px,
+                "focal_px": posed.focal_px,
+                "centre_px": posed.centre_px,
+                "world_to_camera": torch.cat([posed.rotation, posed.translation_m[:, None]], 1).tolist(),
+            }
+            for name, posed in capture.cameras.items()
+        ],
+        "normalisation": {
+            "from": capture.colour_space,
+            "to": _COLOUR_SPACE,
+            "black_level": capture.black_level,
+            "gain": dict(gains),
+            "non_finite": "set to 0",
+            "negative": "set to 0 after the crop",
+        },
+    }
+
+
+def sha256_of(path: Path) -> str:
+    """The digest of a file's bytes."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

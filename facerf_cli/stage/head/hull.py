@@ -1,0 +1,95 @@
+"""The outside of a head as one height field, so that what is worn stays out of the skin.
+
+The field is a capsule's: above the skull's middle a point is measured along the ray from that middle, below
+it along the horizontal from the vertical line through it. So crown, neck and shoulders all have one radius
+for every azimuth and arc, where arc is 0 at the middle's height, positive above, and negative below.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from facerf_cli.stage.head.mesh import PARTS, HeadMesh
+
+_AZIMUTHS = 96
+_ARC_M = 0.004  # height of a cell
+_RADIUS_M = 0.09  # arc per radian of elevation
+_LOWEST_M = -0.36  # arc of the lowest row
+_MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skull, above the ears
+_SLICE_M = (0.07, 0.09)  # of heights, where front and back of the skull are looked for
+_STEP_M = 0.002  # over which the field's slope is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Radius [rows, azimuths] in metres of the outermost surface about `middle` [3]; smooth and closed."""
+
+    middle: np.ndarray
+    radius: np.ndarray
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """How far [...] outside the hull points [..., 3] lie, along the capsule's ray; negative inside."""
+        out, azimuth, arc = self._coordinates(points)
+        column = azimuth / (2 * np.pi) * _AZIMUTHS
+        row = np.clip((arc - _LOWEST_M) / _ARC_M, 0, len(self.radius) - 1)
+        padded = np.concatenate([self.radius, self.radius[:, :1]], 1)
+        return out - map_coordinates(padded, [row, column % _AZIMUTHS], order=1, mode="nearest")
+
+    def rays(self, points: np.ndarray) -> np.ndarray:
+        """The unit direction [..., 3] in which the height of points [..., 3] is measured."""
+        offset = points - self.middle
+        offset = np.stack([offset[..., 0], np.maximum(offset[..., 1], 0), offset[..., 2]], -1)
+        return offset / np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1e-9)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Unit normals [..., 3] of the level surfaces of height through points [..., 3]."""
+        here = self.height(points)
+        slope = np.stack([self.height(points + step) - here for step in np.eye(3) * _STEP_M], -1)
+        return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
+
+    def lifted(self, points: np.ndarray, least: np.ndarray | float) -> np.ndarray:
+        """Points [..., 3], those lower than `least` [...] pushed out to that height."""
+        short = np.maximum(least - self.height(points), 0)
+        return points + short[..., None] * self.rays(points)
+
+    def _coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        x, y, z = np.moveaxis(points - self.middle, -1, 0)
+        level = np.hypot(x, z)
+        above = np.maximum(y, 0)
+        arc = np.where(y > 0, _RADIUS_M * np.arctan2(above, level), y)
+        return np.hypot(level, above), np.arctan2(x, z) % (2 * np.pi), arc
+
+
+def hull_of(head: HeadMesh, smooth_cells: float = 0.8) -> Hull:
+    """The hull of a head's skin, and of the clothes where it wears some."""
+    corners = head.vertices[head.triangles[np.isin(head.part[head.triangles[:, 0]], _outer())]].astype(float)
+    coarse = corners[np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1) > _ARC_M]
+    sampled = [corners.mean(1), corners[:, 0], *(coarse[:, k] for k in (1, 2))]
+    points = np.concatenate([*sampled, *((coarse[:, k] + coarse[:, k - 1]) / 2 for k in range(3))])
+    hull = Hull(_middle(points), np.zeros((1, _AZIMUTHS)))
+    out, azimuth, arc = hull._coordinates(points)
+    rows = int((np.pi / 2 * _RADIUS_M - _LOWEST_M) / _ARC_M) + 2
+    row = np.clip(np.rint((arc - _LOWEST_M) / _ARC_M).astype(int), 0, rows - 1)
+    column = np.rint(azimuth / (2 * np.pi) * _AZIMUTHS).astype(int) % _AZIMUTHS
+    radius = np.zeros((rows, _AZIMUTHS))
+    np.maximum.at(radius, (row, column), out)
+    return Hull(hull.middle, gaussian_filter(_filled(radius), smooth_cells, mode=("nearest", "wrap")))
+
+
+def _outer() -> list[int]:
+    return [PARTS.index("skin"), PARTS.index("cloth")]
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The capsule's middle [3], halfway between the forehead and the back of the skull."""
+    belt = points[(points[:, 1] > _SLICE_M[0]) & (points[:, 1] < _SLICE_M[1])]
+    return np.array([0, _MIDDLE_M, (belt[:, 2].min() + belt[:, 2].max()) / 2])
+
+
+def _filled(radius: np.ndarray) -> np.ndarray:
+    """Cells that no point fell into take the nearest one's radius, around the back too."""
+    third = radius.shape[1]
+    tiled = np.tile(radius, (1, 3))
+    nearest = distance_transform_edt(tiled == 0, return_distances=False, return_indices=True)
+    return tiled[tuple(nearest)][:, third : 2 * third]

@@ -1,0 +1,63 @@
+"""Procedural environment maps by seed and number: lat-long [H, 2 H, 3], scene-linear Rec.709.
+
+The kinds are in `outdoors.py` and `interiors.py`; conventions of directions: `light/sphere.py`.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from facerf_cli.errors import UsageError
+from facerf_cli.stage.sky.interiors import hall, stage, studio, windows
+from facerf_cli.stage.sky.outdoors import dusk, night, overcast, sun
+from facerf_cli.stage.sky.sky_grid import Grid, Random, make_grid
+
+_PEAK = 60000.0  # what half floats hold, with room
+KINDS: dict[str, Callable[[Grid, Random], np.ndarray]] = {
+    kind.__name__: kind for kind in (sun, dusk, overcast, windows, hall, studio, night, stage)
+}
+# How often each is drawn, were there sixteen maps.
+MIX = (*4 * ("sun",), *2 * ("dusk", "overcast", "windows", "hall", "studio"), "night", "stage")
+
+
+def kind_of(index: int, seed: int, kinds: Sequence[str] = MIX) -> str:
+    """The kind of the map with this index: a function of (seed, index) and nothing else."""
+    return kinds[int(np.random.default_rng([seed, index, 0]).integers(len(kinds)))]
+
+
+def draw_sky(index: int, seed: int, width_px: int, kinds: Sequence[str] = MIX) -> tuple[np.ndarray, str]:
+    """A map [width / 2, width, 3] float32 and its kind; the same whatever was drawn before.
+
+    Mean radiance over the sphere is 1, or less where the brightest pixel would leave the range of halves.
+    """
+    kind, grid = kind_of(index, seed, kinds), make_grid(width_px)
+    radiance = KINDS[kind](grid, np.random.default_rng([seed, index, 1]))
+    mean = (radiance.mean(-1) * grid.solid_angles_sr).sum() / (4 * np.pi)
+    return (radiance / max(mean, radiance.max() / _PEAK)).astype(np.float32), kind
+
+
+@dataclass(frozen=True)
+class ProceduralMaps:
+    """So many maps, each drawn when it is asked for."""
+
+    maps: int
+    seed: int
+    width_px: int
+
+    def __len__(self) -> int:
+        return self.maps
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if not 0 <= index < self.maps:
+            raise IndexError(index)
+        return draw_sky(index, self.seed, self.width_px)[0]
+
+
+def parse_envmaps(text: str, seed: int, width_px: int = 256) -> ProceduralMaps:
+    """`procedural:N`, the word for maps that are drawn instead of read."""
+    match = re.fullmatch(r"procedural:([1-9]\d{0,8})", text)
+    if not match:
+        raise UsageError(f"{text}: write procedural:N with a number of maps, such as procedural:100")
+    return ProceduralMaps(int(match[1]), seed, width_px)
