@@ -62,7 +62,8 @@ def relight_dataset(
     """
     from facerf_cli.stage.data.dataset import read_dataset
     from facerf_cli.stage.data.map_weights import name_maps
-    from facerf_cli.stage.data.recipes import RELIT, draw_pairs, pairs_path, settle_pairs
+    from facerf_cli.stage.data.pair_weights import settle_pairs
+    from facerf_cli.stage.data.recipes import RELIT, draw_pairs, pairs_path
     from facerf_cli.stage.sky.skies import parse_envmaps
 
     settings = settings_of(context)
@@ -104,7 +105,7 @@ class _Relight:
 
     def __call__(self, item: Item) -> Outcome:
         """Write the sources that are missing."""
-        from facerf_cli.stage.data.recipes import load_pairs
+        from facerf_cli.stage.data.pair_weights import load_pairs
         from facerf_cli.stage.data.relighting import relight_subject
 
         pairs, weights = load_pairs(self.dataset)[item.name]

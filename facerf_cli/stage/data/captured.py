@@ -21,7 +21,7 @@ from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map
 from facerf_cli.stage.data.dataset import Dataset, read_dataset
-from facerf_cli.stage.data.recipes import load_pairs
+from facerf_cli.stage.data.pair_weights import load_pairs
 from facerf_cli.stage.data.textures import build_textures, sources_path, texture_path
 from facerf_cli.stage.geometries import GeometrySettings, bake_head
 from facerf_cli.stage.lights import draw_light

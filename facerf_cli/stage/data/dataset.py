@@ -13,6 +13,7 @@ capture has it; each stack holds its lights in its own crop's camera space.
 import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage.data.documents import Node, read_document, unique_ids
 from facerf_cli.stage.data.layouts import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
@@ -58,7 +59,11 @@ class Dataset:
 
     def split_of(self, subject: str) -> str:
         """'train', 'validation', 'test', or '' for a subject that is in none."""
-        return next((split for split in SPLITS if subject in self.splits[split]), "")
+        return self._split_by_subject.get(subject, "")
+
+    @cached_property
+    def _split_by_subject(self) -> dict[str, str]:
+        return {subject: split for split, members in self.splits.items() for subject in members}
 
     def stack_path(self, subject: str, camera: str) -> Path:
         """The OLAT stack of a subject seen by a camera."""
@@ -127,6 +132,8 @@ def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:
         if node["status"].text() == "done":
             nodes = node["cameras"].items(MOST_CAMERAS)
             cameras[subject] = tuple(camera.name() for camera in nodes)
+            if not nodes:
+                raise node["cameras"].wrong("a camera at least")
             for camera in nodes:
                 if camera.value not in known or cameras[subject].count(camera.value) > 1:
                     raise camera.wrong("one of the dataset's cameras, once")
@@ -222,10 +229,11 @@ def stack_header(
     """The header of a stack of pictures [S, S, 3] in a fit's crop, lit from camera-space directions [L, 3].
 
     `source` [S, S, 3] is the crop under a constant map of radiance 1; `inside` [S, S] tells which of its
-    pixels the photo holds. The face is seen where the fitted mesh covers those.
+    pixels the photo holds. The face is seen where the front of the fitted mesh covers those.
     """
     vertices, triangles = fit.vertices_camera(model), grid_triangles()
     fragments = rasterize(vertices, triangles, fit.camera)
+    front = front_facing(vertices, triangles)[fragments.triangle] & fragments.covered
     normals = interpolate(vertex_normals(vertices, triangles), triangles, fragments)
     normals = torch.nn.functional.normalize(normals, dim=-1)
     return StackHeader(
@@ -233,7 +241,7 @@ def stack_header(
         directions=directions,
         rotation=fit.rotation.double().numpy(),
         source=source,
-        seen=(fragments.covered.numpy() & inside).astype(np.float32),
+        seen=(front.numpy() & inside).astype(np.float32),
         normals=normals.numpy(),
         layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(fit),

@@ -1,8 +1,10 @@
 """JSON that a user brings: read within bounds, and every entry checked, with one line that says where."""
 
+import hashlib
 import json
 import math
 import re
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ from facerf_cli.files.atomic import atomic_path
 _LIMIT_BYTES = 64 << 20
 # Names become parts of paths: no separators, nothing hidden, nothing that climbs out of a folder.
 _NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")
+_RESERVED = (" ", ".", ".json", ".jsonl")  # ends of names; a dataset has files of its own that end so
 _LARGEST, _UNIT_OFF = 1e12, 1e-3
 
 
@@ -51,7 +54,7 @@ class Node:
 
     def name(self) -> str:
         """A string that can stand in a file's name, such as a subject's or a camera's."""
-        if not _NAME.fullmatch(self.text()) or self.text().endswith((" ", ".")):
+        if not _NAME.fullmatch(self.text()) or self.text().endswith(_RESERVED):
             raise self.wrong("a name of letters, digits, - and _")
         return self.text()
 
@@ -106,20 +109,34 @@ class Node:
 def read_document(path: Path, missing: str) -> Node:
     """The JSON document in a file; `missing` says what to do where there is none."""
     try:
-        size = path.stat().st_size
-        text = path.read_text(encoding="utf-8") if size <= _LIMIT_BYTES else ""
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(f"{path}: is no file")
+        with path.open("rb") as stream:
+            content = stream.read(_LIMIT_BYTES + 1)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; {missing}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if len(content) > _LIMIT_BYTES:
+        raise InputError(f"{path}: more than {_LIMIT_BYTES >> 20} MiB are too many for a description")
+    try:
+        return Node(str(path), _parsed(content.decode("utf-8")))
     except UnicodeDecodeError:
         raise InputError(f"{path}: not JSON (it is no text in UTF-8)") from None
-    if size > _LIMIT_BYTES:
-        raise InputError(f"{path}: {size >> 20} MiB are too many for a description")
-    try:
-        return Node(str(path), json.loads(text, parse_constant=_no_number, parse_float=_finite))
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error})") from None
+
+
+def _parsed(text: str) -> Any:
+    return json.loads(text, parse_constant=_no_number, parse_float=_finite, object_pairs_hook=_each_key_once)
+
+
+def _each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} stands twice in an object")
+    return table
 
 
 def _no_number(text: str) -> float:
@@ -132,10 +149,18 @@ def _finite(text: str) -> float:
 
 
 def write_document(path: Path, content: Mapping[str, Any]) -> None:
-    """Write JSON for people and programs, whole or not at all; NaN is a ValueError."""
+    """Write JSON for people and programs, whole or not at all; NaN is a ValueError.
+
+    Halves of surrogate pairs, which are no UTF-8, stay the escapes that they can only have been.
+    """
     text = json.dumps(content, allow_nan=False, ensure_ascii=False, indent=1)
     with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def digest(content: bytes) -> str:
+    """What tells contents apart in a file's name or a record: 16 digits of their SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def unique_ids(nodes: list[Node]) -> list[str]:

@@ -20,7 +20,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.images import HALF_MAX, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.stage.data.dataset import Dataset
-from facerf_cli.stage.data.recipes import Pair, pair_weights, picture_path
+from facerf_cli.stage.data.pair_weights import pair_weights
+from facerf_cli.stage.data.recipes import Pair, picture_path
 from facerf_cli.stage.threads import one_thread
 
 TILE_PICTURES = 128

@@ -7,7 +7,6 @@ Made by `build_textures` where missing or older than the stack; all of it can be
 the subject's pairs and stacks.
 """
 
-import hashlib
 import logging
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -30,7 +29,9 @@ from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olat
 from facerf_cli.raster.texture import normal_map, unwrap
 from facerf_cli.records import LOGGER_NAME, json_line
 from facerf_cli.stage.data.dataset import Dataset
-from facerf_cli.stage.data.recipes import Pair, load_pairs, picture_path
+from facerf_cli.stage.data.documents import digest
+from facerf_cli.stage.data.pair_weights import load_pairs
+from facerf_cli.stage.data.recipes import Pair, picture_path
 from facerf_cli.stage.shards import in_shards
 from facerf_cli.stage.threads import one_thread
 
@@ -49,8 +50,7 @@ def sources_path(dataset: Dataset, side: int, subject: str) -> Path:
     """Where a subject's unwrapped sources are, or would be."""
     rows = "".join(json_line(asdict(pair)) for pair in _pairs(dataset, subject))
     stamps = "".join(_stamp(dataset, subject, camera) for camera in dataset.cameras[subject])
-    key = hashlib.sha256((rows + stamps).encode()).hexdigest()[:16]
-    return _folder(dataset, side, subject) / f"relit-{key}.npy"
+    return _folder(dataset, side, subject) / f"relit-{digest((rows + stamps).encode())}.npy"
 
 
 def _folder(dataset: Dataset, side: int, subject: str) -> Path:

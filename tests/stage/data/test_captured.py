@@ -16,7 +16,8 @@ from facerf_cli.raster.texture import unwrap
 from facerf_cli.stage.data.captured import Captured, View, open_captured
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.map_weights import name_maps
-from facerf_cli.stage.data.recipes import draw_pairs, load_pairs, pairs_path, picture_path, settle_pairs
+from facerf_cli.stage.data.pair_weights import load_pairs, settle_pairs
+from facerf_cli.stage.data.recipes import draw_pairs, pairs_path, picture_path
 from facerf_cli.stage.data.relighting import relight_subject
 from facerf_cli.stage.data.textures import texture_path
 from facerf_cli.stage.samples import Sample

@@ -1,6 +1,7 @@
 """Prepared data: what is written is read, what is wrong is said in one line, and nobody is in two splits."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.stage.data.dataset import SPLITS, Split, constant_weights, read_dataset
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.stage.data.dataset import SPLITS, Split, constant_weights, read_dataset, stack_header
 from tests.stage.data.dataset_fixture import write_small_dataset
 
 
@@ -38,6 +40,17 @@ def test_a_dataset_is_read_as_it_was_written(small: Path) -> None:
     assert np.abs(lit - stack.header.source).max() < 2e-3 * lit.max()
 
 
+def test_a_camera_behind_the_head_does_not_see_the_face(small: Path) -> None:
+    model = load_face_model()
+    fit = load_fit(read_dataset(small).fit_path("0000", "C0"))
+    turn = pose_to_rotation(180.0, 0.0, 0.0)
+    source, inside = np.zeros((48, 48, 3), np.float32), np.ones((48, 48), bool)
+    for rotation, sees in ((fit.rotation, True), (turn @ fit.rotation, False)):
+        header = stack_header(model, replace(fit, rotation=rotation), np.eye(3), source, inside, {})
+        assert (header.seen.mean() > 0.2) == sees
+    assert header.seen.mean() < 0.01  # not the mask's inside
+
+
 def changed(small: Path, folder: Path, change: dict[str, Any]) -> Path:
     """A copy of the dataset's description, with some of its entries replaced."""
     content = json.loads((small / "dataset.json").read_text()) | change
@@ -59,6 +72,7 @@ def changed(small: Path, folder: Path, change: dict[str, Any]) -> Path:
         ({"splits": {"train": ["9999"], "validation": [], "test": []}}, "9999"),
         ({"subjects": {"../0000": {"status": "done", "cameras": []}}}, "a name"),
         ({"subjects": {"0000": {"status": "done", "cameras": ["C7"]}}}, "C7"),
+        ({"subjects": {"0000": {"status": "done", "cameras": []}}}, "a camera at least"),
         ({"subjects": []}, "an object"),
     ],
 )

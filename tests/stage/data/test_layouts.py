@@ -1,6 +1,7 @@
 """Captures on disk: axes, lamps and values become DESIGN's; whatever is wrong is said in one line."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from facerf_cli.colour import matrix_to_rec709, named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
+from facerf_cli.stage.data.documents import read_document, write_document
 from facerf_cli.stage.data.layouts import read_capture
 
 K = [[500.0, 0, 33], [0, 500.0, 30], [0, 0, 1]]
@@ -130,6 +132,8 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"pattern": "{subject.x}/{camera}/{light}{subject}.exr"}, "below the capture"),
         ({"subjects": ["0000"]}, "an object"),
         ({"subjects": {"a/b": {}}}, "a name"),
+        ({"subjects": {"..": {}}}, "a name"),
+        ({"subjects": {"0000.json": {}}}, "a name"),  # fits/0000.json is the record of 0000
         ({"subjects": {"0000": 3}}, "an object"),
     ],
 )
@@ -147,11 +151,32 @@ def test_nothing_is_guessed(tmp_path: Path, missing: str) -> None:
         read_capture(tmp_path)
 
 
-@pytest.mark.parametrize("text", ["{", '{"format": NaN}', '{"format": 1e999}', '{"a": ' + "9" * 5000 + "}"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        '{"format": NaN}',
+        '{"format": 1e999}',
+        '{"a": ' + "9" * 5000 + "}",
+        '{"subjects": {"0000": {"age": 30}, "0000": {}}}',
+    ],
+)
 def test_broken_json(tmp_path: Path, text: str) -> None:
     (tmp_path / "stage.json").write_text(text)
     with pytest.raises(InputError, match="not JSON"):
         read_capture(tmp_path)
+
+
+def test_a_description_that_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "stage.json")  # reading one would wait for ever
+    with pytest.raises(InputError, match="is no file"):
+        read_capture(tmp_path)
+
+
+def test_a_text_that_is_no_unicode_is_written_as_it_was_read(tmp_path: Path) -> None:
+    content = {"name": "\ud800 \N{LATIN SMALL LETTER E WITH ACUTE}"}
+    write_document(tmp_path / "a.json", content)
+    assert read_document(tmp_path / "a.json", "").table() == content
 
 
 def test_no_capture_and_no_such_layout(tmp_path: Path) -> None:

@@ -13,17 +13,8 @@ from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, read_
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.stage.data.dataset import Dataset, constant_weights
 from facerf_cli.stage.data.map_weights import map_directions, name_maps, world_to_map
-from facerf_cli.stage.data.recipes import (
-    draw_pair,
-    draw_pairs,
-    load_pairs,
-    pair_weights,
-    pairs_path,
-    picture_path,
-    read_pairs,
-    settle_pairs,
-    weights_path,
-)
+from facerf_cli.stage.data.pair_weights import load_pairs, pair_weights, settle_pairs, weights_path
+from facerf_cli.stage.data.recipes import draw_pair, draw_pairs, pairs_path, picture_path, read_pairs
 from facerf_cli.stage.data.relighting import multiply, relight_subject, relit_pictures, render_source
 from facerf_cli.stage.sky.skies import ProceduralMaps
 from tests.stage.data.dataset_fixture import write_small_dataset
@@ -222,7 +213,7 @@ def test_other_recipes_need_overwrite_and_take_the_old_pictures_with_them(fresh:
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     before = weights_path(fresh)
-    with pytest.raises(UsageError, match=r"another seed, other maps .* --overwrite"):
+    with pytest.raises(UsageError, match=r"another seed, other maps, .* --overwrite"):
         settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
     assert picture_path(fresh, "0000", 1).exists()
     settle_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
@@ -233,6 +224,80 @@ def test_other_recipes_need_overwrite_and_take_the_old_pictures_with_them(fresh:
     with pytest.raises(InputError, match="line 1 is no pair"):
         settle_pairs(fresh, drawn, overwrite=False)
     assert len(settle_pairs(fresh, drawn, overwrite=True)) == 8
+
+
+def test_fewer_pairs_leave_no_picture_without_its_own(fresh: Dataset) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
+    few = settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)  # recipes alone may go
+    assert len(few) == 8
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    with pytest.raises(UsageError, match="more of each subject"):
+        settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    assert len(read_pairs(fresh)) == 8 and picture_path(fresh, "0000", 1).exists()
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+    assert not picture_path(fresh, "0000", 1).exists()
+
+
+def test_as_many_pairs_of_other_subjects_are_other_pairs(fresh: Dataset) -> None:
+    drawn = draw_pairs(fresh, MAPS, 2, 0)
+    settle_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
+    settled = settle_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
+    assert [pair.subject for pair in settled] == ["0000", "0001", "0002", "0003"] == list(load_pairs(fresh))
+
+
+def test_a_map_that_changed_is_another_map(fresh: Dataset, tmp_path: Path) -> None:
+    name = write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 1.0))
+    drawn = draw_pairs(fresh, [name], 1, 0)
+    settle_pairs(fresh, drawn, overwrite=False)
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 8.0))
+    with pytest.raises(UsageError, match="other maps"):
+        settle_pairs(fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
+    weights_path(fresh).unlink()
+    pairs_path(fresh).touch()
+    with pytest.raises(InputError, match="made with other maps than are there now"):
+        load_pairs(fresh)
+    assert settle_pairs(fresh, drawn, overwrite=True)[0].exposure_ev == -3
+
+
+def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: Path) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    with pytest.raises(FacerfError, match="cannot be used"):
+        settle_pairs(fresh, draw_pairs(fresh, [str(tmp_path / "none.exr")], 1, 0), overwrite=True)
+    assert picture_path(fresh, "0000", 0).exists() and len(read_pairs(fresh)) == 4
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"split": "test"},
+        {"subject": "9999"},
+        {"source_camera": "C7"},
+        {"target_light": 20},
+        {"index": -1},
+        {"index": 1},
+        {"rotate_deg": 90},
+    ],
+)
+def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, object]) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
+    first, *others = pairs_path(fresh).read_text().splitlines()
+    changed = json.dumps(json.loads(first) | change)
+    pairs_path(fresh).write_text("\n".join([changed, *others]))
+    number = 2 if change == {"index": 1} else 1  # twice the same pair
+    with pytest.raises(InputError, match=f"line {number} is no pair"):
+        read_pairs(fresh)
+
+
+def test_one_camera_predicts_itself(tmp_path: Path) -> None:
+    dataset = write_small_dataset(tmp_path, (1, 0, 0), cameras=1, lights=6, crop_px=32)
+    (pair,) = settle_pairs(dataset, draw_pairs(dataset, MAPS, 1, 0), overwrite=False)
+    assert pair.source_camera == pair.target_camera == "C0"
+    assert render_source(dataset, pair).isfinite().all()
 
 
 def test_pictures_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -> None:
