@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from facerf_cli.stage.data.dataset import Split
     from facerf_cli.stage.data.layouts import Capture
 
-_CROP_STEP_PX, _CROP_MOST_PX = 8, 4096
+_CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -47,17 +47,12 @@ class _Prepare:
 
     def __call__(self, item: Item) -> Outcome:
         """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
-        import torch
-
         from facerf_cli.stage.data.prepare import prepare_subject
+        from facerf_cli.stage.threads import one_thread
 
         capture, model = _capture(self.capture, self.layout), _face_model(self.face_model)
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
+        with one_thread():
             record = prepare_subject(capture, item.name, model, self.folder, self.crop_px, self.key)
-        finally:
-            torch.set_num_threads(threads)
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
         worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
@@ -117,13 +112,13 @@ def prepare_dataset(
     fits, a sheet a subject, index.html to look through, and dataset.json at the end. A second run goes on
     where the first was cut off.
     """
-    from facerf_cli.stage.data.dataset import DATASET_FILE, Split
-    from facerf_cli.stage.data.prepare import preparation_key
+    from facerf_cli.stage.data.dataset import DATASET_FILE, LARGEST_CROP_PX, Split
+    from facerf_cli.stage.data.description import preparation_key
 
     settings = settings_of(context)
     drawn = Split.parse(split)
-    if crop % _CROP_STEP_PX or not 0 < crop <= _CROP_MOST_PX:
-        raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {_CROP_MOST_PX}")
+    if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:
+        raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}")
     found = _capture(capture, layout)
     _check_subjects(found, output, drawn)
     model_sha256 = _model_digest(face_model)
@@ -136,7 +131,7 @@ def prepare_dataset(
         (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
     code = run_items("prepare-dataset", items, work, work.outputs_of, options, settings)
     if not dry_run:
-        _finish(found, output, drawn, settings.seed, face_model, model_sha256, crop)
+        _finish(work, found, drawn, settings.seed, model_sha256)
     raise typer.Exit(code)
 
 
@@ -153,7 +148,7 @@ def _check_subjects(capture: "Capture", output: Path, split: "Split") -> None:
 
 def _model_digest(name: str) -> str:
     from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH
-    from facerf_cli.stage.data.prepare import sha256_of
+    from facerf_cli.stage.data.description import sha256_of
 
     _face_model(name)  # a file that is none is named first
     return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
@@ -172,22 +167,25 @@ def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) 
         )
 
 
-def _finish(
-    capture: "Capture", output: Path, split: "Split", seed: int, face_model: str, model_sha256: str, crop: int
-) -> None:
-    """Write the page and `dataset.json` of the subjects that are finished."""
+def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model_sha256: str) -> None:
+    """Write the page and `dataset.json` of the subjects that are finished, and prepared as this run would."""
     from facerf_cli.files.atomic import atomic_path
     from facerf_cli.stage.data.dataset import DATASET_FILE
+    from facerf_cli.stage.data.description import describe_dataset
     from facerf_cli.stage.data.documents import write_document
     from facerf_cli.stage.data.index_page import index_page
-    from facerf_cli.stage.data.prepare import describe_dataset, prepared_subjects
+    from facerf_cli.stage.data.prepare import prepared_subjects
 
-    records = prepared_subjects(capture, output)
+    found = prepared_subjects(capture, work.folder).items()
+    records = {subject: record for subject, record in found if record.get("prepared") == work.key}
     if not records:
         return
-    model = _face_model(face_model)
-    dataset = describe_dataset(capture, records, split, seed, model, model_sha256, crop)
-    with atomic_path(output / "index.html") as temporary:
-        temporary.write_text(index_page(dataset, records), encoding="utf-8")
-    write_document(output / DATASET_FILE, dataset)
-    print(output / DATASET_FILE)
+    model = _face_model(work.face_model)
+    dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
+    with atomic_path(work.folder / "index.html") as temporary:
+        text = index_page(dataset, records)
+        temporary.write_text(
+            text, encoding="utf-8", errors="replace"
+        )  # folders may have any bytes for a name
+    write_document(work.folder / DATASET_FILE, dataset)
+    print(work.folder / DATASET_FILE)

@@ -1,4 +1,4 @@
-"""One head fitted to the landmarks of several calibrated cameras, and what each camera's crop sees of it.
+"""One head fitted to the landmarks of several calibrated cameras; `crop_pose.py` takes it to their crops.
 
 Identity, expression and the head's place in the world are shared; each camera adds the residuals of its 68
 landmarks, whose contour slides along the silhouette that this camera sees (`gauss_newton.py`). Priors and
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
-from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
+from facerf_cli.face.crop import check_landmarks, from_landmarks
+from facerf_cli.face.fit import IOD_M, FitSettings, fit_basis, landmark_noise, trust_inside
 from facerf_cli.face.gauss_newton import (
     FitState,
     Problem,
@@ -23,27 +23,21 @@ from facerf_cli.face.gauss_newton import (
     descend,
     jacobian,
     landmark_cost,
-    moved,
     normal_equations,
-    pixels_by_points,
-    pixels_by_pose,
     prior_cost,
     residuals,
     weak_perspective,
 )
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS, grid_triangles
-from facerf_cli.raster.camera import Camera, pixel_rays, project
-from facerf_cli.raster.rasterize import front_facing
+from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS
+from facerf_cli.raster.camera import Camera, project
 
 _USUAL = FitSettings()
 LOST_IOD = 0.15  # landmarks that lie this far off in the mean belong to no face, or to another one
 _PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # all cameras' landmarks are taken to this one's picture
-_CROP_STEPS = 12
 # The last bits of linear algebra depend on where memory happens to lie. Results are rounded far above those
 # and far below what can be measured, so that the same input gives the same bytes.
-_DECIMALS = 6
-_CROP_STRIDE = 5  # every so many vertices hold the crop's pose
+DECIMALS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +77,7 @@ class JointFit:
     def mean_error_iod(self) -> float:
         """The mean over the cameras that have landmarks."""
         errors = [error for error in self.error_iod if error is not None]
-        return round(float(np.mean(errors)), _DECIMALS)
+        return round(float(np.mean(errors)), DECIMALS)
 
     def vertices_world(self, model: MorphableModel) -> Tensor:
         """The mesh in the world [V, 3], float64."""
@@ -178,22 +172,22 @@ def _fit_found(
     head = descend(joint.residuals, joint.cost, joint.step, head, settings.steps)
     off = (joint.residuals(head).difference_px.norm(dim=-1) * trust).sum(1) / trust.sum(1)  # [W]
     views = joint.views(head)
-    errors_iod = off * _eyes_depth_m(views.rotation, views.translation_m) / IOD_M
+    errors_iod = off * eyes_depth_m(views.rotation, views.translation_m) / IOD_M
     coefficients = (head.coordinates @ basis.spread.mT)[0]
     to_world = cameras[first].rotation.mT
     fit = JointFit(
-        rotation=(to_world @ head.rotation[0]).round(decimals=_DECIMALS + 1),
+        rotation=(to_world @ head.rotation[0]).round(decimals=DECIMALS + 1),
         translation_m=(to_world @ (head.translation_m[0] - cameras[first].translation_m)).round(
-            decimals=_DECIMALS
+            decimals=DECIMALS
         ),
-        alpha=coefficients[: len(model.identity)].round(decimals=_DECIMALS),
-        beta=coefficients[len(model.identity) :].round(decimals=_DECIMALS),
+        alpha=coefficients[: len(model.identity)].round(decimals=DECIMALS),
+        beta=coefficients[len(model.identity) :].round(decimals=DECIMALS),
         error_iod=(),
     )
-    return fit, errors_iod.round(decimals=_DECIMALS).tolist()
+    return fit, errors_iod.round(decimals=DECIMALS).tolist()
 
 
-def _eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
+def eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
     """How far along the camera's axis the eyes are [...], for poses [..., 3, 3] and [..., 3]."""
     eyes = torch.from_numpy(LANDMARKS_M[list(OUTER_EYE_CORNERS)].mean(0))
     return -(rotation @ eyes + translation_m)[..., 2]
@@ -207,70 +201,3 @@ def _row(state: FitState, index: int) -> FitState:
 def _trust(camera: PosedCamera, landmarks_px: np.ndarray) -> np.ndarray:
     crop = from_landmarks(landmarks_px, 256)
     return trust_inside(crop.to_crop(landmarks_px), crop, camera.height_px, camera.width_px)
-
-
-def fit_in_crop(
-    model: MorphableModel,
-    joint: JointFit,
-    camera: PosedCamera,
-    landmarks_px: np.ndarray | None,
-    error_iod: float,
-    crop_px: int,
-) -> tuple[FaceFit, float]:
-    """The head in the fixed camera of its crop from a camera's picture, identity and expression unchanged.
-
-    The crop goes by the fitted landmarks. The pose is the one under which the vertices that face the camera
-    lie where the true camera sees them; the mean distance that is left, over the inter-ocular distance, comes
-    second (the two cameras stand at different distances). `landmarks_px` None takes the fitted ones.
-    """
-    vertices_world = joint.vertices_world(model)
-    fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
-    crop = _rounded(from_landmarks(fitted_px, crop_px))
-    in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
-    ids = _facing(in_camera)[::_CROP_STRIDE]
-    target_px = torch.from_numpy(crop.to_crop(camera.project(vertices_world[ids]).numpy()))
-    head = (vertices_world[ids] - joint.translation_m) @ joint.rotation
-    rotation, translation_m = _pose_in_crop(head, target_px, camera.rotation @ joint.rotation, crop.camera)
-    off_px = (project(head @ rotation.mT + translation_m, crop.camera) - target_px).norm(dim=-1).mean()
-    seen_px = np.round(fitted_px, _DECIMALS) if landmarks_px is None else landmarks_px
-    fit = FaceFit(
-        model=model.name,
-        crop=crop,
-        rotation=rotation.round(decimals=_DECIMALS + 1).float(),
-        translation_m=translation_m.round(decimals=_DECIMALS).float(),
-        alpha=joint.alpha.float(),
-        beta=joint.beta.float(),
-        landmarks_px=torch.from_numpy(crop.to_crop(seen_px)).float(),
-        error_iod=error_iod,
-    )
-    iod_px = crop.camera.focal_px * IOD_M / _eyes_depth_m(rotation, translation_m)
-    return fit, float(off_px / iod_px)
-
-
-def _rounded(crop: Crop) -> Crop:
-    x0_px, y0_px, side_px = (round(length, _DECIMALS) for length in (crop.x0_px, crop.y0_px, crop.side_px))
-    return Crop(x0_px, y0_px, side_px, crop.size_px)
-
-
-def _facing(vertices_camera: Tensor) -> Tensor:
-    """Ids of the vertices of triangles that face the camera."""
-    triangles = grid_triangles()
-    return torch.unique(triangles[front_facing(vertices_camera, triangles)])
-
-
-def _pose_in_crop(head: Tensor, target_px: Tensor, rotation: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rotation [3, 3] and translation [3] that bring points [N, 3] closest to pixels [N, 2]; Gauss-Newton.
-
-    It begins with a rotation in a camera that looks elsewhere, and with the points where their mean is seen.
-    """
-    ray = pixel_rays(target_px.mean(0), camera)
-    spread_px = (target_px - target_px.mean(0)).norm(dim=-1).mean()
-    spread_m = ((head - head.mean(0)) @ rotation.mT)[:, :2].norm(dim=-1).mean()
-    place = ray * (camera.focal_px * spread_m / spread_px) - rotation @ head.mean(0)
-    state = FitState(rotation[None], place[None], torch.zeros(1, 0, dtype=torch.float64))
-    for _ in range(_CROP_STEPS):
-        points = head @ state.rotation.mT + state.translation_m[:, None]
-        by_pose = pixels_by_pose(pixels_by_points(points, camera), points, state.translation_m)[0]
-        off_px = project(points, camera)[0] - target_px
-        state = moved(state, -torch.linalg.lstsq(by_pose.flatten(0, 1), off_px.flatten()).solution[None])
-    return state.rotation[0], state.translation_m[0]

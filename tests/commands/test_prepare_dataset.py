@@ -18,7 +18,7 @@ import torch
 
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
 from facerf_cli.stage.data.dataset import Dataset, read_dataset
@@ -203,6 +203,87 @@ def test_other_options_do_not_mix(given: Given, prepared: Dataset, capsys: Said)
     line = ["prepare-dataset", str(given[0]), "-o", str(prepared.folder), "--crop", "128"]
     assert main(line) == 2
     assert "prepared with another crop" in capsys.readouterr().err
+
+
+def changed(given: Given, capture: Path, **changes: object) -> Path:
+    """The capture with changes to its description, its pictures linked."""
+    shutil.copytree(given[0], capture, copy_function=os.link)
+    content = json.loads((capture / "stage.json").read_text())
+    (capture / "stage.json").unlink()
+    (capture / "stage.json").write_text(json.dumps(content | changes))
+    return capture
+
+
+def test_a_camera_behind_the_head_is_named(given: Given, tmp_path: Path, capsys: Said) -> None:
+    cameras = json.loads((given[0] / "stage.json").read_text())["cameras"]
+    pose, head = np.array(cameras[1]["world_to_camera"]), np.array([0.01, 1.3, 0.02])
+    turn = np.diag([-1.0, 1, -1])  # about the head
+    cameras[1]["world_to_camera"] = np.c_[
+        pose[:, :3] @ turn, pose[:, :3] @ (head - turn @ head) + pose[:, 3]
+    ].tolist()
+    capture = changed(given, tmp_path / "capture", cameras=cameras, subjects={"0000": {}})
+    assert prepare(capture, tmp_path / "out", "--split", "1/0/0") == 1
+    assert "0000/C1: " in (said := capsys.readouterr().err) and said.count("\n") == 1
+
+
+def test_values_that_halves_cannot_hold_and_odd_texts_of_the_capture(
+    given: Given, tmp_path: Path, capsys: Said
+) -> None:
+    lights = json.loads((given[0] / "stage.json").read_text())["lights"]
+    dim = [light | {"intensity": [1e-6] * 3} for light in lights]
+    capture = changed(given, tmp_path / "capture", lights=dim, subjects={"0000": {"name": "\ud800"}})
+    assert prepare(capture, tmp_path / "out", "--split", "1/0/0") == 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 3 and all(
+        "pixels are beyond 65504 and were clipped; the lamps'" in line for line in said
+    )
+    assert (
+        json.loads((tmp_path / "out/dataset.json").read_text())["subjects"]["0000"]["traits"]["name"]
+        == "\ud800"
+    )
+
+
+def test_pictures_for_the_eye_are_taken_by_their_curve(
+    given: Given, prepared: Dataset, tmp_path: Path
+) -> None:
+    """sRGB PNG, whose curve is undone; grey frames give grey stacks."""
+    content = json.loads((given[0] / "stage.json").read_text())
+    lights = [light | {"intensity": [1, 1, 1]} for light in content["lights"]]
+    pattern = "{subject}/{camera}/{light}.png"
+    capture = tmp_path / "capture"
+    there = read_capture(given[0])
+    for camera in there.cameras:
+        for number, light in enumerate(there.light_ids):
+            path = capture / "0000" / camera / f"{light}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_display(path, np.repeat(there.frame("0000", camera, number)[..., 1:2], 3, -1))
+    changes = {"lights": lights, "pattern": pattern, "colour_space": "sRGB", "black_level": 0.0}
+    (capture / "stage.json").write_text(json.dumps(content | changes))
+    assert prepare(capture, tmp_path / "out", "--split", "1/0/0") == 0
+    olats = read_olat_stack(tmp_path / "out/olat/0000/C0.exr").olats.float()
+    whole = read_olat_stack(prepared.stack_path("0000", "C0")).olats.float()
+    assert torch.equal(olats[:, 0], olats[:, 2])
+    assert olats.mean() == pytest.approx(float(whole[:, 1].mean()), rel=0.05)
+
+
+def test_records_of_another_run_stay_out_of_the_dataset(
+    given: Given, prepared: Dataset, tmp_path: Path
+) -> None:
+    """As when a run with --overwrite and other options dies before it comes to a subject."""
+    output = Path(shutil.copytree(prepared.folder, tmp_path / "out"))
+    (given[0] / "0001" / "C0" / "L000.exr").rename(tmp_path / "hidden.exr")
+    try:
+        unlink = Path.unlink
+        with pytest.MonkeyPatch.context() as patch:  # it dies first of all
+            patch.setattr(
+                Path, "unlink", lambda path, **k: None if path.name == "0001.json" else unlink(path, **k)
+            )
+            line = ["prepare-dataset", str(given[0]), "-o", str(output), "--crop", "64", "--overwrite"]
+            assert main(line) == 1
+    finally:
+        (tmp_path / "hidden.exr").rename(given[0] / "0001" / "C0" / "L000.exr")
+    dataset = read_dataset(output)
+    assert dataset.subjects == ("0000",) and dataset.crop_px == 64
 
 
 def test_a_dry_run_writes_nothing(given: Given, tmp_path: Path, capsys: Said) -> None:

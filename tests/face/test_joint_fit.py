@@ -1,6 +1,7 @@
 """One head from several calibrated cameras: closer to the truth than any single fit, and seen by all."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.crop_pose import fit_in_crop
 from facerf_cli.face.fit import IOD_M, fit_landmarks
-from facerf_cli.face.joint_fit import JointFit, PosedCamera, fit_in_crop, fit_views
+from facerf_cli.face.joint_fit import JointFit, PosedCamera, fit_views
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation, project
 
@@ -170,7 +172,9 @@ def test_no_face_at_all_is_an_input_error(model: MorphableModel) -> None:
         fit_views(model, CAMERAS, [None] * len(CAMERAS))
 
 
-@pytest.mark.parametrize(("distance_m", "most_iod"), [(0.8, 0.005), (1.1, 0.005), (1.5, 0.01)])
+@pytest.mark.parametrize(
+    ("distance_m", "most_iod"), [(0.8, 0.005), (1.1, 0.005), (1.5, 0.008), (10.0, 0.018)]
+)
 def test_the_crop_sees_the_head_where_the_camera_does(
     model: MorphableModel, distance_m: float, most_iod: float
 ) -> None:
@@ -188,3 +192,22 @@ def test_the_crop_sees_the_head_where_the_camera_does(
         # the chain through the head is the camera's own rotation, but for the crop's small turn
         turn = fit.rotation.double() @ (camera.rotation @ joint.rotation).mT
         assert math.degrees(math.acos(min(1, (float(turn.trace()) - 1) / 2))) < 4
+
+
+def test_a_crop_needs_the_front_of_the_face(model: MorphableModel) -> None:
+    _, world = true_head(model, 5)
+    joint = fit_views(model, CAMERAS, [seen(model, world, camera, 0.0, 0) for camera in CAMERAS])
+    head = torch.tensor(HEAD_WORLD, dtype=torch.float64)
+    away = PosedCamera((4000.0, 4000.0), (200.0, 200.0), 400, 400, torch.eye(3).double(), 0 * head)
+    behind = replace(away, rotation=torch.diag(torch.tensor([-1.0, 1.0, -1.0]).double()))
+    for camera in (away, behind):
+        shift = torch.tensor([0.0, 0.0, 1.0 if camera is away else -1.2]).double()
+        with pytest.raises(InputError, match="from behind"):
+            fit_in_crop(
+                model,
+                joint,
+                replace(camera, translation_m=shift - camera.rotation @ head),
+                None,
+                0.01,
+                256,
+            )

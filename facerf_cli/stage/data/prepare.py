@@ -4,9 +4,9 @@ Pictures are read one by one, twice: once for the fully lit sum that the face is
 Never more than one camera's sum is held.
 """
 
-import hashlib
-import json
+import logging
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,20 +19,19 @@ from facerf_cli import __version__
 from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
+from facerf_cli.face.crop_pose import fit_in_crop
 from facerf_cli.face.fit import FaceFit, quality_of, save_fit
-from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
+from facerf_cli.face.joint_fit import JointFit, fit_views
 from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.overlay import draw_fit
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import write_display
+from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.records import LOGGER_NAME
 from facerf_cli.report import contact_sheet, mark_light
 from facerf_cli.stage.data.dataset import (
-    FORMAT,
-    SPLITS,
-    Split,
     constant_weights,
     fit_path,
     record_path,
@@ -43,9 +42,9 @@ from facerf_cli.stage.data.dataset import (
 from facerf_cli.stage.data.documents import read_document, write_document
 from facerf_cli.stage.data.layouts import Capture
 
+log = logging.getLogger(LOGGER_NAME)
 _TILE_PX = 192  # of the sheets
 _SHOWN_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # the sheets' three lights, to the camera
-_COLOUR_SPACE = "lin_rec709"
 
 
 def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
@@ -60,16 +59,15 @@ def prepare_subject(
     """Write a subject's stacks, fits, sheet and record; give the record. `key` is of `preparation_key`."""
     record_path(folder, subject).unlink(missing_ok=True)
     landmarks = [_find_landmarks(capture, subject, camera) for camera in capture.cameras]
-    try:
+    with _concerning(subject):
         joint = fit_views(model, list(capture.cameras.values()), landmarks)
-    except InputError as error:
-        raise InputError(f"{subject}: {error}") from None
     cameras, rows = {}, []
     for camera, landmarks_px, error_iod in zip(capture.cameras, landmarks, joint.error_iod, strict=True):
         seen_px = None if error_iod is None else landmarks_px  # lost ones are as good as none
         error_iod = joint.mean_error_iod if error_iod is None else error_iod
         posed = capture.cameras[camera]
-        fit, off_iod = fit_in_crop(model, joint, posed, seen_px, error_iod, crop_px)
+        with _concerning(f"{subject}/{camera}"):
+            fit, off_iod = fit_in_crop(model, joint, posed, seen_px, error_iod, crop_px)
         rows.append(_write_camera(capture, subject, camera, model, joint, fit, folder))
         cameras[camera] = {
             "face_found": seen_px is not None,
@@ -87,6 +85,15 @@ def prepare_subject(
     }
     write_document(record_path(folder, subject), record)
     return record
+
+
+@contextmanager
+def _concerning(name: str) -> Iterator[None]:
+    """Say of whom an error within the block speaks."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def _find_landmarks(capture: Capture, subject: str, camera: str) -> np.ndarray | None:
@@ -126,7 +133,7 @@ def _write_camera(
     }
     header = stack_header(model, fit, directions, source, inside, metadata)
     if not header.seen.any():
-        raise InputError(f"{subject}: camera {camera} does not see the face that the others do")
+        raise InputError(f"{subject}/{camera}: the camera does not see the face; take it out of stage.json")
     shown: dict[int, np.ndarray] = dict.fromkeys(_lights_shown(directions), source)
     crops = _crops(capture, subject, camera, fit.crop, header, shown)
     write_olat_stack(stack_path(folder, subject, camera), header, crops)
@@ -143,12 +150,19 @@ def _crops(
     The header's source fills up on the way; `write_olat_stack` writes it last. Only here, where the crop has
     averaged noise, do values below the black level become 0.
     """
+    clipped = 0
     for light, weight in enumerate(constant_weights(header.directions)):
         picture = np.maximum(crop.apply(capture.frame(subject, camera, light)), 0)
         np.add(header.source, weight * picture, out=header.source)
         if light in shown:
             shown[light] = picture
+        clipped += int((picture > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(picture).permute(2, 0, 1)[None]
+    if clipped:
+        advice = "the lamps' intensities in stage.json are too small for these pictures"
+        log.warning(
+            "%s/%s: %d pixels are beyond %g and were clipped; %s", subject, camera, clipped, HALF_MAX, advice
+        )
 
 
 def _lights_shown(directions: np.ndarray) -> list[int]:
@@ -177,91 +191,10 @@ def _tiles(
     return tiles
 
 
-def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int) -> str:
-    """What a subject's files depend on besides its pictures, as a short digest."""
-    content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
 def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
-    """The records of the subjects that are finished, by subject."""
+    """The records of the subjects that are finished, by subject; 'prepared' is the key they were given."""
     return {
         subject: read_document(record_path(folder, subject), "").table()
         for subject in capture.subjects
         if all(path.exists() for path in subject_outputs(capture, subject, folder))
     }
-
-
-def describe_dataset(
-    capture: Capture,
-    records: Mapping[str, Mapping[str, Any]],
-    split: Split,
-    seed: int,
-    model: MorphableModel,
-    face_model_sha256: str,
-    crop_px: int,
-) -> dict[str, Any]:
-    """The content of `dataset.json`; subjects without a record are those that failed."""
-    splits = split.of(capture.subjects, seed)
-    return {
-        "format": FORMAT,
-        "capture": capture.folder.resolve().name,
-        "face_model": model.name,
-        "crop_px": crop_px,
-        "colour_space": _COLOUR_SPACE,
-        "axes": "x right, y up, z toward the camera; metres; pixel centres at index + 0.5",
-        **_calibration(capture),
-        "splits": {name: [subject for subject in splits[name] if subject in records] for name in SPLITS},
-        "subjects": {
-            subject: {"traits": traits, **_status(records.get(subject))}
-            for subject, traits in capture.subjects.items()
-        },
-        "provenance": {
-            "software": f"facerf {__version__}",
-            "face_model_licence": model.licence,
-            "face_model_sha256": face_model_sha256,
-            "split_seed": seed,
-            "capture": capture.provenance,
-        },
-    }
-
-
-def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
-    if record is None:
-        return {"status": "failed"}
-    known = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-    return {"status": "done", **known, "cameras": list(record["cameras"])}
-
-
-def _calibration(capture: Capture) -> dict[str, Any]:
-    """Lights, cameras and what was done to the pictures' values."""
-    lights = zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
-    gains = zip(capture.light_ids, (1 / capture.intensities).tolist(), strict=True)
-    return {
-        "rig": {"lights": [{"id": name, "direction_world": direction} for name, direction in lights]},
-        "cameras": [
-            {
-                "id": name,
-                "width": posed.width_px,
-                "height": posed.height_px,
-                "focal_px": posed.focal_px,
-                "centre_px": posed.centre_px,
-                "world_to_camera": torch.cat([posed.rotation, posed.translation_m[:, None]], 1).tolist(),
-            }
-            for name, posed in capture.cameras.items()
-        ],
-        "normalisation": {
-            "from": capture.colour_space,
-            "to": _COLOUR_SPACE,
-            "black_level": capture.black_level,
-            "gain": dict(gains),
-            "non_finite": "set to 0",
-            "negative": "set to 0 after the crop",
-        },
-    }
-
-
-def sha256_of(path: Path) -> str:
-    """The digest of a file's bytes."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

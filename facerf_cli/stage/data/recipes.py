@@ -94,7 +94,8 @@ def picture_path(dataset: Dataset, subject: str, index: int) -> Path:
 
 def read_pairs(dataset: Dataset) -> list[Pair]:
     """All pairs of a dataset, none where it has none; they must speak of what the dataset holds."""
-    path, pairs = pairs_path(dataset), []
+    path = pairs_path(dataset)
+    pairs: list[Pair] = []
     if not path.is_file():
         return []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
