@@ -21,10 +21,9 @@ _RISE_SHARE = 0.5  # this share of its neighbours' rise, up to as much again as 
 _BLUR_NEIGHBOURS = 24
 _SAME_SURFACE_COSINE = 0.6  # of two normals, for near vertices to share their view of the surroundings
 _NO_WEIGHT = 1e-4
-_STRAND_STRIDE, _NEAR = (
-    5,
-    4,
-)  # of a strand's vertices this many share a traced one; the means are over so many
+_STRAND_STRIDE = 5  # of a strand's vertices this many share a traced one;
+_STRAND_NEAR = 4  # what a lamp gives them is a mean over so many
+_CURVE_BITS = 10  # of a place along each axis, by which a mesh's vertices are ordered
 _R2 = np.array([0.7548776662466927, 0.5698402909980532], np.float32)  # 1 / p, 1 / p^2 with p^3 = p + 1
 
 
@@ -89,15 +88,27 @@ class MeshTransport:
     """Per light and vertex, for lights of rgb 1 in `directions` [L, 3].
 
     visibility [L, V] float32: the share of the lamp's disc that a vertex sees, 0 where it faces away.
-    gather [V, V]: irradiance that each vertex receives from its surroundings' radiosity; a row sums to the
-    share of the cosine-weighted hemisphere that other surfaces' outsides cover.
-    baked [V] bool: where the two were traced; both are 0 elsewhere.
+    baked [V] bool: what was asked for; elsewhere there is only the light that bounces off on its way there.
+    sites [S]: the vertices that light bounces from and to; site_of [V]: which of these stands for each vertex
+    (itself, or the nearest one of its strands of hair; 0 where there is none).
+    hits [S, S]: what each site's rays over the hemisphere met; means [S, S]: a mean over near sites.
     """
 
     directions: np.ndarray
     visibility: np.ndarray
-    gather: csr_matrix
     baked: np.ndarray
+    sites: np.ndarray
+    site_of: np.ndarray
+    hits: csr_matrix
+    means: csr_matrix
+
+    def gathered(self, radiosity: np.ndarray) -> np.ndarray:
+        """Irradiance [S, K] that the sites receive from each other's radiosity [S, K].
+
+        Of a radiosity of 1 it is the share of the cosine-weighted hemisphere that other surfaces' outsides
+        cover.
+        """
+        return np.asarray(self.means @ (self.hits @ radiosity))
 
 
 def bake_mesh(
@@ -118,41 +129,48 @@ def bake_mesh(
     Unless the lamps are points, shadows are smoothed by a mean over a vertex's own edges, which keeps their
     outlines off the triangles' zigzag.
     """
-    nothing = np.zeros(len(vertices), bool)
+    count, nothing = len(vertices), np.zeros(len(vertices), bool)
+    curve = _along_curve(vertices)  # inside, vertices have its order: near rays run through the same caches
+    rank = np.argsort(curve)
     baked = ~nothing if wanted is None else wanted
-    surface = _Surface.of(vertices, normals, triangles, nothing if all_round is None else all_round)
-    shifts = np.random.default_rng(seed).random((len(vertices), 2), np.float32)
-    strands = np.flatnonzero(surface.all_round)
-    traced_strands = strands[::_STRAND_STRIDE]
+    strand = nothing if all_round is None else all_round
+    surface = _Surface.of(vertices[curve], normals[curve], rank[triangles], strand[curve])
+    shifts = np.random.default_rng(seed).random((count, 2), np.float32)[curve]
+    strands, traced_strands = rank[np.flatnonzero(strand)], rank[np.flatnonzero(strand)[::_STRAND_STRIDE]]
     near = _nearest_of(surface.vertices, strands, traced_strands)
-    untraced = surface.all_round.copy()
-    untraced[traced_strands] = False
-    gather = _gather(surface, baked & ~untraced, settings, shifts)
-    gather = _filled(gather, strands[baked[strands]], near[baked[strands], 0])
-    sources = np.bincount(gather.indices, minlength=len(vertices)) > 0
-    traced = (baked | sources) & ~untraced
+    stands_for = np.arange(count)
+    stands_for[strands] = near[0]
+    receives = nothing.copy()
+    receives[stands_for[baked[curve]]] = True
+    hits = _hits(surface, receives, stands_for, settings, shifts)
+    is_site = receives | (np.bincount(hits.indices, minlength=count) > 0)
+    traced = is_site.copy()
     traced[traced_strands] = True
-    visibility = np.zeros((len(directions), len(vertices)), np.float32)
+    visibility = np.empty((len(directions), count), np.float32)
     for light, direction in enumerate(directions):
         share = _lamp_share(surface, direction, traced, settings, shifts)
-        share[strands] = share[near].mean(-1)
-        visibility[light] = share
-    return MeshTransport(directions, visibility, gather, baked)
+        share[strands] = share[near].mean(0)
+        visibility[light] = share[rank]
+    sites = np.flatnonzero(is_site)
+    means = _neighbour_means(surface, receives & ~surface.all_round, settings.bounce_blur_m)
+    return MeshTransport(
+        directions,
+        visibility,
+        baked,
+        sites=curve[sites],
+        site_of=np.where(is_site, np.cumsum(is_site) - 1, 0)[stands_for][rank],
+        hits=hits[sites][:, sites],
+        means=means[sites][:, sites],
+    )
 
 
 def _nearest_of(vertices: np.ndarray, strands: np.ndarray, traced: np.ndarray) -> np.ndarray:
-    """The traced strand vertices nearest to each of the strands' [N, k]."""
+    """The traced strand vertices [k, N] nearest to each of the strands', the very nearest first."""
     if not len(strands):
-        return np.zeros((0, 1), np.int64)
-    _, nearest = cKDTree(vertices[traced]).query(vertices[strands], range(1, min(_NEAR, len(traced)) + 1))
-    return traced[nearest]
-
-
-def _filled(gather: csr_matrix, rows: np.ndarray, copied: np.ndarray) -> csr_matrix:
-    """`gather` with the rows [N] set to the copies of others [N]."""
-    source = np.arange(gather.shape[0])
-    source[rows] = copied
-    return gather[source]
+        return np.zeros((1, 0), np.int64)
+    ranks = range(1, min(_STRAND_NEAR, len(traced)) + 1)
+    _, nearest = cKDTree(vertices[traced]).query(vertices[strands], ranks)
+    return np.ascontiguousarray(traced[nearest].T)
 
 
 def _spread(shifts: np.ndarray, chosen: np.ndarray, sample: int) -> tuple[np.ndarray, np.ndarray]:
@@ -167,15 +185,15 @@ def _spread(shifts: np.ndarray, chosen: np.ndarray, sample: int) -> tuple[np.nda
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """A mesh to cast rays from and at; edges [E, 2], each once, and as a matrix [V, V] of ones."""
+    """A mesh to cast rays from and at."""
 
     scene: rtcore_scene.EmbreeScene
     vertices: np.ndarray
     normals: np.ndarray
     triangles: np.ndarray
     all_round: np.ndarray
-    edges: np.ndarray
-    beside: csr_matrix
+    edges: np.ndarray  # [E, 2], each once, strands' left out,
+    beside: csr_matrix  # and as a matrix [V, V] of ones
     offset_m: np.ndarray  # [V, 1] of ray origins off the surface
 
     @classmethod
@@ -183,10 +201,10 @@ class _Surface:
         cls, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, all_round: np.ndarray
     ) -> "_Surface":
         vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
-        pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        keys = np.unique(pairs[:, 0].astype(np.int64) * len(vertices) + pairs[:, 1])
-        edges = np.stack([keys // len(vertices), keys % len(vertices)], -1)
-        both_ways = (np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]]))
+        edges = _edges(triangles, len(vertices))
+        offset_m = _mesh_offset_m(vertices, normals, edges)[:, None]
+        edges = edges[~all_round[edges[:, 0]]]
+        both_ways = np.concatenate([edges, edges[:, ::-1]]).T
         ones = np.ones(2 * len(edges), np.float32)
         return cls(
             build_scene(vertices, triangles),
@@ -195,9 +213,28 @@ class _Surface:
             triangles,
             all_round,
             edges,
-            csr_matrix((ones, both_ways), shape=(len(vertices), len(vertices))),
-            _mesh_offset_m(vertices, normals, edges)[:, None],
+            csr_matrix((ones, tuple(both_ways)), shape=(len(vertices), len(vertices))),
+            offset_m,
         )
+
+
+def _edges(triangles: np.ndarray, count: int) -> np.ndarray:
+    """The edges [E, 2] of triangles among so many vertices, each once."""
+    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    keys = np.sort(pairs[:, 0].astype(np.int64) * count + pairs[:, 1])
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    return np.stack([keys // count, keys % count], -1)
+
+
+def _along_curve(points: np.ndarray) -> np.ndarray:
+    """The ids of points [N, 3] in the order of Morton's curve (1966) through them."""
+    low, size = points.min(0), max(float(np.ptp(points, 0).max()), 1e-9)
+    cell = ((points - low) * ((2**_CURVE_BITS - 1) / size)).astype(np.int64)
+    key = np.zeros(len(points), np.int64)
+    for bit in range(_CURVE_BITS):
+        for axis in range(3):
+            key |= (cell[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(key, kind="stable")
 
 
 def _mesh_offset_m(vertices: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -231,7 +268,7 @@ def _lamp_share(
     share[first] = _lamp_rays(surface, first, facing, direction, settings, _spread(shifts, first, 0))
     if settings.lamp_radius_deg == 0:
         return share
-    edge = np.flatnonzero(_beside(surface.edges, share, lit) & lit & ~surface.all_round)
+    edge = np.flatnonzero(_beside(surface.edges, share, lit) & lit)
     for sample in range(1, settings.lamp_samples):
         numbers = _spread(shifts, edge, sample)
         share[edge] += _lamp_rays(surface, edge, facing, direction, settings, numbers)
@@ -265,17 +302,25 @@ def _beside(edges: np.ndarray, share: np.ndarray, lit: np.ndarray) -> np.ndarray
     return found
 
 
-def _gather(surface: _Surface, baked: np.ndarray, settings: BakeSettings, shifts: np.ndarray) -> csr_matrix:
-    """See `MeshTransport.gather`: what hemisphere rays hit, as barycentric weights of its corners."""
-    count, samples = len(baked), settings.bounce_samples
+def _hits(
+    surface: _Surface,
+    receives: np.ndarray,
+    stands_for: np.ndarray,
+    settings: BakeSettings,
+    shifts: np.ndarray,
+) -> csr_matrix:
+    """What hemisphere rays from the vertices that receive [V] bool meet: barycentric weights [V, V].
+
+    Columns are the vertices that stand for [V] the corners of what was met.
+    """
+    count, samples = len(receives), settings.bounce_samples
     if samples == 0:
         return csr_matrix((count, count), dtype=np.float32)
-    smooth, strands = np.flatnonzero(baked & ~surface.all_round), np.flatnonzero(baked & surface.all_round)
+    smooth, strands = (np.flatnonzero(receives & side) for side in (~surface.all_round, surface.all_round))
     blocks = [*_hemisphere_hits(surface, smooth, samples, shifts)]
     blocks += _hemisphere_hits(surface, strands, max(1, samples // 4), shifts)
     rows, columns, values = (np.concatenate(column) for column in zip(*blocks, strict=True))
-    hits = csr_matrix((values, (rows, columns)), shape=(count, count), dtype=np.float32)
-    return _neighbour_means(surface, smooth, settings.bounce_blur_m) @ hits
+    return csr_matrix((values, (rows, stands_for[columns])), shape=(count, count), dtype=np.float32)
 
 
 def _hemisphere_hits(
@@ -300,15 +345,13 @@ def _hemisphere_hits(
         yield chosen[found].repeat(3), columns.ravel(), weights.astype(np.float32).ravel()
 
 
-def _neighbour_means(surface: _Surface, chosen: np.ndarray, sigma_m: float) -> csr_matrix:
-    """A Gaussian mean [V, V] over near vertices of the same surface for the chosen ones; others stay."""
-    count = len(surface.vertices)
-    other = np.setdiff1d(np.arange(count), chosen)
+def _neighbour_means(surface: _Surface, blurred: np.ndarray, sigma_m: float) -> csr_matrix:
+    """A Gaussian mean [V, V] over near vertices of the same surface where `blurred` [V]; others stay."""
+    count, chosen, other = len(blurred), np.flatnonzero(blurred), np.flatnonzero(~blurred)
     if sigma_m == 0 or len(chosen) == 0:
         return csr_matrix((np.ones(count, np.float32), (np.arange(count),) * 2), shape=(count, count))
     points, normals = surface.vertices[chosen], surface.normals[chosen]
-    distance, near = cKDTree(points).query(points, k=min(_BLUR_NEIGHBOURS, len(chosen)))
-    distance, near = distance.reshape(len(chosen), -1), near.reshape(len(chosen), -1)
+    distance, near = cKDTree(points).query(points, range(1, min(_BLUR_NEIGHBOURS, len(chosen)) + 1))
     alike = np.einsum("nc,nkc->nk", normals, normals[near]) > _SAME_SURFACE_COSINE
     weights = np.exp(-0.5 * (distance / sigma_m) ** 2) * alike + (distance == 0)
     weights /= weights.sum(1, keepdims=True)
@@ -358,11 +401,12 @@ def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.ran
 
 def _on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
     """Unit directions [N, 3] to points on a lamp's disc, by two numbers [N, 1] in 0..1."""
-    tangent, bitangent = _tangents(axis[None])
-    radius = np.tan(np.radians(radius_deg)) * np.sqrt(share)
+    axis = axis.astype(np.float32)
+    tangent, bitangent = (side.astype(np.float32) for side in _tangents(axis[None]))
+    radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
     turn = 2 * np.pi * around
     rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
-    return (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return (rays / np.sqrt((rays * rays).sum(-1, keepdims=True))).astype(np.float32)
 
 
 def _one_bounce(

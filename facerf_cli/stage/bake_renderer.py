@@ -7,7 +7,7 @@ one sparse product a channel: area x albedo x barycentric weights [facets of the
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -31,7 +31,8 @@ from facerf_cli.stage.shading import (
 
 _SKIN, _HAIR = PARTS.index("skin"), PARTS.index("hair")
 _SMALL_PX = 160  # a picture up to this side takes 3 x 3 samples a pixel, a larger one 2 x 2
-_CHUNK = 1 << 20  # facets x lights that are worked on at a time; bounds the memory
+_CHUNK = 1 << 19  # pixels x lights that are shaded at a time: what fits the caches
+_LIGHTS = 25  # that are bounced at a time
 _NEAR = 32  # vertices that one pass of scattering reaches
 _RELIEF_SOFTNESS = 0.15  # light from the sides (scattering, bounces) that keeps bumps from going black
 _NORMAL_VARIANCE = 0.18  # at most, added to alpha squared where a pixel's normals spread
@@ -71,18 +72,21 @@ def photograph(
     """
     if irradiance is None:
         irradiance = scattered_irradiance(head, appearance, transport, settings)
-    facets = _facets(head, appearance, camera, settings)
+    facets, shares, pixels = _facets(head, appearance, camera, settings)
     height, width = camera.camera.height_px, camera.camera.width_px
     lights = len(transport.directions)
+    visibility = np.ascontiguousarray(transport.visibility[:, facets.vertices].T)
     pictures = torch.zeros(lights, 3, height * width)
-    step = max(1, _CHUNK // max(1, len(facets.part)))
-    for first in range(0, lights, step):
-        chunk = slice(first, min(first + step, lights))
-        for channel, radiance in enumerate(_shaded(facets, transport, irradiance, chunk, settings)):
-            seen = facets.shares @ radiance
-            pictures[chunk, channel, facets.pixels] = torch.from_numpy(np.ascontiguousarray(seen.T))
+    step = max(1, _CHUNK // lights)
+    for first in range(0, len(pixels), step):
+        some = slice(first, min(first + step, len(pixels)))
+        rows = slice(shares.indptr[some.start], shares.indptr[some.stop])
+        area = shares[some, rows]
+        shaded = _shaded(facets.part_of(rows), transport.directions, visibility, irradiance, settings)
+        for channel, radiance in enumerate(shaded):
+            pictures[:, channel, pixels[some]] = torch.from_numpy(area @ radiance).T
     coverage = torch.zeros(height * width)
-    coverage[facets.pixels] = torch.from_numpy(np.asarray(facets.shares.sum(1))[:, 0])
+    coverage[pixels] = torch.from_numpy(np.asarray(shares.sum(1))[:, 0])
     return pictures.view(lights, 3, height, width), coverage.view(height, width)
 
 
@@ -93,17 +97,22 @@ def scattered_irradiance(
     settings: RenderSettings = RenderSettings(),
 ) -> np.ndarray:
     """Irradiance [3, V, L]: direct, bounced and spread under the skin; 1 on what faces a light of rgb 1."""
-    direct = np.ascontiguousarray(transport.visibility.T) * _cosines(head, transport.directions)
-    albedo = _vertex_albedo(head, appearance)
-    scatterings = _scatterings(head, transport.baked, appearance) if settings.scattering else [[], [], []]
-    irradiance = np.empty((3, *direct.shape), np.float32)
-    for channel, passes in enumerate(scatterings):
-        total = direct
-        for _ in range(settings.bounces):
-            total = direct + transport.gather @ (albedo[:, channel, None] * total)
-        for spread in passes:
-            total = spread @ total
-        irradiance[channel] = total
+    albedo = _vertex_albedo(head, appearance)[transport.sites].T[..., None]  # [3, S, 1]
+    skin = np.flatnonzero(transport.baked & (head.part == _SKIN))
+    spreads = _spreads(head, skin, appearance) if settings.scattering and len(skin) else [[], [], []]
+    irradiance = np.empty((3, len(head.vertices), len(transport.directions)), np.float32)
+    for first in range(0, len(transport.directions), _LIGHTS):
+        chunk = slice(first, first + _LIGHTS)
+        total = transport.visibility[chunk].T * _cosines(head, transport.directions[chunk])
+        direct = total[transport.sites]
+        for channel, spread in enumerate(spreads):
+            bounced = np.zeros_like(direct)
+            for _ in range(settings.bounces):
+                bounced = transport.gathered(albedo[channel] * (direct + bounced))
+            lit = total + bounced[transport.site_of] * transport.baked[:, None]
+            for step in spread:
+                lit[skin] = step @ lit[skin]
+            irradiance[channel, :, chunk] = lit
     return irradiance
 
 
@@ -123,22 +132,18 @@ def _vertex_albedo(head: HeadMesh, appearance: Appearance) -> np.ndarray:
     return surface.albedo.float().numpy()
 
 
-def _scatterings(head: HeadMesh, baked: np.ndarray, appearance: Appearance) -> list[list[csr_matrix]]:
-    """For each channel the sparse means [V, V] that, one after the other, spread light under the skin.
+def _spreads(head: HeadMesh, skin: np.ndarray, appearance: Appearance) -> list[list[csr_matrix]]:
+    """For each channel the sparse means [N, N] that, one after the other, spread light under the skin [N].
 
     A Gaussian over near vertices, weighted by their area, among skin that faces alike (not across the lips'
     slit). A wide one takes several passes of narrower ones, so that each reaches few vertices.
     """
-    skin = np.flatnonzero(baked & (head.part == _SKIN))
-    if len(skin) == 0:
-        return [[], [], []]
     area = _vertex_areas_m2(head)[skin]
     points, normals = head.vertices[skin], head.normals[skin]
-    distance, near = cKDTree(points).query(points, k=min(_NEAR, len(skin)))
-    distance, near = distance.reshape(len(skin), -1), near.reshape(len(skin), -1)
+    distance, near = cKDTree(points).query(points, range(1, min(_NEAR, len(skin)) + 1))
     weights = area[near] * (np.einsum("nc,nkc->nk", normals, normals[near]) > 0.3)
     reach_m = float(np.median(distance[:, -1]))
-    count = len(head.vertices)
+    rows = np.broadcast_to(np.arange(len(skin))[:, None], near.shape)
     result = []
     for sigma_mm in appearance.scattering_mm.tolist():
         passes = max(1, math.ceil((2.2 * sigma_mm / 1000 / reach_m) ** 2))
@@ -146,16 +151,8 @@ def _scatterings(head: HeadMesh, baked: np.ndarray, appearance: Appearance) -> l
         kernel = weights * np.exp(-0.5 * (distance / sigma_m) ** 2) + 1e-12 * (distance == 0)
         kept = kernel > 1e-3 * kernel.max(1, keepdims=True)
         kernel /= (kernel * kept).sum(1, keepdims=True)
-        rows = np.broadcast_to(np.arange(len(skin))[:, None], near.shape)[kept]
-        other = np.setdiff1d(np.arange(count), skin)
-        matrix = csr_matrix(
-            (
-                np.concatenate([kernel[kept], np.ones(len(other))]).astype(np.float32),
-                (np.concatenate([skin[rows], other]), np.concatenate([skin[near[kept]], other])),
-            ),
-            shape=(count, count),
-        )
-        result.append([matrix] * passes)
+        values = kernel[kept].astype(np.float32)
+        result.append([csr_matrix((values, (rows[kept], near[kept])), shape=(len(skin),) * 2)] * passes)
     return result
 
 
@@ -169,10 +166,9 @@ def _vertex_areas_m2(head: HeadMesh) -> np.ndarray:
 class _Facets:
     """What a picture's pixels see [N], one entry for each part in a pixel; vectors in the head frame."""
 
-    pixels: np.ndarray  # [M] the covered ones
-    shares: csr_matrix  # [M, N] area of each pixel's facets
+    vertices: np.ndarray  # [W] that the picture shows
     part: Tensor  # [N]
-    corners: csr_matrix  # [N, V] barycentric weights; rows sum to 1
+    corners: csr_matrix  # [N, W] barycentric weights; rows sum to 1
     tinted: list[csr_matrix]  # [N, V] a channel: those times albedo
     surface: Surface
     normals: Tensor  # [N, 3] unit, as are the rest
@@ -181,59 +177,67 @@ class _Facets:
     tangents: Tensor
     spread: Tensor  # [N] variance of the normals within
 
+    def part_of(self, rows: slice) -> "_Facets":
+        """Some of the facets."""
+        return _Facets(
+            self.vertices,
+            self.part[rows],
+            self.corners[rows],
+            [matrix[rows] for matrix in self.tinted],
+            Surface(*(getattr(self.surface, field.name)[rows] for field in fields(Surface))),
+            *(getattr(self, name)[rows] for name in ("normals", "bent", "views", "tangents", "spread")),
+        )
 
-def _facets(head: HeadMesh, appearance: Appearance, camera: StageCamera, settings: RenderSettings) -> _Facets:
+
+def _facets(
+    head: HeadMesh, appearance: Appearance, camera: StageCamera, settings: RenderSettings
+) -> tuple[_Facets, csr_matrix, np.ndarray]:
+    """The facets of a picture, the area [M, N] that each has of its covered pixels, and these pixels [M]."""
     samples = _samples(head, camera)
     part = head.part[samples.corners[:, 0]]
     key, facet = np.unique(samples.pixel * len(PARTS) + part, return_inverse=True)
     number = np.bincount(facet, minlength=len(key)).astype(np.float32)
-    facet_of = torch.from_numpy(facet)
-
-    def mean(values: Tensor) -> Tensor:
-        total = torch.zeros(len(key), *values.shape[1:]).index_add_(0, facet_of, values.float())
-        return total / torch.from_numpy(number).view(-1, *[1] * (values.dim() - 1))
+    vertices, used = np.unique(samples.corners, return_inverse=True)
+    each = (samples.weights / number[facet][:, None]).astype(np.float32)
+    rows = facet.repeat(3)
+    corners = csr_matrix((each.ravel(), (rows, used.ravel())), shape=(len(key), len(vertices)))
 
     def interpolated(attribute: np.ndarray) -> Tensor:
-        return torch.from_numpy(
-            np.einsum("sk,skc->sc", samples.weights, attribute[samples.corners]).astype(np.float32)
-        )
+        found = np.einsum("sk,skc->sc", samples.weights, attribute[samples.corners])
+        return torch.from_numpy(found.astype(np.float32))
+
+    def tinted(albedo: Tensor) -> csr_matrix:
+        values = each * albedo.numpy()[:, None]
+        return csr_matrix((values.ravel(), (rows, samples.corners.ravel())), shape=(len(key), len(head.part)))
+
+    def mean(values: Tensor) -> Tensor:
+        total = torch.zeros(len(key), *values.shape[1:]).index_add_(0, torch.from_numpy(facet), values)
+        return total / torch.from_numpy(number).view(-1, *[1] * (values.dim() - 1))
 
     surface = sample(appearance, torch.from_numpy(part), interpolated(head.uv))
     smooth = unit(interpolated(head.normals), 1)
     along_u, along_v = _uv_tangents(head, samples, smooth)
-    slopes = surface.relief.float() if settings.relief else torch.zeros(len(part), 2)
+    slopes = surface.relief if settings.relief else torch.zeros(len(part), 2)
     bent = mean(unit(smooth - slopes[:, :1] * along_u - slopes[:, 1:] * along_v, 1))
-    normals = mean(smooth)
     length = bent.norm(dim=1).clamp(1e-3, 1)
     eye_head = -camera.head_to_camera.T.float() @ camera.translation_m.float()
-    positions = mean(interpolated(head.vertices))
-    weights = samples.weights / number[facet][:, None]
-    rows = facet.repeat(3)
-
-    def matrix(tint: np.ndarray) -> csr_matrix:
-        values = (weights * tint[:, None]).astype(np.float32).ravel()
-        return csr_matrix((values, (rows, samples.corners.ravel())), shape=(len(key), len(head.vertices)))
-
-    pixels, pixel_of = np.unique(key // len(PARTS), return_inverse=True)
-    shares = number / samples.per_pixel
-    return _Facets(
-        pixels=pixels,
-        shares=csr_matrix((shares, (pixel_of, np.arange(len(key)))), shape=(len(pixels), len(key))),
+    facets = _Facets(
+        vertices=vertices,
         part=torch.from_numpy(key % len(PARTS)),
-        corners=matrix(np.ones(len(part))),
-        tinted=[matrix(surface.albedo[:, channel].numpy()) for channel in range(3)],
-        surface=Surface(
-            albedo=mean(surface.albedo),
-            specular=mean(surface.specular),
-            roughness=mean(surface.roughness),
-            relief=mean(surface.relief),
-        ),
-        normals=unit(normals, 1),
+        corners=corners,
+        tinted=[tinted(channel) for channel in surface.albedo.T],
+        surface=Surface(*(mean(getattr(surface, field.name)) for field in fields(Surface))),
+        normals=unit(mean(smooth), 1),
         bent=unit(bent, 1),
-        views=unit(eye_head - positions, 1),
-        tangents=unit(mean(interpolated(head.tangents)), 1),
+        views=unit(eye_head - torch.from_numpy(corners @ head.vertices[vertices]), 1),
+        tangents=unit(torch.from_numpy(corners @ head.tangents[vertices]), 1),
         spread=(1 - length) / length,
     )
+    pixels, pixel_of = np.unique(key // len(PARTS), return_inverse=True)
+    area = csr_matrix(
+        (number / samples.per_pixel, (pixel_of, np.arange(len(key)))), shape=(len(pixels), len(key))
+    )
+    return facets, area, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,15 +293,18 @@ def _uv_tangents(head: HeadMesh, samples: _Samples, normals: Tensor) -> tuple[Te
 
 
 def _shaded(
-    facets: _Facets, transport: MeshTransport, irradiance: np.ndarray, chunk: slice, settings: RenderSettings
+    facets: _Facets,
+    directions: np.ndarray,
+    visibility: np.ndarray,
+    irradiance: np.ndarray,
+    settings: RenderSettings,
 ) -> Iterator[np.ndarray]:
-    """Radiance [N, L] of the facets by channel, under a chunk of the lights."""
-    lights = torch.from_numpy(transport.directions[chunk]).float()
-    hair = facets.part == _HAIR
+    """Radiance [N, L] of the facets by channel; visibility is that of `facets.vertices` [W, L]."""
+    lights = torch.from_numpy(directions).float()
     white, coloured = torch.zeros(2, len(facets.part), len(lights))
     if settings.gloss:
-        visibility = facets.corners @ np.ascontiguousarray(transport.visibility[chunk].T)
-        seen = torch.from_numpy(visibility)
+        hair = facets.part == _HAIR
+        seen = torch.from_numpy(facets.corners @ visibility)
         white[~hair] = _gloss(facets, ~hair, lights) * seen[~hair]
         strands = Strands(
             facets.tangents[hair],
@@ -307,11 +314,9 @@ def _shaded(
         )
         for lobe, radiance in zip((white, coloured), strand_highlights(strands, lights), strict=True):
             lobe[hair] = radiance * seen[hair]
-    relief = _relief_ratio(facets, lights) if settings.relief else None
-    for channel in range(3):
-        diffuse = facets.tinted[channel] @ np.ascontiguousarray(irradiance[channel][:, chunk])
-        if relief is not None:
-            diffuse *= relief
+    relief = _relief_ratio(facets, lights) if settings.relief else np.float32(1)
+    for channel, tinted in enumerate(facets.tinted):
+        diffuse = (tinted @ irradiance[channel]) * relief
         yield diffuse + (white + coloured * facets.surface.albedo[:, channel, None]).numpy()
 
 

@@ -278,7 +278,8 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
     weights = 1 / (distances + 1e-5)
     weights /= weights.sum(-1, keepdims=True)
     cosines = np.clip(transport.directions @ subject.mesh.normals.T, 0, None)
-    bounce = (transport.gather @ (transport.visibility * cosines).T).T
+    direct = (transport.visibility * cosines)[:, transport.sites].T
+    bounce = transport.gathered(direct)[transport.site_of].T * transport.baked
 
     def in_chart(baked: np.ndarray) -> Tensor:
         field = np.einsum("lnk,nk->ln", baked[:, skin[near]], weights)

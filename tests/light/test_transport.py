@@ -6,7 +6,7 @@ import trimesh
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.transport import BakeSettings, bake_mesh, bake_transport, build_scene
+from facerf_cli.light.transport import BakeSettings, MeshTransport, bake_mesh, bake_transport, build_scene
 from facerf_cli.light.transport import occluded as embree_occluded
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import rasterize
@@ -147,6 +147,11 @@ def _table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _joined(floor, board)
 
 
+def _cover(bake: MeshTransport) -> np.ndarray:
+    """The share [V] of the hemisphere that other surfaces cover."""
+    return bake.gathered(np.ones(len(bake.sites)))[bake.site_of]
+
+
 def test_a_mesh_shadow_lies_where_the_lamp_throws_it() -> None:
     vertices, normals, triangles = _table()
     lamp = np.array([1.0, 3.0, 0.0]) / np.sqrt(10)  # moves the board's shadow by 0.1 m to -x
@@ -181,8 +186,7 @@ def test_smooth_normals_of_a_sphere_throw_no_shadow_on_it() -> None:
     assert (baked.visibility[facing <= 0] == 0).all()
     inside_out = -sphere.vertex_normals  # a hollow: its facets rise above every tangent plane
     hollow = bake_mesh(sphere.vertices, inside_out, sphere.faces[:, ::-1], lamps, BakeSettings())
-    cover = np.asarray(hollow.gather.sum(1))[:, 0]
-    assert np.allclose(cover, 1, atol=1e-5)  # nothing but the hollow to be seen from within
+    assert np.allclose(_cover(hollow), 1, atol=1e-5)  # nothing but the hollow to be seen from within
 
 
 def test_a_mesh_gathers_the_form_factor_of_a_wall() -> None:
@@ -195,12 +199,12 @@ def test_a_mesh_gathers_the_form_factor_of_a_wall() -> None:
     wanted = np.isin(np.arange(len(vertices)), middle)
     baked = bake_mesh(vertices, normals, triangles, z[None], settings, wanted=wanted)
     expected = (1 - 1 / np.sqrt(1 + (1 / np.maximum(vertices[middle, 2], 1e-9)) ** 2)) / 2
-    seen = np.asarray(baked.gather.sum(1))[middle, 0]
+    seen = _cover(baked)[middle]
     away = vertices[middle, 2] > 0.02  # on the edge itself half of all rays run along the wall
     assert np.abs(seen - expected)[away].mean() < 0.01
-    bounced = (baked.gather @ baked.visibility[0])[middle]  # the lamp meets the wall head on
+    bounced = baked.gathered(baked.visibility[0][baked.sites])[baked.site_of[middle]]  # it is lit head on
     assert np.abs(bounced - expected)[away].mean() < 0.01
-    assert baked.gather[~wanted].nnz == 0 and (baked.baked == wanted).all()
+    assert np.unique(baked.hits.nonzero()[0]).size <= wanted.sum() and (baked.baked == wanted).all()
     assert baked.visibility[0][~wanted].max() == 1  # the wall was not asked for, yet light bounces off it
 
 
@@ -210,12 +214,12 @@ def test_light_bounces_off_outsides_only() -> None:
         _tessellated(np.zeros(3), z, x, 9), _tessellated(np.array([0, 0.1, 0.0]), z, x, 9)
     )
     bake = bake_mesh(vertices, normals, triangles, y[None], BakeSettings())
-    assert bake.gather.nnz == 0  # the ceiling turns its back
+    assert bake.hits.nnz == 0  # the ceiling turns its back
     flipped = triangles.copy()
     flipped[len(flipped) // 2 :] = flipped[len(flipped) // 2 :, ::-1]
     below = np.arange(len(vertices)) < 81
     facing = bake_mesh(vertices, np.where(below[:, None], normals, -normals), flipped, y[None])
-    assert np.asarray(facing.gather.sum(1)).mean() > 0.5
+    assert _cover(facing).mean() > 0.5
 
 
 def test_hair_is_lit_from_both_sides() -> None:
@@ -232,5 +236,20 @@ def test_the_same_seed_gives_the_same_mesh_bake() -> None:
     vertices, normals, triangles = _table()
     lamps = rig_directions(6).numpy()
     first, second, third = (bake_mesh(vertices, normals, triangles, lamps, seed=seed) for seed in (3, 3, 4))
-    assert (first.visibility == second.visibility).all() and (first.gather != second.gather).nnz == 0
+    assert (first.visibility == second.visibility).all() and (first.hits != second.hits).nnz == 0
     assert (first.visibility != third.visibility).any()
+
+
+def test_strands_share_the_light_and_surroundings_of_those_near() -> None:
+    """Only every fifth vertex is traced, and half of the strip lies in the shadow of a roof."""
+    x, y, z = np.eye(3)
+    strip = _tessellated(np.zeros(3), z, 0.002 * x, 101)
+    roof = _tessellated(np.array([-0.5, 0.1, 0.5]), z, x, 3)
+    vertices, normals, triangles = _joined(strip, roof)
+    hair = vertices[:, 1] == 0
+    bake = bake_mesh(vertices, normals, triangles, y[None], BakeSettings(lamp_radius_deg=0), all_round=hair)
+    share, along = bake.visibility[0][hair], vertices[hair, 2]
+    assert (share[along < 0.49] == 1).all() and (share[along > 0.51] == 0).all()
+    sites = bake.site_of[hair]
+    assert len(np.unique(sites)) < 0.25 * hair.sum()
+    assert np.abs(vertices[bake.sites[sites]] - vertices[hair]).max() < 0.03
