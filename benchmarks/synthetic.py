@@ -14,7 +14,6 @@ import torch
 from facerf_cli.network.losses import si_mse
 from facerf_cli.pipeline import load_models
 from facerf_cli.stage.bank import load_bank
-from facerf_cli.stage.samples import draw_sample
 from facerf_cli.training import TrainSettings
 
 DRAWS, LIGHTS = 16, 8
@@ -36,7 +35,7 @@ def main() -> None:
     generator = torch.Generator().manual_seed(2021)
     columns = []
     for _ in range(DRAWS):
-        sample = draw_sample(bank, heads, LIGHTS, generator)
+        sample = bank.draw(heads, LIGHTS, generator)
         encoded = network.encode(sample.source, sample.normals_source, sample.visible)
         predicted = network.decode(encoded, sample.normals_target, sample.lights)
         cosine = torch.einsum("blc,bcij->blij", sample.lights, sample.normals_target).clamp_min(0)

@@ -14,31 +14,10 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.raster.texture import bake_attributes, normal_map
-from facerf_cli.stage.samples import Sample, draw_sample
+from facerf_cli.stage.baked_faces import Geometry, draw_sample
+from facerf_cli.stage.samples import Sample
 from facerf_cli.stage.shards import in_shards
 from facerf_cli.stage.views import build_views
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """One baked head (head frame): positions, normals, tangents [3, T, T]; transport in bytes."""
-
-    positions: Tensor
-    normals: Tensor
-    tangents: tuple[Tensor, Tensor]
-    directions: Tensor  # [L, 3]
-    visibility: Tensor  # [L, T, T]
-    bounce: Tensor  # [L, T, T], square roots
-
-
-@dataclass(frozen=True)
-class View:
-    """One fitted view of a head: see stage.views."""
-
-    rotation: Tensor  # [3, 3]
-    warp: Tensor  # [T, T, 2]
-    visible: Tensor  # [1, T, T] in 0..1
-    normals: Tensor  # [3, T, T]
 
 
 @dataclass(frozen=True)
@@ -46,7 +25,7 @@ class Bank:
     """Heads and their views; head 0 is the mean face."""
 
     geometries: list[Geometry]
-    views: list[dict[str, Tensor]]
+    views: list[dict[str, Tensor]]  # as `stage.views` writes them
     provenance: dict[str, Any]
 
     @property
@@ -60,18 +39,8 @@ class Bank:
 
     def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
         """One sample of every head in `heads` [B], with `lights` target lights."""
-        return draw_sample(self, heads, lights, generator)
-
-    def draw_view(self, head: int, generator: torch.Generator) -> View:
-        """A random view of a head."""
-        views = self.views[head]
-        index = int(torch.randint(len(views["rotation"]), (), generator=generator))
-        return View(
-            rotation=views["rotation"][index],
-            warp=views["warp"][index].float().permute(1, 2, 0),
-            visible=views["visible"][index][None].float() / 255,
-            normals=F.normalize(views["normals"][index].float(), dim=0),
-        )
+        chosen = [(self.geometries[int(head)], self.views[int(head)]) for head in heads]
+        return draw_sample(chosen, lights, generator)
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of head 0, in the head frame."""

@@ -12,7 +12,6 @@ from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.bank import Bank, load_bank
 from facerf_cli.stage.geometries import bake_head, build_geometries, draw_coefficients
 from facerf_cli.stage.lights import draw_light
-from facerf_cli.stage.samples import draw_sample
 from facerf_cli.stage.views import ViewSettings, build_views
 from tests.stage.conftest import TINY
 
@@ -74,7 +73,7 @@ def test_a_neutral_head_seen_without_error_is_unwrapped_almost_in_place() -> Non
 
 
 def test_samples_are_finite_and_at_one_exposure(bank: Bank) -> None:
-    sample = draw_sample(bank, torch.tensor([1, 2, 3]), 4, torch.Generator().manual_seed(0))
+    sample = bank.draw(torch.tensor([1, 2, 3]), 4, torch.Generator().manual_seed(0))
     for field in (sample.source, sample.target, sample.normals_source, sample.weight):
         assert field.isfinite().all()
     assert sample.target.shape == (3, 4, 3, 32, 32) and sample.target.min() >= 0
@@ -85,7 +84,7 @@ def test_samples_are_finite_and_at_one_exposure(bank: Bank) -> None:
 
 def test_target_brightens_where_it_faces_its_light(bank: Bank) -> None:
     generator = torch.Generator().manual_seed(2)
-    sample = draw_sample(bank, torch.arange(1, 6), 6, generator)
+    sample = bank.draw(torch.arange(1, 6), 6, generator)
     cosine = torch.einsum("blc,bcij->blij", sample.lights, sample.normals_target)
     seen = sample.weight[:, :1].expand_as(cosine) > 0.5
     luminance = sample.target.mean(2)
