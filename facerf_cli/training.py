@@ -3,7 +3,7 @@
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,6 @@ def train(
     """
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
-    generator = torch.Generator().manual_seed(settings.seed)
     network = _network(source, network_settings, start_from, device)
     average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
     optimizer = torch.optim.AdamW(
@@ -68,31 +67,50 @@ def train(
     )
     heads, held_out = source.heads(settings.held_out_heads)
     validation = _held_out_samples(source, held_out)
-    begin, step, drawing = time.monotonic(), 0, 0.0
+    begin, step = time.monotonic(), 0
 
     def finish(row: dict[str, float]) -> Path:
         row["si_mse"] = _validate(average, network.settings, validation, folder / "validation.png")
         return _save(folder / "last.safetensors", average, network.settings, settings, source, row)
 
     with (folder / "log.jsonl").open("a") as log:
-        while (elapsed := time.monotonic() - begin) < settings.max_seconds and step < settings.max_steps:
-            _set_rate(optimizer, settings, step, elapsed)
-            drawn_at = time.monotonic()
-            chosen = heads[torch.randint(len(heads), (settings.batch,), generator=generator)]
-            sample = source.draw(chosen, settings.lights, generator)
-            drawing += time.monotonic() - drawn_at
-            loss = _step(network, optimizer, sample.to(device), settings)
+        for step, drawn in enumerate(_draws(source, heads, settings), 1):
+            _set_rate(optimizer, settings, step - 1, drawn.seconds)
+            loss = _step(network, optimizer, drawn.sample.to(device), settings)
             if not math.isfinite(loss):
-                raise FacerfError(f"the loss is not finite at step {step} (heads {chosen.tolist()})")
-            step += 1
+                raise FacerfError(f"the loss is not finite at step {step - 1} (heads {drawn.heads.tolist()})")
             _update_average(average, network, min(settings.ema_decay, step / (step + 10)))
-            row = {"step": step, "seconds": elapsed, "loss": loss, "drawing": drawing / (elapsed + 1e-6)}
+            row = {"step": step, "seconds": drawn.seconds, "loss": loss, "drawing": drawn.drawing}
             if step % settings.validate_every == 0:
                 finish(row)
             log.write(json.dumps(row) + "\n")
             log.flush()
             report(row)
     return finish({"step": step, "seconds": time.monotonic() - begin})
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """A sample, and when it came."""
+
+    sample: Sample
+    heads: Tensor  # [B]
+    seconds: float  # since the first
+    drawing: float  # the share of these that went into drawing
+
+
+def _draws(source: SampleSource, heads: Tensor, settings: TrainSettings) -> Iterator[_Draw]:
+    """Samples of random heads until the time or the steps are up."""
+    generator = torch.Generator().manual_seed(settings.seed)
+    begin, drawing_s = time.monotonic(), 0.0
+    for _ in range(settings.max_steps):
+        start_s = time.monotonic() - begin
+        if start_s >= settings.max_seconds:
+            return
+        chosen = heads[torch.randint(len(heads), (settings.batch,), generator=generator)]
+        sample = source.draw(chosen, settings.lights, generator)
+        drawing_s += time.monotonic() - begin - start_s
+        yield _Draw(sample, chosen, start_s, drawing_s / (start_s + 1e-6))
 
 
 def _network(

@@ -1,5 +1,6 @@
 """`facerf relight-dataset`: subjects of a prepared dataset under environment maps, as pairs to train on."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +68,8 @@ def relight_dataset(
     from facerf_cli.stage.sky.skies import parse_envmaps
 
     settings = settings_of(context)
+    if not math.isfinite(memory):
+        raise UsageError(f"--memory {memory}: give a number of GB")
     prepared = read_dataset(dataset)
     output = dataset / RELIT
     if envmaps.startswith("procedural:"):

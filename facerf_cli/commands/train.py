@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from facerf_cli.stage.samples import SampleSource
 
 _OF_THE_BANK = ("heads_from", "heads", "views", "bank")
+_OF_A_DATASET = ("texture_size",)
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 
 
@@ -68,8 +69,12 @@ def train(
 
     settings = settings_of(context)
     training = TrainSettings(max_seconds=_seconds(max_time), seed=settings.seed)
-    if dataset is not None:
-        _refuse_the_banks_options(context)
+    if dataset is None:
+        _refuse(context, _OF_A_DATASET, "is for a prepared dataset; give --dataset beside it")
+    else:
+        _refuse(
+            context, _OF_THE_BANK, "is for synthetic heads, and --dataset takes their place; give one of them"
+        )
     if start_from:
         load_network(start_from)  # a bad file is named before hours of baking
     source: SampleSource
@@ -85,14 +90,12 @@ def train(
     print(checkpoint)
 
 
-def _refuse_the_banks_options(context: typer.Context) -> None:
-    for name in _OF_THE_BANK:
+def _refuse(context: typer.Context, names: tuple[str, ...], why: str) -> None:
+    """Raise for options that were given although they mean nothing here."""
+    for name in names:
         given = context.get_parameter_source(name)
         if given is not None and given.name == "COMMANDLINE":
-            option = f"--{name.replace('_', '-')}"
-            raise UsageError(
-                f"{option} is for synthetic heads, and --dataset takes their place; give one of them"
-            )
+            raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
 def _open_dataset(folder: Path, fit_with: str, side: int, jobs: int) -> "SampleSource":

@@ -58,3 +58,9 @@ def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path, capsys: pytest.Cap
     assert main(["train", "--dataset", str(tmp_path), "-o", str(tmp_path / "run")]) == 1
     assert f"{tmp_path}/dataset.json: no such file" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+def test_a_datasets_options_need_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), "--texture-size", "64"]) == 2
+    assert "--texture-size is for a prepared dataset; give --dataset" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
