@@ -131,21 +131,15 @@ def usable(shots: Iterable[Shot]) -> tuple[Shot, ...]:
 
 def read_map(path: Path | DrawnMap) -> "Tensor":
     """A lat-long map [H, W, 3], linear; an InputError names what is wrong with it."""
-    import torch
-
     if isinstance(path, DrawnMap):
+        import torch
+
         from facerf_cli.stage.sky.skies import draw_sky
 
         return torch.from_numpy(draw_sky(path.index, path.seed, DRAWN_WIDTH_PX)[0])
-    from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
-    from facerf_cli.light.envmap import check_envmap
+    from facerf_cli.stage.map_files import read_map_file
 
-    envmap = torch.from_numpy(read_image(path, limit_px=ENVMAP_LIMIT_PX).pixels)
-    try:
-        check_envmap(envmap)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return envmap
+    return read_map_file(path)
 
 
 @lru_cache(maxsize=1)

@@ -21,10 +21,10 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.light.envmap import check_envmap, rotated_weights
+from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.stage.data.dataset import Dataset
+from facerf_cli.stage.map_files import read_map_file
 from facerf_cli.stage.sky.skies import ProceduralMaps, draw_sky
 from facerf_cli.stage.threads import one_thread
 
@@ -43,12 +43,7 @@ def read_map(name: str) -> Tensor:
     """The lat-long map [H, W, 3] that a pair names, linear; an InputError says what is wrong with it."""
     if drawn := _PROCEDURAL.fullmatch(name):
         return torch.from_numpy(draw_sky(int(drawn[1]), int(drawn[2]), int(drawn[3]))[0])
-    envmap = torch.from_numpy(read_image(name, limit_px=ENVMAP_LIMIT_PX).pixels)
-    try:
-        check_envmap(envmap)
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
-    return envmap
+    return read_map_file(name)
 
 
 @dataclass(frozen=True, eq=False)
