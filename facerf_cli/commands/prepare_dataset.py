@@ -21,8 +21,8 @@ from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
-    from facerf_cli.stage.data.dataset import Split
     from facerf_cli.stage.data.layouts import Capture
+    from facerf_cli.stage.data.splits import Split
 
 _CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
@@ -112,8 +112,9 @@ def prepare_dataset(
     fits, a sheet a subject, index.html to look through, and dataset.json at the end. A second run goes on
     where the first was cut off.
     """
-    from facerf_cli.stage.data.dataset import DATASET_FILE, LARGEST_CROP_PX, Split
+    from facerf_cli.stage.data.dataset import DATASET_FILE, LARGEST_CROP_PX
     from facerf_cli.stage.data.description import preparation_key
+    from facerf_cli.stage.data.splits import Split
 
     settings = settings_of(context)
     drawn = Split.parse(split)

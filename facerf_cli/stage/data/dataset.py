@@ -1,4 +1,4 @@
-"""Prepared light-stage data on disk (DESIGN, 'Files'): what is where, the splits, reading and writing.
+"""Prepared light-stage data on disk (DESIGN, 'Files'): what is where, and reading what is said of it.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
     olat/SUBJECT/CAMERA.exr    an OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
@@ -10,25 +10,14 @@ Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward
 capture has it; each stack holds its lights in its own crop's camera space.
 """
 
-import hashlib
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.fit import FaceFit, fit_to_arrays
-from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
-from facerf_cli.files.olat_stack import StackHeader
-from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
-from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.errors import InputError
 from facerf_cli.stage.data.documents import Node, read_document, unique_ids
 from facerf_cli.stage.data.layouts import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 
@@ -153,97 +142,3 @@ def _read_splits(node: Node, subjects: set[str]) -> dict[str, tuple[str, ...]]:
             placed.add(member.name())
         splits[split] = tuple(member.name() for member in members)
     return splits
-
-
-@dataclass(frozen=True)
-class Split:
-    """How many subjects go to training, validation and test: counts, or shares of all that sum to 1."""
-
-    parts: tuple[float, float, float]
-    are_shares: bool
-
-    @staticmethod
-    def parse(text: str) -> "Split":
-        """`300/10/40` or `0.8/0.1/0.1`."""
-        words = text.split("/")
-        advice = f"--split {text!r}: give counts of subjects such as 300/10/40, or shares such as 0.8/0.1/0.1"
-        if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):
-            train, validation, test = (float(word) for word in words)
-            return Split((train, validation, test), are_shares=False)
-        try:
-            train, validation, test = (float(word) for word in words)
-        except ValueError:
-            raise UsageError(advice) from None
-        if not (min(train, validation, test) >= 0 and abs(train + validation + test - 1) < 1e-6):
-            raise UsageError(f"{advice} (shares are not negative and sum to 1)")
-        return Split((train, validation, test), are_shares=True)
-
-    def counts(self, subjects: int) -> tuple[int, int, int]:
-        """How many of so many subjects go where; of shares, none but 0 goes without one if that can be."""
-        if not self.are_shares:
-            train, validation, test = (int(part) for part in self.parts)
-            if train + validation + test > subjects:
-                wanted = "/".join(str(int(part)) for part in self.parts)
-                raise UsageError(
-                    f"--split {wanted}: {train + validation + test} subjects, but the capture has "
-                    f"{subjects}; give shares such as 0.8/0.1/0.1"
-                )
-            return train, validation, test
-        exact = np.array(self.parts) * subjects
-        counts = np.floor(exact + 1e-9).astype(int)
-        order = np.argsort(counts - exact, kind="stable")
-        counts[order[: subjects - counts.sum()]] += 1  # the largest remainders
-        for part in np.flatnonzero((counts == 0) & (np.array(self.parts) > 0)):
-            if counts.max() > 1:
-                counts[counts.argmax()] -= 1
-                counts[part] = 1
-        train, validation, test = counts.tolist()
-        return train, validation, test
-
-    def of(self, subjects: Iterable[str], seed: int) -> dict[str, tuple[str, ...]]:
-        """The subjects of each split, sorted.
-
-        They are cut from an order that depends on each subject's name and the seed alone, so that a subject
-        more or less moves few of the others.
-        """
-        order = sorted(subjects, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest())
-        ends = np.cumsum([0, *self.counts(len(order))]).tolist()
-        parts = (order[first:last] for first, last in pairwise(ends))
-        return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
-
-
-def constant_weights(directions: np.ndarray) -> np.ndarray:
-    """Weights [L] of lights [L, 3] under a map of radiance 1: the solid angle of each one's cell over pi."""
-    white = torch.ones(2, 4, 3)
-    return envmap_weights(white, torch.from_numpy(directions).float())[:, 0].numpy()
-
-
-def stack_header(
-    model: MorphableModel,
-    fit: FaceFit,
-    directions: np.ndarray,
-    source: np.ndarray,
-    inside: np.ndarray,
-    metadata: Mapping[str, Any],
-) -> StackHeader:
-    """The header of a stack of pictures [S, S, 3] in a fit's crop, lit from camera-space directions [L, 3].
-
-    `source` [S, S, 3] is the crop under a constant map of radiance 1; `inside` [S, S] tells which of its
-    pixels the photo holds. The face is seen where the front of the fitted mesh covers those.
-    """
-    vertices, triangles = fit.vertices_camera(model), grid_triangles()
-    fragments = rasterize(vertices, triangles, fit.camera)
-    front = front_facing(vertices, triangles)[fragments.triangle] & fragments.covered
-    normals = interpolate(vertex_normals(vertices, triangles), triangles, fragments)
-    normals = torch.nn.functional.normalize(normals, dim=-1)
-    return StackHeader(
-        kind="image",
-        directions=directions,
-        rotation=fit.rotation.double().numpy(),
-        source=source,
-        seen=(front.numpy() & inside).astype(np.float32),
-        normals=normals.numpy(),
-        layout_version=LAYOUT_VERSION,
-        fit=fit_to_arrays(fit),
-        metadata=dict(metadata),
-    )

@@ -5,9 +5,8 @@ Never more than one camera's sum is held.
 """
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import torch
 from torch import Tensor
 
 from facerf_cli import __version__
-from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.crop_pose import fit_in_crop
@@ -24,27 +22,23 @@ from facerf_cli.face.fit import FaceFit, quality_of, save_fit
 from facerf_cli.face.joint_fit import JointFit, fit_views
 from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.overlay import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
-from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.records import LOGGER_NAME
-from facerf_cli.report import contact_sheet, mark_light
+from facerf_cli.report import contact_sheet
 from facerf_cli.stage.data.dataset import (
-    constant_weights,
     fit_path,
     record_path,
     sheet_path,
-    stack_header,
     stack_path,
 )
 from facerf_cli.stage.data.documents import read_document, write_document
 from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.sheets import lights_shown, sheet_tiles
+from facerf_cli.stage.data.stacks import constant_weights, stack_header
 
 log = logging.getLogger(LOGGER_NAME)
-_TILE_PX = 192  # of the sheets
-_SHOWN_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # the sheets' three lights, to the camera
 
 
 def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
@@ -118,9 +112,8 @@ def _write_camera(
 ) -> np.ndarray:
     """Write a camera's stack and fit; give its tiles [6, h, w, 3] of the sheet."""
     posed = capture.cameras[camera]
-    world_to_crop = (
-        fit.rotation.double() @ joint.rotation.mT
-    )  # through the head: lights turn with the normals
+    # Through the head, so that lights turn with the normals.
+    world_to_crop = fit.rotation.double() @ joint.rotation.mT
     directions = capture.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)
@@ -134,12 +127,12 @@ def _write_camera(
     header = stack_header(model, fit, directions, source, inside, metadata)
     if not header.seen.any():
         raise InputError(f"{subject}/{camera}: the camera does not see the face; take it out of stage.json")
-    shown: dict[int, np.ndarray] = dict.fromkeys(_lights_shown(directions), source)
+    shown: dict[int, np.ndarray] = dict.fromkeys(lights_shown(directions), source)
     crops = _crops(capture, subject, camera, fit.crop, header, shown)
     write_olat_stack(stack_path(folder, subject, camera), header, crops)
     with atomic_path(fit_path(folder, subject, camera)) as temporary:
         save_fit(temporary, fit)
-    return _tiles(header, fit, model, shown)
+    return sheet_tiles(header, fit, model, shown)
 
 
 def _crops(
@@ -163,32 +156,6 @@ def _crops(
         log.warning(
             "%s/%s: %d pixels are beyond %g and were clipped; %s", subject, camera, clipped, HALF_MAX, advice
         )
-
-
-def _lights_shown(directions: np.ndarray) -> list[int]:
-    """Three lights of the sheet: those nearest to a lamp in front, on the left and on the right."""
-    wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHOWN_AZEL_DEG])
-    return (wanted @ directions.T).argmax(1).tolist()
-
-
-def _tiles(
-    header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
-) -> np.ndarray:
-    """Fully lit, the fit over it, what the mask leaves of it, three single lights: [6, h, w, 3].
-
-    Linear, exposed for display: each on its own, but the three lights alike.
-    """
-    side_px = fit.crop.size_px
-    lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
-    overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
-    masked = lit * (0.1 + 0.9 * header.seen[..., None])
-    single = np.stack([shown[light] for light in _lights_shown(header.directions)])
-    single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
-    small = Crop(0.0, 0.0, float(side_px), min(side_px, _TILE_PX))
-    tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])
-    for tile, light in zip(tiles[3:], _lights_shown(header.directions), strict=True):
-        mark_light(tile, header.directions[light], 1.0)
-    return tiles
 
 
 def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:

@@ -21,13 +21,12 @@ from facerf_cli.stage.data.dataset import (
     FORMAT,
     SPLITS,
     Dataset,
-    constant_weights,
     fit_path,
     read_dataset,
-    stack_header,
     stack_path,
 )
 from facerf_cli.stage.data.documents import write_document
+from facerf_cli.stage.data.stacks import constant_weights, stack_header
 
 YAW_DEG = (-15.0, 20.0, 40.0, -40.0)  # of the head, one a camera: camera k sees it turned so far
 

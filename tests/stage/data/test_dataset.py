@@ -14,7 +14,9 @@ from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.stage.data.dataset import SPLITS, Split, constant_weights, read_dataset, stack_header
+from facerf_cli.stage.data.dataset import SPLITS, read_dataset
+from facerf_cli.stage.data.splits import Split
+from facerf_cli.stage.data.stacks import constant_weights, stack_header
 from tests.stage.data.dataset_fixture import write_small_dataset
 
 

@@ -11,11 +11,12 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, read_olats, write_olat_stack
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.stage.data.dataset import Dataset, constant_weights
+from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.map_weights import map_directions, name_maps, world_to_map
 from facerf_cli.stage.data.pair_weights import load_pairs, pair_weights, settle_pairs, weights_path
 from facerf_cli.stage.data.recipes import draw_pair, draw_pairs, pairs_path, picture_path, read_pairs
 from facerf_cli.stage.data.relighting import multiply, relight_subject, relit_pictures, render_source
+from facerf_cli.stage.data.stacks import constant_weights
 from facerf_cli.stage.sky.skies import ProceduralMaps
 from tests.stage.data.dataset_fixture import write_small_dataset
 
