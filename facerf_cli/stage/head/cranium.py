@@ -9,11 +9,13 @@ slope go on across the border and the difference dies away over the skull.
 from functools import cache
 
 import numpy as np
+import torch
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
+from facerf_cli.stage.threads import one_thread
 
 BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; the other one is 1 - BACK_U
 _CROWN_MM_PER_DEG = 1.4  # of arc
@@ -113,16 +115,19 @@ class Surroundings:
         known = template(*uv[self._rings].T)
         self._known, self._wanted = known, template(*u_level.T)
         covariance = _kernel(known, known) + 1e-7 * np.eye(len(known))
-        inverse = np.linalg.inv(covariance)
-        chunks = np.array_split(self._wanted, 16)
-        self._carry = np.concatenate([(_kernel(c, known) @ inverse).astype(np.float32) for c in chunks])
+        with one_thread():  # numpy's solver would round by the number of cores
+            inverse = torch.linalg.inv(torch.from_numpy(covariance))
+            chunks = np.array_split(self._wanted, 16)
+            self._carry = torch.cat([(torch.from_numpy(_kernel(c, known)) @ inverse).float() for c in chunks])
 
     def positions(self, vertices_mm: np.ndarray) -> np.ndarray:
         """The surface [N, 3] in millimetres that goes on from the chart's `vertices_mm` [V, 3]."""
         border = vertices_mm[self._rings]
         scale, shift = _similarity(self._known, border)
         difference = border - (self._known * scale + shift)
-        return self._wanted * scale + shift + self._carry @ difference.astype(np.float32)
+        with one_thread():
+            carried = self._carry @ torch.from_numpy(difference).float()
+        return self._wanted * scale + shift + carried.numpy()
 
 
 def _rings() -> np.ndarray:

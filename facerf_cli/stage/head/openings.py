@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.regions import CHART_MM
 from facerf_cli.face.topology import LANDMARK_UV, grid_uv
 from facerf_cli.stage.head.cranium import BACK_U, CROWN_LEVEL, NECK_LEVEL
+from facerf_cli.stage.threads import one_thread
 
 OPENINGS = ("eye_left", "eye_right", "mouth")  # eyes by the picture's side
 _ARCS = {"eye_left": ([36, 37, 38, 39], [39, 40, 41, 36]), "mouth": ([*range(60, 65)], [64, 65, 66, 67, 60])}
@@ -131,7 +133,9 @@ def _thin_plate(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     system[: len(known)] = rows(known)
     system[len(known) :, : len(known)] = system[: len(known), len(known) :].T
     system[np.arange(len(known)), np.arange(len(known))] += _SMOOTHING
-    return np.linalg.solve(system.T, rows(wanted).T).T[:, : len(known)]
+    with one_thread():  # numpy's solver would round by the number of cores
+        solved = torch.linalg.solve(torch.from_numpy(system.T), torch.from_numpy(rows(wanted).T))
+    return solved.numpy().T[:, : len(known)]
 
 
 def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:

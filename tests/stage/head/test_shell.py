@@ -1,5 +1,8 @@
 """Any chart closed into a whole head: what is closed, what is open, and what lies behind what."""
 
+import os
+import subprocess
+import sys
 from functools import cache
 
 import numpy as np
@@ -254,3 +257,26 @@ def test_uv_is_the_chart_gone_on() -> None:
     u, v = mesh.uv[skin].T
     assert -1 < u.min() < -0.95 and 1.95 < u.max() < 2
     assert -0.4 < v.min() < -0.25 and v.max() == pytest.approx((TOP_M + 0.17) / 0.174, abs=0.01)
+
+
+def test_a_head_does_not_depend_on_the_number_of_threads() -> None:
+    """A process of --jobs 2 has fewer of them than one of --jobs 1."""
+    script = """
+from zlib import crc32
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.stage.head.openings import lips
+from facerf_cli.stage.head.shell import shell_head
+print(*(crc32(lip.weights.tobytes()) for name in ("eye_left", "mouth") for lip in lips(name)))
+print(crc32(shell_head(load_face_model().mean, (0.0, 0.0), 0).vertices.tobytes()))
+"""
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            env=os.environ | {"OMP_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        for threads in ("1", "4")
+    ]
+    assert runs[0].stdout == runs[1].stdout and len(runs[0].stdout.split()) == 5
