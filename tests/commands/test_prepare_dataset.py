@@ -226,21 +226,19 @@ def test_a_camera_behind_the_head_is_named(given: Given, tmp_path: Path, capsys:
     assert "0000/C1: " in (said := capsys.readouterr().err) and said.count("\n") == 1
 
 
-def test_values_that_halves_cannot_hold_and_odd_texts_of_the_capture(
-    given: Given, tmp_path: Path, capsys: Said
+@pytest.mark.parametrize(("intensity", "said"), [(1e-6, "65504 and were clipped"), (1e6, "too large")])
+def test_intensities_of_another_unit_and_odd_texts_of_the_capture(
+    given: Given, tmp_path: Path, capsys: Said, intensity: float, said: str
 ) -> None:
-    lights = json.loads((given[0] / "stage.json").read_text())["lights"]
-    dim = [light | {"intensity": [1e-6] * 3} for light in lights]
-    capture = changed(given, tmp_path / "capture", lights=dim, subjects={"0000": {"name": "\ud800"}})
+    content = json.loads((given[0] / "stage.json").read_text())
+    lights = [light | {"intensity": [intensity] * 3} for light in content["lights"]]
+    subjects = {"0000": {"name": "\ud800"}}
+    capture = changed(given, tmp_path / "capture", lights=lights, subjects=subjects)
     assert prepare(capture, tmp_path / "out", "--split", "1/0/0") == 0
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 3 and all(
-        "pixels are beyond 65504 and were clipped; the lamps'" in line for line in said
-    )
-    assert (
-        json.loads((tmp_path / "out/dataset.json").read_text())["subjects"]["0000"]["traits"]["name"]
-        == "\ud800"
-    )
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3 and all(said in line and "lamps' intensities" in line for line in lines)
+    dataset = json.loads((tmp_path / "out/dataset.json").read_text())
+    assert dataset["subjects"]["0000"]["traits"] == subjects["0000"]
 
 
 def test_pictures_for_the_eye_are_taken_by_their_curve(

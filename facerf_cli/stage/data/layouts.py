@@ -36,6 +36,7 @@ MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 _FIELDS = ("subject", "camera", "light")
 _LONGEST_SIDE_PX = 65_536
 _ORTHONORMAL_OFF = 1e-3
+_LEAST_INTENSITY = 1e-12  # what is less is no light, and 0 in float32 before long
 _ASPECT_OFF = 0.01  # of fx from fy: a face crop has square pixels
 _OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
 
@@ -128,7 +129,7 @@ def _colour_space(node: Node) -> str:
 
 def _intensity(light: Node) -> np.ndarray:
     intensity = light["intensity"].array(3)
-    if not (intensity > 0).all():
+    if not (intensity > _LEAST_INTENSITY).all():
         name = light["id"].name()
         raise light["intensity"].wrong(f"light in every channel (lamp {name} cannot be divided out)")
     return intensity

@@ -27,17 +27,13 @@ from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.records import LOGGER_NAME
 from facerf_cli.report import contact_sheet
-from facerf_cli.stage.data.dataset import (
-    fit_path,
-    record_path,
-    sheet_path,
-    stack_path,
-)
+from facerf_cli.stage.data.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.stage.data.documents import read_document, write_document
 from facerf_cli.stage.data.layouts import Capture
 from facerf_cli.stage.data.sheets import lights_shown, sheet_tiles
 from facerf_cli.stage.data.stacks import constant_weights, stack_header
 
+_DIMMEST = 1e-3  # what a picture under a constant map of radiance 1 may be; halves hold little below
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -151,11 +147,17 @@ def _crops(
             shown[light] = picture
         clipped += int((picture > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(picture).permute(2, 0, 1)[None]
+    _say_what_halves_lose(f"{subject}/{camera}", clipped, float(header.source.max()))
+
+
+def _say_what_halves_lose(name: str, clipped: int, lit: float) -> None:
+    """Warn of intensities that are far from DESIGN's unit: a face under a constant map of 1 is below 1."""
     if clipped:
         advice = "the lamps' intensities in stage.json are too small for these pictures"
-        log.warning(
-            "%s/%s: %d pixels are beyond %g and were clipped; %s", subject, camera, clipped, HALF_MAX, advice
-        )
+        log.warning("%s: %d pixels are beyond %g and were clipped; %s", name, clipped, HALF_MAX, advice)
+    elif lit < _DIMMEST:
+        advice = "the lamps' intensities in stage.json are too large for these pictures"
+        log.warning("%s: a map of radiance 1 would light it to %.2g at most; %s", name, lit, advice)
 
 
 def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 _SAME_CAMERA_SHARE = 0.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Pair:
     """A source under a map, and the light of a camera's stack that is to be predicted from it.
 

@@ -112,6 +112,7 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"lights": light(direction=[0, 1])}, "finite"),
         ({"lights": light(intensity=[1, 0, 1])}, "lamp L0"),
         ({"lights": light(intensity=[1, -1, 1])}, "lamp L0"),
+        ({"lights": light(intensity=[1, 1e-60, 1])}, "lamp L0"),
         ({"lights": light(id="L1")}, "no other"),
         ({"lights": light(id="../L0")}, "a name"),
         ({"lights": light(id=".L0")}, "a name"),
