@@ -13,6 +13,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.stage.baked_faces import Geometry, draw_sample
 from facerf_cli.stage.samples import Sample
@@ -63,9 +64,8 @@ def _add_views_shard(views: Path, fitted_with: str, count: int, seed: int, heads
         tensors = build_views(
             head["vertices"], model, count, head["visibility"].shape[-1], seed + int(path.stem)
         )
-        unfinished = views / f"{path.stem}.partial"
-        save_file(tensors, unfinished, metadata={"fitted_with": model.name})
-        unfinished.rename(views / path.name)
+        with atomic_path(views / path.name) as temporary:
+            save_file(tensors, temporary, metadata={"fitted_with": model.name})
 
 
 def load_bank(geometries: Path, views: Path, provenance: dict[str, Any]) -> Bank:

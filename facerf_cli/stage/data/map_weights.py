@@ -29,7 +29,7 @@ from facerf_cli.stage.sky.skies import ProceduralMaps, draw_sky
 from facerf_cli.stage.threads import one_thread
 
 _HEADS_ASKED = 16  # for the vertical
-_PROCEDURAL = re.compile(r"procedural:(\d+):(\d+):(\d+)")
+_PROCEDURAL = re.compile(r"procedural:(\d{1,9}):(\d+):([1-9]\d{0,3})")
 
 
 def name_maps(maps: Sequence[Path] | ProceduralMaps) -> list[str]:

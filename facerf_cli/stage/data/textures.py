@@ -124,7 +124,7 @@ def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: s
     visible = visible * (texture[3] > _INSIDE)
     if visible.max() < 0.5:
         raise InputError(f"{path}: nothing of the face is seen by its fit; run prepare-dataset again")
-    at_once = max(1, min(_AT_ONCE, _VALUES_AT_ONCE // (3 * (4 * side) ** 2)))
+    at_once = _at_once(side)
     olats = torch.empty(len(header.directions), 3, side, side, dtype=torch.float16)
     for first in range(0, len(olats), at_once):
         part = slice(first, first + at_once)
@@ -155,6 +155,11 @@ def _fit_of(path: Path, header: StackHeader, model: MorphableModel) -> tuple[Fac
         raise InputError(f"{path}: the fit in it is of no use: {error}") from None
 
 
+def _at_once(side: int) -> int:
+    """Pictures that are unwrapped together; a texel is 4 x 4 samples."""
+    return max(1, min(_AT_ONCE, _VALUES_AT_ONCE // (3 * (4 * side) ** 2)))
+
+
 def _unwrapped(pictures: Tensor, vertices: Tensor, fit: FaceFit, side: int) -> Tensor:
     """Textures [N, 3, T, T] float16 of pictures [N, 3, H, W]."""
     planes = pictures.float().flatten(0, 1)
@@ -165,7 +170,7 @@ def _unwrapped(pictures: Tensor, vertices: Tensor, fit: FaceFit, side: int) -> T
 def _unwrap_sources(dataset: Dataset, model: MorphableModel, side: int, subject: str) -> None:
     """Write a subject's unwrapped sources, in the order of its pairs."""
     pairs, path = _pairs(dataset, subject), sources_path(dataset, side, subject)
-    at_once = max(1, min(_AT_ONCE, _VALUES_AT_ONCE // (3 * (4 * side) ** 2)))
+    at_once = _at_once(side)
     with atomic_path(path) as temporary:
         shape = (len(pairs), 3, side, side)
         textures = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)

@@ -12,7 +12,7 @@ from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, read_olats, write_olat_stack
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.stage.data.dataset import Dataset
-from facerf_cli.stage.data.map_weights import map_directions, name_maps, world_to_map
+from facerf_cli.stage.data.map_weights import map_directions, name_maps, read_map, world_to_map
 from facerf_cli.stage.data.pair_weights import load_pairs, pair_weights, settle_pairs, weights_path
 from facerf_cli.stage.data.recipes import draw_pair, draw_pairs, pairs_path, picture_path, read_pairs
 from facerf_cli.stage.data.relighting import multiply, relight_subject, relit_pictures, render_source
@@ -133,8 +133,6 @@ def test_the_weights_are_those_of_the_turned_map_in_a_cameras_own_directions(
     fresh: Dataset, tmp_path: Path
 ) -> None:
     pair = settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)[0]
-    from facerf_cli.stage.data.map_weights import read_map
-
     envmap = read_map(pair.envmap)
     expected = envmap_weights(envmap, map_directions(fresh), pair.rotate_deg) * 2.0**pair.exposure_ev
     torch.testing.assert_close(pair_weights(fresh, pair), expected)
@@ -292,6 +290,12 @@ def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, 
     number = 2 if change == {"index": 1} else 1  # twice the same pair
     with pytest.raises(InputError, match=f"line {number} is no pair"):
         read_pairs(fresh)
+
+
+@pytest.mark.parametrize("name", ["procedural:0:0:99999999", "procedural:0:0:0", "procedural:0"])
+def test_a_row_cannot_ask_for_a_map_of_any_size(name: str) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_map(name)
 
 
 def test_one_camera_predicts_itself(tmp_path: Path) -> None:
