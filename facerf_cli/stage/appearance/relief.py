@@ -11,6 +11,7 @@ from torch import Tensor
 from facerf_cli.stage.appearance.noise import blurred, noise, slopes, splat
 from facerf_cli.stage.appearance.people import People
 from facerf_cli.stage.appearance.window import LANDMARK_MM, Window, blob, blobs, mask
+from facerf_cli.stage.head.vectors import arc_lengths
 
 _WRINKLE_WIDTH_MM = 0.9
 _STEP_MM = 0.4  # between the places along a line
@@ -77,7 +78,7 @@ def _fold_lines() -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     depths += [_FOREHEAD_DEPTH_MM] * len(_FOREHEAD_MM)
     bases, tapers, numbers = [], [], []
     for number, points in enumerate(folds):
-        length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+        length = arc_lengths(points)
         at = np.arange(0, length[-1], _STEP_MM)
         bases.append(CubicSpline(length, np.eye(len(points)))(at))
         tapers.append(np.sin(np.pi * (0.1 + 0.8 * at / length[-1])) ** 1.5)

@@ -4,6 +4,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from facerf_cli.stage.head.eyeballs import capped
+from facerf_cli.stage.head.vectors import arc_lengths, smoothstep
 
 # Outline in the ear's plane, millimetres: back from the canal, up; round from the front of the helix.
 _OUTLINE_MM = """
@@ -32,10 +33,10 @@ def ear() -> tuple[np.ndarray, np.ndarray]:
     front = _relief(rho[:, None], plane)
     edge = np.sqrt(np.clip(1 - ((rho[:, None] - 0.86) / 0.14).clip(0, 1) ** 2, 0, 1))
     thickness = _THICKNESS_MM * edge
-    attached = _step(-rho[:, None], -0.92, -0.25)
-    forward = _step(-plane[..., 0], -12, 5)
+    attached = smoothstep(-rho[:, None], -0.92, -0.25)
+    forward = smoothstep(-plane[..., 0], -12, 5)
     back = front - thickness - _ROOT_MM * np.maximum(attached, 0) * np.ones_like(front)
-    front = front - _SINK_MM * forward * _step(rho[:, None], 0.7, 1.0)
+    front = front - _SINK_MM * forward * smoothstep(rho[:, None], 0.7, 1.0)
     back = back - _SINK_MM * forward
     sheet = np.concatenate([_placed(plane, front), _placed(plane, back)[-2::-1]])
     return sheet.reshape(-1, 3), capped(len(sheet), _SPOKES)[:, ::-1]
@@ -52,21 +53,21 @@ def _outline(turn: np.ndarray) -> np.ndarray:
     text = _OUTLINE_MM.strip().replace("\n", " | ")
     points = np.array([[float(x) for x in cell.split()] for cell in text.split("|")])
     points = np.concatenate([points, points[:1]])
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+    length = arc_lengths(points)
     return CubicSpline(length / length[-1], points, bc_type="periodic")(turn)
 
 
 def _relief(rho: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """Height [R, S] of the ear's face above its plane."""
     a, b = plane[..., 0], plane[..., 1]
-    lobe = _step(-b, 10, 20)
-    rear = _step(a, -3, 6)
-    above = np.maximum(rear, _step(b, 10, 20))
+    lobe = smoothstep(-b, 10, 20)
+    rear = smoothstep(a, -3, 6)
+    above = np.maximum(rear, smoothstep(b, 10, 20))
     helix = 3.4 * np.exp(-(((rho - 0.90) / 0.085) ** 2)) * above * (1 - 0.8 * lobe)
     scapha = -1.6 * np.exp(-(((rho - 0.74) / 0.07) ** 2)) * above * (1 - lobe)
-    antihelix = 2.6 * np.exp(-(((rho - 0.57) / 0.10) ** 2)) * _step(a, 2, 10) * (1 - lobe)
+    antihelix = 2.6 * np.exp(-(((rho - 0.57) / 0.10) ** 2)) * smoothstep(a, 2, 10) * (1 - lobe)
     bowl = -11.0 * np.exp(-((((a - 5.5) / 7.5) ** 2 + ((b + 0.5) / 10.0) ** 2) ** 1.6))
-    crus = 4.0 * np.exp(-(((b - 5.5 - 0.25 * a) / 2.2) ** 2)) * _step(-a, -9, 2) * _step(a, -9, -2)
+    crus = 4.0 * np.exp(-(((b - 5.5 - 0.25 * a) / 2.2) ** 2)) * smoothstep(-a, -9, 2) * smoothstep(a, -9, -2)
     fossa = -2.0 * np.exp(-(((a - 11) / 6) ** 2 + ((b - 22) / 6) ** 2))
     tragus = 6.5 * np.exp(-((((a + 4.0) / 3.2) ** 2 + ((b + 2.0) / 6.0) ** 2) ** 1.5))
     antitragus = 2.6 * np.exp(-(((a - 6) / 4.5) ** 2 + ((b + 13) / 2.8) ** 2))
@@ -87,8 +88,3 @@ def _placed(plane: np.ndarray, height: np.ndarray) -> np.ndarray:
     up = up * np.cos(lean) + normal * np.sin(lean)
     normal = np.cross(up, back) * -1
     return plane[..., :1] * back + plane[..., 1:] * up + height[..., None] * normal
-
-
-def _step(value: np.ndarray, start: float, end: float) -> np.ndarray:
-    share = np.clip((value - start) / (end - start), 0, 1)
-    return share * share * (3 - 2 * share)

@@ -13,6 +13,7 @@ from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M
 from facerf_cli.stage.head.hair_styles import HairStyle, draw_style
 from facerf_cli.stage.head.hull import Hull, hull_of
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
+from facerf_cli.stage.head.vectors import smoothstep, unit
 
 MAX_VERTICES = 250_000
 
@@ -104,7 +105,7 @@ def _roots(
     chosen = random.choice(len(triangles), style.wisps, p=chance / chance.sum())
     weights = random.dirichlet([1, 1, 1], style.wisps)[..., None]
     normals = (head.normals[triangles[chosen]] * weights).sum(1)
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    normals = unit(normals)
     return (corners[chosen] * weights).sum(1), normals, margin[chosen]
 
 
@@ -118,20 +119,15 @@ def _bare_top(points: np.ndarray) -> np.ndarray:
 def _lengths(
     roots: np.ndarray, margin: np.ndarray, style: HairStyle, random: np.random.Generator
 ) -> np.ndarray:
-    top = _smoothstep((roots[:, 1] - 0.055) / 0.05)
+    top = smoothstep((roots[:, 1] - 0.055) / 0.05)
     length = style.side_mm + (style.top_mm - style.side_mm) * top
-    edge = style.edge + (1 - style.edge) * _smoothstep(margin / 0.02)
+    edge = style.edge + (1 - style.edge) * smoothstep(margin / 0.02)
     return length * edge * random.uniform(0.75, 1.08, len(roots)) / 1000
 
 
 def _shares(style: HairStyle) -> np.ndarray:
     """How far along the wisp each of its rows lies [segments + 1]."""
     return np.linspace(0, 1, style.segments + 1) ** style.crowding
-
-
-def _smoothstep(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0, 1)
-    return x * x * (3 - 2 * x)
 
 
 class _Wisps:
@@ -160,7 +156,7 @@ class _Wisps:
             share = shares[index]
             step = np.maximum(length_m * (shares[index + 1] - share), _ROWS_LEFT)[:, None]
             normal = self.normals if index == 0 else self.hull.normals(points)
-            held = 0.1 + 0.9 * _smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair just hangs
+            held = 0.1 + 0.9 * smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair just hangs
             held = np.where(length_m > 0.08, held, 1)
             way = held[:, None] * (_combed(points, normal, self.roots, style) + self.stray)
             fallen = share * length_m / 0.1 * style.gravity
@@ -169,7 +165,7 @@ class _Wisps:
             inward = (way * normal).sum(-1)
             touches = self.hull.height(points) < self.layer_m + 0.004
             way = way - (np.minimum(inward, 0) * touches)[:, None] * normal
-            way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+            way = unit(way)
             points = points + step * way
             points = self._in_layer(points, shares[index + 1], length_m)
             rows.append(points)
@@ -181,7 +177,7 @@ class _Wisps:
         least = 0.6 * rise if self.style.comb != "out" else np.minimum(rise, 0.002)
         points = self.hull.lifted(points, least)
         above = np.maximum(self.hull.height(points) - self.layer_m, 0)
-        hold = _smoothstep((points[:, 1] - 0.03) / 0.05)
+        hold = smoothstep((points[:, 1] - 0.03) / 0.05)
         return points - (0.6 * above * hold)[:, None] * self.hull.rays(points)
 
 
@@ -189,26 +185,26 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
     """The way [W, 3] hair is combed at these points, along the skull."""
     x, y, z = points.T
     side = np.sign(roots[:, 0])
-    front = _smoothstep((roots[:, 2] - 0.0) / 0.05)
+    front = smoothstep((roots[:, 2] - 0.0) / 0.05)
     if style.comb == "out":
         return 2 * normals
     if style.comb == "whorl":
         whorl = points - np.array([0.012, 0.14, -0.045])
         spin = np.stack([-whorl[:, 2], np.zeros(len(x)), whorl[:, 0]], -1)
         way = whorl + 0.35 * spin
-        way /= np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9)
+        way = unit(way)
         way[:, 2] -= 0.5 * (y < 0.08) * (z > 0)  # temples: downward, not before the face
     elif style.comb == "back":
         way = np.stack([0.12 * side, -0.2 - 0.3 * (1 - front), -1 + 0.3 * front], -1)
     elif style.comb == "fringe":
-        ahead = _smoothstep((roots[:, 2] - 0.02) / 0.03) * (np.abs(roots[:, 0]) < 0.055)
+        ahead = smoothstep((roots[:, 2] - 0.02) / 0.03) * (np.abs(roots[:, 0]) < 0.055)
         away = np.clip(x / 0.03, -1, 1)
         aside = 1 - ahead
         way = np.stack([0.25 * ahead + away * aside, -0.6 + 0 * x, ahead - 0.15 * aside], -1)
     else:
         parting = style.parting_mm / 1000
         away = np.tanh((roots[:, 0] - parting) / 0.003)
-        front_sweep = _smoothstep((roots[:, 2] - 0.05) / 0.03)
+        front_sweep = smoothstep((roots[:, 2] - 0.05) / 0.03)
         way = np.stack([1.0 * away, -0.45 + 0 * x, -0.35 - 0.25 * front_sweep], -1)
     way[:, 2] -= style.tuck * 1.2 * ((y < 0.075) & (z > -0.02))
     around = np.abs(np.degrees(np.arctan2(x, z)))
@@ -261,7 +257,7 @@ def _curled(
     turns = pace * length_m[:, None] * share
     begin = random.uniform(0, 2 * np.pi, (len(paths), 1))[leader]  # a clump curls in step
     phase = turns * 2 * np.pi + begin + random.uniform(-0.6, 0.6, (len(paths), 1))
-    radius = style.curl_mm / 1000 * _smoothstep(share * 4)
+    radius = style.curl_mm / 1000 * smoothstep(share * 4)
     wound = radius[:, None] * (np.cos(phase)[..., None] * across + 0.7 * np.sin(phase)[..., None] * normals)
     unrest = np.cumsum(random.normal(0, 1, paths.shape), 1) * share[:, None]
     return paths + wound + style.frizz_mm / 1000 / np.sqrt(paths.shape[1]) * unrest
@@ -269,7 +265,7 @@ def _curled(
 
 def _tangents(paths: np.ndarray) -> np.ndarray:
     along = np.gradient(paths, axis=1)
-    return along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    return unit(along)
 
 
 def _ribbons(
@@ -285,7 +281,7 @@ def _ribbons(
     paths, normals, root_normals = paths[:wisps], normals[:wisps], root_normals[:wisps]
     along = _tangents(paths)
     across = np.cross(along, normals)
-    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    across = unit(across)
     roll = random.uniform(-1.0, 1.0, (wisps, 1, 1))
     across = np.cos(roll) * across + np.sin(roll) * np.cross(along, across)
     share = _shares(style)
@@ -293,7 +289,7 @@ def _ribbons(
     half = 0.5 * style.width_mm / 1000 * random.uniform(0.6, 1.3, (wisps, 1)) * taper
     left, right = paths - half[..., None] * across, paths + half[..., None] * across
     soft = 0.65 * normals + 0.35 * root_normals[:, None]
-    soft = soft / np.maximum(np.linalg.norm(soft, axis=-1, keepdims=True), 1e-9)
+    soft = unit(soft)
     uv = np.stack(np.broadcast_arrays(random.uniform(0, 1, (wisps, 1)), share), -1)
 
     def woven(a: np.ndarray, b: np.ndarray, tip: np.ndarray) -> np.ndarray:

@@ -16,15 +16,14 @@ from facerf_cli.face.head_model import HEAD_PARTS, HeadModel
 from facerf_cli.face.importers import EXPRESSION_STD
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG
+from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.head.slits import Slit, eye_slit, lip_slit
 
 _TURN = 360 / (2 * HALF_ANGLE_DEG)  # of u, once around the head
 _LOOK_DEG = 30.0  # the gaze that a full eyeLook shape goes with
-_LID_GAP_M, _LID_REACH_M = (
-    0.0002,
-    0.0008,
-)  # lids stay this far off the ball; those nearer than the reach yield
+_LID_GAP_M = 0.0002  # lids stay this far off the ball;
+_LID_REACH_M = 0.0008  # those nearer than this yield
 _SLIDE_UV = 0.03  # a vertex's shift in the texture by subdivision; more is a seam
 _SKIN, _EYE, _MOUTH = (HEAD_PARTS.index(name) for name in ("skin", "eye", "mouth"))
 
@@ -54,7 +53,7 @@ def build_head(
     vertices = plan.refine @ coarse
     for eye in plan.eyes:
         _clear_of_ball(vertices, plan.skin, vertices[eye.fine])
-    normals = _normals(vertices, plan.triangles)
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(plan.triangles)).numpy()
     return HeadMesh(
         vertices=vertices[plan.source].astype(np.float32),
         normals=normals[plan.source].astype(np.float32),
@@ -119,17 +118,6 @@ def _clear_of_ball(vertices: np.ndarray, skin: np.ndarray, ball: np.ndarray) -> 
     gap = distance - surface - _LID_GAP_M
     kept = np.where(gap > _LID_REACH_M, gap, _LID_REACH_M * np.exp(np.minimum(gap / _LID_REACH_M - 1, 0)))
     vertices[near] = centre + direction * (surface + _LID_GAP_M + kept)[:, None]
-
-
-def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Unit normals [V, 3], weighted by the area of the triangles [F, 3] around."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    facing = np.cross(b - a, c - a)
-    total = np.stack(
-        [np.bincount(triangles.ravel(), np.repeat(facing[:, axis], 3), len(vertices)) for axis in range(3)],
-        -1,
-    )
-    return total / np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-12)
 
 
 @dataclass(frozen=True, eq=False)

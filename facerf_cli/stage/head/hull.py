@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
+from facerf_cli.stage.head.vectors import unit
 
 _AZIMUTHS = 96
 _ARC_M = 0.004  # height of a cell
@@ -40,13 +41,13 @@ class Hull:
         """The unit direction [..., 3] in which the height of points [..., 3] is measured."""
         offset = points - self.middle
         offset = np.stack([offset[..., 0], np.maximum(offset[..., 1], 0), offset[..., 2]], -1)
-        return offset / np.maximum(np.linalg.norm(offset, axis=-1, keepdims=True), 1e-9)
+        return unit(offset)
 
     def normals(self, points: np.ndarray) -> np.ndarray:
         """Unit normals [..., 3] of the level surfaces of height through points [..., 3]."""
         here = self.height(points)
         slope = np.stack([self.height(points + step) - here for step in np.eye(3) * _STEP_M], -1)
-        return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
+        return unit(slope)
 
     def lifted(self, points: np.ndarray, least: np.ndarray | float) -> np.ndarray:
         """Points [..., 3], those lower than `least` [...] pushed out to that height."""

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.stage.head.eyeballs import capped, ring_triangles
+from facerf_cli.stage.head.vectors import arc_lengths, unit
 
 # From the rim back: how far behind it, and how much wider and taller than it, in millimetres.
 _BAG_MM = ((0, 0, 0), (1.5, 0.2, 2), (4, 0.2, 5), (9, 0, 8), (18, -1, 10), (28, -5, 9), (38, -11, 4))
@@ -32,7 +33,7 @@ def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     offset = rim - centre
     reach = np.maximum(np.abs(offset[:, :2]).max(0), 1.0)
     direction = offset[:, :2] / reach
-    direction = direction / np.maximum(np.linalg.norm(direction, axis=-1, keepdims=True), 1e-6)
+    direction = unit(direction)
     rings = []
     flat = rim[:, 2].mean()
     for behind, wider, taller in _BAG_MM:
@@ -142,7 +143,7 @@ def _arch() -> tuple[CubicSpline, float]:
     """(x, z) by the length along half an arch from the midline, and that length."""
     along = np.linspace(0, np.pi / 2, 200)
     arch = np.stack([np.sin(along) * _ARCH_HALF_MM, np.cos(along) * _ARCH_DEPTH_MM - _ARCH_DEPTH_MM], -1)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(arch, axis=0), axis=-1))])
+    length = arc_lengths(arch)
     return CubicSpline(length, arch), float(length[-1])
 
 
@@ -154,7 +155,7 @@ def _ridge(up: float) -> np.ndarray:
     side = np.where(along < 0, -1.0, 1.0)
     centre = np.stack([side * at[:, 0], np.full(_GUM_RINGS, up * _GUM_UP_MM), at[:, 1]], -1)
     back = np.stack([side * slope[:, 1], np.zeros(_GUM_RINGS), -slope[:, 0]], -1)
-    back /= np.linalg.norm(back, axis=-1, keepdims=True)
+    back = unit(back)
     taper = np.sqrt(np.clip(1 - (np.abs(along) - 0.9).clip(0) ** 2 / 0.01, 0, 1))
     around = np.arange(_GUM_SEGMENTS) / _GUM_SEGMENTS * 2 * np.pi
     ring = np.stack([np.cos(around) * _GUM_HALF_MM[0], np.sin(around) * _GUM_HALF_MM[1]], -1)

@@ -15,9 +15,9 @@ from scipy.spatial.distance import cdist
 from facerf_cli.face.regions import CHART_MM
 from facerf_cli.face.topology import LANDMARK_UV, grid_uv
 from facerf_cli.stage.head.cranium import BACK_U, CROWN_LEVEL, NECK_LEVEL
+from facerf_cli.stage.head.vectors import arc_lengths
 from facerf_cli.stage.threads import one_thread
 
-OPENINGS = ("eye_left", "eye_right", "mouth")  # eyes by the picture's side
 _ARCS = {"eye_left": ([36, 37, 38, 39], [39, 40, 41, 36]), "mouth": ([*range(60, 65)], [64, 65, 66, 67, 60])}
 _ROWS_PER_COLUMN = 0.75  # so that cells are about square on the skin
 _GROWTH, _COARSEST_MM = 1.1, 3.5  # cells grow away from the face
@@ -147,7 +147,7 @@ def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
 
 
 def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+    length = arc_lengths(points)
     knots = np.arange(len(points))
     at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
     return CubicSpline(length, points)(at)

@@ -17,6 +17,7 @@ from facerf_cli.stage.head import ears, eyeballs, mouth
 from facerf_cli.stage.head.cranium import Surroundings, on_chart, template
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.stage.head.openings import Sheet, lips, outline, skin_sheet
+from facerf_cli.stage.head.vectors import unit
 
 _LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
 _LIPS = ((61, 67), (62, 66), (63, 65))
@@ -136,16 +137,16 @@ def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
     along = np.roll(edge, -1, 0) - np.roll(edge, 1, 0)
     across = np.cross(normals, along)
     for _ in range(2):
-        across = across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+        across = unit(across)
         across = np.roll(across, 1, 0) + 2 * across + np.roll(across, -1, 0)
-    return across / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    return unit(across)
 
 
 def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
     """Rings of a lid's margin, from its edge to just under the eyeball's surface."""
     low = edge + 0.6 * inward
     to_ball = low - ball
-    foot = ball + to_ball / np.linalg.norm(to_ball, axis=-1, keepdims=True) * (eyeballs.RADIUS_MM - 0.3)
+    foot = ball + unit(to_ball) * (eyeballs.RADIUS_MM - 0.3)
     rounded = edge + 0.2 * inward + 0.15 * down
     return [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
 

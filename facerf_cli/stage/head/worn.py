@@ -6,12 +6,15 @@ down and out to the shoulders, kept off the skin.
 """
 
 import numpy as np
+import torch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage.head.hull import Hull, hull_of
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.head.vectors import unit
 
 GLASSES = ("round", "rectangular", "square", "aviator", "half-rim")
 GARMENTS = ("crew neck", "v-neck", "wide neck", "turtleneck", "shirt")
@@ -191,9 +194,9 @@ def _tube(path: np.ndarray, up: np.ndarray, across_m: float, up_m: float, closed
     """A rounded bar along `path` [N, 3], half as thick as `up_m` along `up` and as `across_m` across it."""
     count = len(path)
     along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-12)
+    along = unit(along)
     aside = np.cross(up, along)
-    aside /= np.maximum(np.linalg.norm(aside, axis=-1, keepdims=True), 1e-12)
+    aside = unit(aside)
     over = np.cross(along, aside)
     turn = np.linspace(0, 2 * np.pi, _TUBE, endpoint=False)
     cos, sin = np.cos(turn), np.sin(turn)
@@ -336,7 +339,7 @@ def _ring_normals(rings: np.ndarray) -> np.ndarray:
     around = np.roll(rings, -1, 1) - np.roll(rings, 1, 1)
     down = np.gradient(rings, axis=0)
     normal = np.cross(down, around)
-    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    return unit(normal)
 
 
 class _Skin:
@@ -393,11 +396,7 @@ def _loft(part: str, rings: np.ndarray, closed: bool) -> HeadMesh:
     quads = [(upper[:, :-1], lower[:, :-1], upper[:, 1:]), (upper[:, 1:], lower[:, :-1], lower[:, 1:])]
     triangles = np.concatenate([np.stack(quad, -1).reshape(-1, 3) for quad in quads])
     vertices = rings.reshape(-1, 3)
-    corners = vertices[triangles]
-    facets = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], facets)
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(triangles)).numpy()
     share = np.broadcast_arrays(np.linspace(0, 1, around)[None], np.linspace(0, 1, count)[:, None])
     return _plain(part, vertices, normals, triangles, np.stack(share, -1).reshape(-1, 2))
 
@@ -405,7 +404,7 @@ def _loft(part: str, rings: np.ndarray, closed: bool) -> HeadMesh:
 def _plain(
     part: str, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: np.ndarray
 ) -> HeadMesh:
-    normals = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    normals = unit(normals)
     return HeadMesh(
         vertices=vertices.astype(np.float32),
         normals=normals.astype(np.float32),
