@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.stage.data.dataset import Dataset
@@ -28,12 +28,15 @@ from facerf_cli.stage.map_files import read_map_file
 from facerf_cli.stage.sky.skies import ProceduralMaps, draw_sky
 from facerf_cli.stage.threads import one_thread
 
+_MOST_MAPS = 1_000_000
 _HEADS_ASKED = 16  # for the vertical
 _PROCEDURAL = re.compile(r"procedural:(\d{1,9}):(\d+):([1-9]\d{0,3})")
 
 
 def name_maps(maps: Sequence[Path] | ProceduralMaps) -> list[str]:
     """What pairs call the maps by."""
+    if len(maps) > _MOST_MAPS:
+        raise UsageError(f"--envmaps: {len(maps)} maps are too many; {_MOST_MAPS} are the most")
     if isinstance(maps, ProceduralMaps):
         return [f"procedural:{index}:{maps.seed}:{maps.width_px}" for index in range(len(maps))]
     return [str(path.absolute()) for path in maps]
