@@ -2,7 +2,7 @@
 
 That camera's focal length is 4 times the crop's side (`raster/camera.py`), so a face that fills the crop
 stands 0.9 to 1.05 m before it, wherever the true camera stood. No pose takes back the difference of
-perspective. Of the inter-ocular distance, the mean distance of vertices left at the best pose is 0.1 to 0.5 %
+perspective. Of the inter-ocular distance, the mean distance of vertices left at the best pose is 0.1 to 0.6 %
 for cameras at 0.8 to 1.1 m, up to 0.6 % at 1.3 m, 0.8 % at 1.5 m, 1.1 % at 2 m and 1.7 % far away (heads of
 tests/face/test_joint_fit.py). More steps change none of it, weights for the least mean distance a twentieth.
 """
