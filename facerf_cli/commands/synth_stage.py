@@ -48,11 +48,14 @@ def synth_stage(
     --subjects adds people and changes none.
     """
     from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.stage.path_tracer import load_mitsuba
     from facerf_cli.stage.synthetic import StageSettings, close_capture, open_capture
 
     if transport and renderer != "bake":
         raise UsageError("--transport keeps the bake, and --renderer mitsuba makes none")
-    load_face_model(face_model)  # a bad one is named before anything is written
+    load_face_model(face_model)  # what is bad or missing is named before anything is written
+    if renderer == "mitsuba":
+        load_mitsuba()
     settings = settings_of(context)
     stage = StageSettings(size, face_model, renderer, lights, settings.seed)
     items = [

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -97,3 +98,12 @@ def test_other_settings_need_another_folder(capture: Path, capsys: Said) -> None
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
     assert photograph(tmp_path / "none", "--subjects", "3", "--dry-run") == 0
     assert capsys.readouterr().out.count("->") == 3 and not (tmp_path / "none").exists()
+
+
+def test_a_missing_path_tracer_is_named_before_anything_is_written(
+    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    assert photograph(tmp_path / "capture", "--renderer", "mitsuba") == 2
+    assert "pip install 'facerf[synth]'" in capsys.readouterr().err
+    assert not (tmp_path / "capture").exists()

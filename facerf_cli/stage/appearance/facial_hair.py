@@ -9,7 +9,7 @@ from torch import Tensor
 
 from facerf_cli.face.regions import CHART_MM
 from facerf_cli.stage.appearance.noise import Strokes, hairs, noise, splat
-from facerf_cli.stage.appearance.people import People
+from facerf_cli.stage.appearance.people import People, each
 from facerf_cli.stage.appearance.window import LANDMARK_MM, Window, blob, mask, places_mm, smooth
 
 # Of the brow from its inner to its outer end: half its height in millimetres, where the hairs point (degrees
@@ -190,4 +190,4 @@ def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torc
 
 def above_hairline(people: People, window: Window) -> Tensor:
     """Millimetres [B, 1, T, T] above each person's hairline."""
-    return -below_edge(window, _SCALP_EDGE, people.hairline_mm.view(-1, 1, 1, 1))
+    return -below_edge(window, _SCALP_EDGE, each(people.hairline_mm))

@@ -3,24 +3,20 @@
 import torch
 from torch import Tensor
 
-from facerf_cli.stage.appearance.people import People
+from facerf_cli.stage.appearance.people import People, each
 from facerf_cli.stage.appearance.window import Window, blobs, inside, mask, smooth
 
 
 def make_up(albedo: Tensor, people: People, window: Window) -> Tensor:
     """The albedo [B, 3, T, T] with what each person wears."""
     colour = torch.stack([people.lipstick_red, people.lipstick_green, people.lipstick_blue], -1)
-    cover = 0.8 * _each(people.lipstick) * mask(window, "lips", 1.6, -0.3)
+    cover = 0.8 * each(people.lipstick) * mask(window, "lips", 1.6, -0.3)
     own = albedo.mean(1, keepdim=True) / albedo.mean((1, 2, 3), keepdim=True).clamp_min(0.02)
     albedo = albedo + cover * (colour[..., None, None] * own.clamp(0.5, 1.2) - albedo)
     lids = blobs(window, 0.355, 0.285, 17, 0.42) * (1 - mask(window, "brows", 4.0))
-    shade = colour.mean(-1).view(-1, 1, 1, 1) * torch.tensor([0.55, 0.42, 0.45]).view(1, 3, 1, 1)
-    cover = 0.8 * _each(people.eye_shadow) * lids.clamp(0, 1)
+    shade = each(colour.mean(-1)) * torch.tensor([0.55, 0.42, 0.45]).view(1, 3, 1, 1)
+    cover = 0.8 * each(people.eye_shadow) * lids.clamp(0, 1)
     albedo = albedo + cover * (shade - albedo)
     beyond = inside(window, "eyes")
     line = smooth((beyond + 1.7) / 0.9) * smooth((0.8 - beyond) / 0.9)
-    return albedo * (1 - 0.8 * _each(people.eyeliner) * line)
-
-
-def _each(values: Tensor) -> Tensor:
-    return values.view(-1, 1, 1, 1)
+    return albedo * (1 - 0.8 * each(people.eyeliner) * line)

@@ -17,6 +17,7 @@ from facerf_cli.stage.head.mesh import PARTS
 
 _SIDE = 256  # of the textures of small parts
 _HAIR_WISPS = 512
+_OF_CHART_HAIR = ("bald", "hairline_mm")  # parameters of hair painted on the chart; here it is geometry
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
     materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
     traits = named(people, 0)
+    for name in _OF_CHART_HAIR:
+        del traits[name]
     traits["random_texture"] = bool(people.random_texture[0])
     traits["ita_deg"] = round(float(ita_deg(bare_skin(people)[0].double().numpy())), 1)
     traits["hair_colour"] = _hair_name(people)

@@ -98,3 +98,8 @@ def draw_people(count: int, generator: torch.Generator) -> People:
 def named(people: People, index: int) -> dict[str, float | str | bool]:
     """The parameters of one of them, for a record."""
     return {field.name: round(float(getattr(people, field.name)[index]), 4) for field in fields(people)}
+
+
+def each(values: Tensor) -> Tensor:
+    """A parameter [B] as [B, 1, 1, 1], to go with fields [B, C, T, T]."""
+    return values.view(-1, 1, 1, 1)

@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from torch import Tensor
 
 from facerf_cli.stage.appearance.noise import blurred, noise, slopes, splat
-from facerf_cli.stage.appearance.people import People
+from facerf_cli.stage.appearance.people import People, each
 from facerf_cli.stage.appearance.window import LANDMARK_MM, Window, blob, blobs, mask
 from facerf_cli.stage.head.vectors import arc_lengths
 
@@ -41,10 +41,10 @@ def draw_relief(
     where skin is bare and 0 where hair covers it.
     """
     count = len(people.melanin)
-    age = ((people.age - 18) / 57).view(-1, 1, 1, 1)
+    age = each((people.age - 18) / 57)
     grain = torch.randn(count, 1, window.side, window.side, generator=generator)
     dents = noise(count, window, 6.0, generator, octaves=1)
-    coarse = 0.6 + 0.5 * age + 0.4 * people.oiliness.view(-1, 1, 1, 1)
+    coarse = 0.6 + 0.5 * age + 0.4 * each(people.oiliness)
     grain = 0.03 * min(1.0, min(window.texel_mm)) * grain
     height = coarse * (_pore_places(window) * (grain + 0.022 * pores) + 0.014 * dents)
     lips = mask(window, "lips", 1.5)

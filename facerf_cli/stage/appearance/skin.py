@@ -12,7 +12,7 @@ from facerf_cli.stage.appearance.eyes import paint_eyes
 from facerf_cli.stage.appearance.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
 from facerf_cli.stage.appearance.make_up import make_up
 from facerf_cli.stage.appearance.noise import noise
-from facerf_cli.stage.appearance.people import People, draw_people
+from facerf_cli.stage.appearance.people import People, draw_people, each
 from facerf_cli.stage.appearance.pigments import hair_albedo, skin_albedo
 from facerf_cli.stage.appearance.relief import draw_relief
 from facerf_cli.stage.appearance.window import (
@@ -52,7 +52,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     window = Window(side, CHART_SPAN)
     skin = paint_skin(people, window, generator, painted_eyes=True)
     scalp = scalp_hair(people, window, above_hairline(people, window), generator)
-    scalp = scalp * _each(1 - people.bald) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.8)
+    scalp = scalp * each(1 - people.bald) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.8)
     skin = with_scalp(skin, people, scalp, generator)
     clothed = mask(window, "neck", 5.0) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.4)
     cloth = 0.02 + 0.58 * torch.rand(faces, 3, 1, 1, generator=generator)
@@ -65,7 +65,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
 
 def bare_skin(people: People) -> Tensor:
     """Mean albedo [B, 3] of their skin, linear Rec.709, without features."""
-    return skin_albedo(_each(people.melanin), _each(people.haemoglobin))[:, :, 0, 0]
+    return skin_albedo(each(people.melanin), each(people.haemoglobin))[:, :, 0, 0]
 
 
 def scattering_mm(people: People) -> Tensor:
@@ -117,10 +117,6 @@ def with_scalp(skin: Skin, people: People, cover: Tensor, generator: torch.Gener
     )
 
 
-def _each(values: Tensor) -> Tensor:
-    return values.view(-1, 1, 1, 1)
-
-
 def _pigments(
     people: People,
     window: Window,
@@ -131,31 +127,31 @@ def _pigments(
 ) -> tuple[Tensor, Tensor]:
     """Melanin and blood [B, 1, T, T], with the face's regions, blotches, freckles and moles."""
     count = len(people.melanin)
-    even = 1 - 0.6 * _each(people.foundation)
-    uneven = _each(people.blotches) * even
-    age = _each((people.age - 18) / 57)
+    even = 1 - 0.6 * each(people.foundation)
+    uneven = each(people.blotches) * even
+    age = each((people.age - 18) / 57)
     lips, lids = mask(window, "lips", 2.2), _around_eyes(window)
     forehead = blob(window, (0.5, 0.02), 55, 0.6)
     perimeter = smooth((inside(window, "face") - 26) / -40)
     melanin = 1 + uneven * (0.05 * coarse + 0.06 * middle) + 0.07 * even * fine
     melanin = melanin + 0.10 * even * forehead + 0.14 * even * perimeter + 0.30 * even * lids
-    base = _each(people.melanin)
+    base = each(people.melanin)
     melanin = base * melanin.clamp_min(0.3) + _spots(people, window, middle, fine, age * even, generator)
 
     veins = (1 - noise(count, window, 7, generator, octaves=2).abs() * 2.5).clamp(0, 1) ** 2
     nose, cheeks = blob(window, 30, 13) + blobs(window, 0.455, 0.55, 7), blobs(window, 0.29, 0.52, 26)
     ears = blobs(window, 1.24, 0.42, 38, 1.2)
     flush = 1.2 * nose.clamp(0, 1) + 1.0 * cheeks + 0.35 * blob(window, 8, 14) + 0.8 * ears.clamp(0, 1)
-    flush = flush * (0.4 + 0.8 * _each(people.flush)) * even * (1 + 0.25 * middle)
+    flush = flush * (0.4 + 0.8 * each(people.flush)) * even * (1 + 0.25 * middle)
     red = 1 + 0.9 * flush + uneven * (0.14 * coarse + 0.12 * middle) + 0.16 * even * fine
     red = red + 0.7 * lids * even + 0.5 * veins * (nose + cheeks).clamp(0, 1) * (0.3 + age) * uneven
     red = red - 0.2 * forehead
-    blood = _each(people.haemoglobin) * red.clamp_min(0.25)
+    blood = each(people.haemoglobin) * red.clamp_min(0.25)
 
     lines = noise(count, window, (1.8, 8.0), generator, octaves=1)
     lower = smooth((places_mm(window)[1] - 126) / 5)[None, None]
     lip_melanin = base * (1.15 - 0.45 * lower) + 0.006 + 0.004 * lines
-    lip_blood = (3.2 + 0.5 * lower) * (0.012 + 0.6 * _each(people.haemoglobin)) * (1 + 0.10 * lines)
+    lip_blood = (3.2 + 0.5 * lower) * (0.012 + 0.6 * each(people.haemoglobin)) * (1 + 0.10 * lines)
     return melanin + lips * (lip_melanin - melanin), blood + lips * (lip_blood - blood)
 
 
@@ -175,7 +171,7 @@ def _spots(
         dots = noise(count, window, 1.8, generator, octaves=1)
         where = 0.5 + blobs(window, 0.35, 0.46, 30) + blob(window, 29, 22)
         freckles = smooth((dots + 0.35 * middle + 0.6 * (where.clamp(0, 1.4) - 1.4) - 0.7) / 1.6)
-        spots = _each(people.freckles) * 0.035 * freckles
+        spots = each(people.freckles) * 0.035 * freckles
     else:
         spots = torch.zeros_like(middle)
     patches = noise(count, window, 4.5, generator, octaves=1)
@@ -200,7 +196,7 @@ def _spots(
 def _darkness(people: People) -> Tensor:
     """How dark their hair is, against brown."""
     dark = (people.hair_eumelanin / 3).clamp(0.15, 1.6) * (1 - 0.6 * people.grey)
-    return _each(dark)
+    return each(dark)
 
 
 def _random_colours(
@@ -235,7 +231,7 @@ def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
     beyond = inside(window, "eyes")
     upper = smooth((62.5 - places_mm(window)[1]) / 5)[None, None]
     rim = smooth((beyond + 0.6) / 1.2)
-    pink = skin_albedo(0.25 * _each(people.melanin), 0.03 + 0 * _each(people.melanin))
+    pink = skin_albedo(0.25 * each(people.melanin), 0.03 + 0 * each(people.melanin))
     albedo = albedo + 0.6 * rim * (pink - albedo)
     width = 0.7 + 0.6 * upper
     lashes = torch.exp(-(((beyond + 0.9) / width) ** 2)) * (0.22 + 0.48 * upper)
@@ -246,8 +242,8 @@ def _gloss(
     people: People, window: Window, hair: Tensor, middle: Tensor, fine: Tensor, painted_eyes: bool
 ) -> tuple[Tensor, Tensor]:
     """Reflectance at normal incidence and roughness [B, 1, T, T]; the same for all tones of skin."""
-    oil = _each(people.oiliness)
-    powder = _each(people.foundation)
+    oil = each(people.oiliness)
+    powder = each(people.foundation)
     t_zone = blob(window, 30, 15) + blob(window, 27, 20) + 0.8 * blob(window, (0.5, 0.06), 36, 0.7)
     t_zone = (t_zone + 0.5 * blobs(window, 0.31, 0.45, 17) + 0.4 * blob(window, 8, 14)).clamp(0, 1)
     lips = mask(window, "lips", 2.0)
