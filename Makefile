@@ -25,8 +25,8 @@ lint: $(STAMP)
 test: lint
 	OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest
 
-bench: $(STAMP)  # benchmarks/synthetic.py needs the heads of a training run
-	set -e; for script in $(filter-out benchmarks/synthetic.py, $(wildcard benchmarks/*.py)); do echo "== $$script"; $(VENV)/bin/python $$script; done
+bench: $(STAMP)  # but for those that want a bank, a capture or a command
+	set -e; for script in $(filter-out benchmarks/synthetic.py benchmarks/synth_stage.py benchmarks/resume.py, $(wildcard benchmarks/*.py)); do echo "== $$script"; $(VENV)/bin/python $$script; done
 
 man: $(STAMP)
 	$(VENV)/bin/python -m facerf_cli.manpages man
