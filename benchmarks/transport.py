@@ -21,8 +21,9 @@ from torch import Tensor
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.images import write_display
+from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.transport import BakeSettings, bake_mesh
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap

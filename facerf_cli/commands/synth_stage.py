@@ -47,13 +47,12 @@ def synth_stage(
     floats, scene-linear Rec.709. Person number n depends on --seed, n and the face model alone, so a larger
     --subjects adds people and changes none.
     """
-    from facerf_cli.face.morphable import load_face_model
     from facerf_cli.stage.path_tracer import load_mitsuba
-    from facerf_cli.stage.synthetic import StageSettings, close_capture, open_capture
+    from facerf_cli.stage.synthetic import StageSettings, close_capture, open_capture, subject_model
 
     if transport and renderer != "bake":
         raise UsageError("--transport keeps the bake, and --renderer mitsuba makes none")
-    load_face_model(face_model)  # what is bad or missing is named before anything is written
+    subject_model(face_model)  # what is bad or missing is named before anything is written
     if renderer == "mitsuba":
         load_mitsuba()
     settings = settings_of(context)
@@ -84,14 +83,13 @@ class _Photograph:
         return [item.output_base] if transport is None else [item.output_base, transport]
 
     def __call__(self, item: Item) -> Outcome:
-        import torch
-
         from facerf_cli.stage.synthetic import draw_subject, subject_model, write_subject
+        from facerf_cli.stage.threads import one_thread
 
-        torch.set_num_threads(1)  # the same bits whatever the machine and --jobs
         model = subject_model(self.stage.face_model)
-        subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
-        write_subject(item.output_base, subject, self.stage, self._transport_of(item))
+        with one_thread():
+            subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
+            write_subject(item.output_base, subject, self.stage, self._transport_of(item))
         return Outcome(self.outputs_of(item), {"traits": subject.traits})
 
     def _transport_of(self, item: Item) -> Path | None:

@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from facerf_cli.light.transport import MeshTransport
+from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.stage.appearance.materials import Appearance, Surface, sample

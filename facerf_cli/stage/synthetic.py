@@ -20,21 +20,23 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import GRID
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_exr
+from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
-from facerf_cli.light.transport import BakeSettings, MeshTransport, bake_mesh
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.stage.bake_renderer import StageCamera
+from facerf_cli.stage.data.documents import write_document
+from facerf_cli.stage.data.layouts import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.stage.geometries import GeometrySettings, draw_coefficients
 from facerf_cli.stage.head.hair import draw_hair, scalp_cover
 from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.stage.head.worn import draw_clothes, draw_glasses
 
-FORMAT = "facerf-stage-1"
 Renderer = Literal["bake", "mitsuba"]
 # Azimuth and elevation of the cameras as seen from the head, all in front (paper, 'Dataset').
 _CAMERAS_DEG = ((0, 0), (-18, 6), (18, -6), (-36, -4), (36, 4), (-54, 3), (54, -3), (0, 24))
@@ -106,9 +108,9 @@ def describe_stage(settings: StageSettings) -> dict[str, Any]:
                 "world_to_camera": (flip @ pose).tolist(),
             }
         )
-    model = load_face_model(settings.face_model)
+    model = subject_model(settings.face_model)
     return {
-        "format": FORMAT,
+        "format": STAGE_FORMAT,
         "colour_space": "lin_rec709",
         "black_level": 0.0,
         "axes": "opencv",
@@ -132,17 +134,16 @@ def describe_stage(settings: StageSettings) -> dict[str, Any]:
 
 def open_capture(folder: Path, settings: StageSettings) -> None:
     """Write stage.json, or hold the one that is there to the same settings (UsageError)."""
-    path, described = folder / "stage.json", describe_stage(settings)
+    path, described = folder / STAGE_FILE, describe_stage(settings)
     if path.exists():
         try:
             found = json.loads(path.read_text(encoding="utf-8"))
         except ValueError:
             found = {}
-        found.pop("subjects", None)
-        if found != described:
+        if not isinstance(found, dict) or {**found, "subjects": None} != {**described, "subjects": None}:
             raise UsageError(f"{path}: a capture of other settings; give another -o, or remove this one")
         return
-    _write_json(path, described)
+    write_document(path, described)
 
 
 def close_capture(folder: Path, settings: StageSettings) -> None:
@@ -151,12 +152,7 @@ def close_capture(folder: Path, settings: StageSettings) -> None:
     subjects = {
         name: json.loads(path.read_text(encoding="utf-8"))["traits"] for name, path in records.items()
     }
-    _write_json(folder / "stage.json", describe_stage(settings) | {"subjects": subjects})
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    write_document(folder / STAGE_FILE, describe_stage(settings) | {"subjects": subjects})
 
 
 def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> Subject:
@@ -266,7 +262,7 @@ def write_subject(
         if transport_path and transport:
             _save_transport(transport_path, subject, transport, settings)
         record = {"traits": subject.traits, "landmarks_world": subject.landmarks_world.tolist()}
-        _write_json(unfinished / "subject.json", record)
+        write_document(unfinished / "subject.json", record)
 
 
 def _save_transport(path: Path, subject: Subject, transport: MeshTransport, settings: StageSettings) -> None:
@@ -294,4 +290,4 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
         "bounce": in_chart(np.sqrt(bounce)),
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"face_model": load_face_model(settings.face_model).name})
+        save_file(tensors, temporary, metadata={"face_model": subject_model(settings.face_model).name})

@@ -6,8 +6,9 @@ import torch
 import trimesh
 from scipy.stats import norm
 
+from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.transport import BakeSettings, MeshTransport, bake_mesh
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer
 from facerf_cli.stage.appearance.materials import Appearance, Material

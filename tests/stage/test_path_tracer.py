@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from facerf_cli.errors import UsageError
+from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.transport import BakeSettings, bake_mesh
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, Material
