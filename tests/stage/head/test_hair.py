@@ -3,27 +3,14 @@
 import numpy as np
 import pytest
 
-from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import chart_uv
-from facerf_cli.stage.geometries import mean_coefficients
 from facerf_cli.stage.head.hair import draw_hair, grow_hair, scalp_cover, scalp_margin_m
 from facerf_cli.stage.head.hair_styles import STYLES, HairStyle, draw_style
-from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.hull import hull_of
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 
 Hairs = dict[str, tuple[HairStyle, HeadMesh]]
 HAIRY = tuple(name for name in STYLES if name != "bald")
-
-
-@pytest.fixture(scope="module")
-def model() -> MorphableModel:
-    return load_face_model()
-
-
-@pytest.fixture(scope="module")
-def head(model: MorphableModel) -> HeadMesh:
-    return build_head(model, *mean_coefficients(model))
 
 
 @pytest.fixture(scope="module")

@@ -4,22 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.stage.geometries import mean_coefficients
 from facerf_cli.stage.head import worn
-from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.head.worn import GARMENTS, GLASSES, draw_clothes, draw_glasses
-
-
-@pytest.fixture(scope="module")
-def model() -> MorphableModel:
-    return load_face_model()
-
-
-@pytest.fixture(scope="module")
-def head(model: MorphableModel) -> HeadMesh:
-    return build_head(model, *mean_coefficients(model))
 
 
 @pytest.fixture(scope="module")
