@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
@@ -33,7 +33,8 @@ class GeometrySettings:
 
     side: int = 128
     lights: int = 150
-    identity_std: float = 0.9
+    identity_std: tuple[float, float] = (0.7, 1.3)  # evenly between, a head
+    free_std: float = 0.6  # of the built-in model's smooth deformations, which no other model's shapes span
     neutral_share: float = 0.35
     bake: BakeSettings = _BAKE
 
@@ -84,6 +85,8 @@ def bake_head(model: MorphableModel, index: int, seed: int, settings: GeometrySe
     random = np.random.default_rng([seed, index])
     alpha, beta = draw_coefficients(model, random, settings) if index else mean_coefficients(model)
     vertices = model.vertices(alpha[None], beta[None])[0]
+    if index:
+        vertices = vertices + _free_deformation(random, settings)
     triangles = grid_triangles()
     positions = bake_attributes(vertices, GRID, settings.side).permute(1, 2, 0).numpy()
     normals = normal_map(vertices, triangles, settings.side).permute(1, 2, 0).numpy()
@@ -106,6 +109,13 @@ def bake_head(model: MorphableModel, index: int, seed: int, settings: GeometrySe
     }
 
 
+def _free_deformation(random: np.random.Generator, settings: GeometrySettings) -> Tensor:
+    """A smooth change of shape [V, 3] (m), of the built-in model's Gaussian process."""
+    basis = load_face_model(BUILTIN).identity
+    weights = torch.from_numpy(random.normal(0, settings.free_std, len(basis))).float()
+    return torch.einsum("k,kvc->vc", weights, basis)
+
+
 def _bytes(values: np.ndarray) -> Tensor:
     return torch.from_numpy((np.clip(values, 0, 1) * 255).round().astype(np.uint8))
 
@@ -119,7 +129,8 @@ def draw_coefficients(
     model: MorphableModel, random: np.random.Generator, settings: GeometrySettings
 ) -> tuple[Tensor, Tensor]:
     """A random person alpha [Ki], and an expression beta [Ke] of a few shapes, mostly alike on both sides."""
-    alpha = torch.from_numpy(random.normal(0, settings.identity_std, len(model.identity))).float()
+    spread = random.uniform(*settings.identity_std)
+    alpha = torch.from_numpy(random.normal(0, spread, len(model.identity))).float()
     beta = torch.zeros(len(model.expression))
     if random.random() < settings.neutral_share:
         return alpha, beta
