@@ -1,4 +1,4 @@
-"""Imports point down only (DESIGN): main, commands, pipeline and its peers, down to records and errors."""
+"""Imports point down only (DESIGN): main, commands, training, its objectives, pipeline, down to errors."""
 
 import ast
 from pathlib import Path
@@ -10,7 +10,9 @@ LEVELS = (
     ("__main__", "manpages"),
     ("main",),
     ("commands",),
-    ("pipeline", "training", "stage", "baselines", "report"),
+    ("training",),
+    ("objectives",),
+    ("pipeline", "stage", "baselines", "report"),
     ("network", "face", "metrics"),
     ("raster", "light"),
     ("files",),
