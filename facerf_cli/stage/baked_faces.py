@@ -12,7 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.raster.texture import inpaint
+from facerf_cli.stage.appearance.occluders import with_occluders
 from facerf_cli.stage.appearance.skin import Skin, draw_skin
+from facerf_cli.stage.appearance.window import Window
 from facerf_cli.stage.lights import draw_light
 from facerf_cli.stage.samples import Sample, draw_target_lights, photograph
 from facerf_cli.stage.shading import bend, diffuse_irradiance, highlights, scatter, unit
@@ -59,7 +61,8 @@ def draw_sample(
 ) -> Sample:
     """Draw one sample of each of B heads and its views, with `lights` target lights."""
     faces = [_draw_face(geometry, views, lights, generator) for geometry, views in heads]
-    skin = draw_skin(len(faces), faces[0].normals.shape[-1], generator)
+    side = faces[0].normals.shape[-1]
+    skin = with_occluders(draw_skin(len(faces), side, generator), Window(side), generator)
     shaded = [_shade_face(face, _one(skin, i)) for i, face in enumerate(faces)]
     source = torch.stack([s for s, _ in shaded])
     target = torch.stack([t for _, t in shaded])

@@ -47,7 +47,10 @@ class Skin:
 
 
 def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
-    """Draw B skins on a chart of `side` texels, eyes painted; tones from light to dark evenly."""
+    """Draw B skins on a chart of `side` texels, eyes painted; tones from light to dark evenly.
+
+    Their gloss differs more than that of `paint_skin`: photographs' highlights do.
+    """
     people = draw_people(faces, generator)
     window = Window(side, CHART_SPAN)
     skin = paint_skin(people, window, generator, painted_eyes=True)
@@ -60,7 +63,14 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     albedo = skin.albedo * (1 - clothed) + clothed * cloth
     mouth = mask(window, "mouth", 1.0)
     albedo = albedo * (1 - mouth) + mouth * slit
-    return Skin(albedo, skin.specular, skin.roughness, skin.relief, skin.scattering_texels)
+    shine = torch.exp(_uniform(faces, -0.5, 0.7, generator))
+    smoothness = _uniform(faces, -0.06, 0.2, generator)
+    specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp_min(0.16)
+    return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
+
+
+def _uniform(faces: int, low: float, high: float, generator: torch.Generator) -> Tensor:
+    return low + (high - low) * torch.rand(faces, 1, 1, 1, generator=generator)
 
 
 def bare_skin(people: People) -> Tensor:
