@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
-from facerf_cli.files.checkpoints import load_checkpoint
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.network.saved import load_networks
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
@@ -30,10 +30,11 @@ _LIGHTS_ON_CPU = 4  # at a time; more of them leave the processor's cache and ar
 
 @dataclass(frozen=True)
 class Models:
-    """The face model, on the processor as all geometry is, and the trained network on `device`."""
+    """The face model, on the processor as all geometry is, and the trained networks on `device`."""
 
     face: MorphableModel
     network: ReflectanceNetwork
+    geometry: nn.Module | None  # a Geometry Network, where the checkpoint holds one
     checkpoint_name: str
     metadata: dict[str, Any]
     device: torch.device
@@ -54,25 +55,18 @@ class FaceTexture:
 def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
     """Load what the arrows need; `checkpoint` None is the one shipped."""
     path = checkpoint or DEFAULT_CHECKPOINT
-    network, metadata = load_network(path)
-    return Models(load_face_model(face_model), network.to(device).eval(), path.stem, metadata, device)
-
-
-def load_network(path: Path) -> tuple[ReflectanceNetwork, dict[str, Any]]:
-    """The network that a checkpoint describes, with its weights, and the checkpoint's metadata."""
-    tensors, metadata = load_checkpoint(path)
-    if metadata.get("layout_version") != LAYOUT_VERSION:
-        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
-    try:
-        configuration: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in metadata["network"].items()
-        }
-        network = ReflectanceNetwork(ReflectanceSettings(**configuration))
-        network.load_state_dict(tensors)
-    except (KeyError, TypeError, RuntimeError, ValueError):
-        raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
-    return network, metadata
+    networks, metadata = load_networks(path, LAYOUT_VERSION)
+    if "reflectance" not in networks:
+        raise InputError(f"{path}: holds no Reflectance Network; give one by `facerf train`")
+    on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
+    return Models(
+        face=load_face_model(face_model),
+        network=on_device["reflectance"],
+        geometry=on_device.get("geometry"),
+        checkpoint_name=path.stem,
+        metadata=metadata,
+        device=device,
+    )
 
 
 def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tuple[Crop, np.ndarray]:

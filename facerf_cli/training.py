@@ -14,11 +14,10 @@ from torch import Tensor
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.checkpoints import save_checkpoint
 from facerf_cli.files.images import write_display
 from facerf_cli.network.losses import root_loss, si_mse
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
-from facerf_cli.pipeline import load_network
+from facerf_cli.network.saved import load_networks, save_networks
 from facerf_cli.stage.samples import Sample, SampleSource
 
 DEFAULT_NETWORK = ReflectanceSettings()
@@ -117,9 +116,11 @@ def _network(
     source: SampleSource, settings: ReflectanceSettings, start_from: Path | None, device: torch.device
 ) -> ReflectanceNetwork:
     """The network to train, with the mean face that the source knows."""
-    network = load_network(start_from)[0] if start_from else ReflectanceNetwork(settings)
+    network: Any = ReflectanceNetwork(settings)
+    if start_from:
+        network = load_networks(start_from, LAYOUT_VERSION)[0]["reflectance"]
     network.set_mean_face(*source.mean_face())
-    moved: ReflectanceNetwork = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    moved: ReflectanceNetwork = network.to(device, memory_format=torch.channels_last)
     return moved
 
 
@@ -200,12 +201,13 @@ def _save(
     row: dict[str, float],
 ) -> Path:
     metadata: dict[str, Any] = {
-        "network": network_settings.as_dict(),
         "layout_version": LAYOUT_VERSION,
         "licence": source.provenance["licence"],
         "provenance": source.provenance,
         "training": asdict(settings),
         "metrics": row,
     }
-    save_checkpoint(path, weights, metadata)
+    network = ReflectanceNetwork(network_settings)
+    network.load_state_dict(weights)
+    save_networks(path, {"reflectance": network}, metadata)
     return path

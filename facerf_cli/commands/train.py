@@ -63,7 +63,8 @@ def train(
     measured (si_mse in the log), its split test left alone. Sources are those of relight-dataset, or, where
     there are none, the stacks under lights that are drawn.
     """
-    from facerf_cli.pipeline import load_network
+    from facerf_cli.face.topology import LAYOUT_VERSION
+    from facerf_cli.network.saved import load_networks
     from facerf_cli.training import TrainSettings
     from facerf_cli.training import train as run_training
 
@@ -76,7 +77,7 @@ def train(
             context, _OF_THE_BANK, "is for synthetic heads, and --dataset takes their place; give one of them"
         )
     if start_from:
-        load_network(start_from)  # a bad file is named before hours of baking
+        load_networks(start_from, LAYOUT_VERSION)  # a bad file is named before hours of baking
     source: SampleSource
     if dataset is not None:
         source = _open_dataset(dataset, fit_with, texture_size, jobs)

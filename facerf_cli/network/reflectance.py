@@ -7,6 +7,7 @@ and bias are applied at the texture's own. The encoder runs once a face, the dec
 """
 
 from dataclasses import asdict, dataclass
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -28,10 +29,6 @@ class ReflectanceSettings:
     decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
     template_channels: int = 8
     rig_lights: int = 150  # whose shadows on the mean face it holds
-
-    def as_dict(self) -> dict[str, object]:
-        """For a checkpoint's metadata."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)
@@ -75,6 +72,17 @@ class ReflectanceNetwork(nn.Module):
             "mean_visibility", torch.zeros(rig_lights, _MAP_SIDE, _MAP_SIDE, dtype=torch.uint8)
         )
         self.register_buffer("rig", torch.zeros(rig_lights, 3))
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "default", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """An untrained network of these; raises KeyError, TypeError or ValueError where they make none."""
+        given = {k: v for k, v in metadata.items() if k != "form"}
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+        return cls(ReflectanceSettings(**settings))
 
     def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
         """Hold the mean face (head frame): normals [3, T, T], visibility [L, T, T], directions [L, 3]."""

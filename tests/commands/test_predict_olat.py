@@ -18,6 +18,7 @@ from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.saved import save_networks
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import normal_map
 
@@ -35,10 +36,11 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     network = ReflectanceNetwork(settings)
     normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
     network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
-    metadata = {"layout_version": LAYOUT_VERSION, "network": settings.as_dict()}
-    save_checkpoint(folder / "lambert.safetensors", network.state_dict(), metadata)
-    save_checkpoint(folder / "other.safetensors", network.state_dict(), metadata | {"layout_version": 99})
-    save_checkpoint(folder / "torn.safetensors", {}, metadata)
+    metadata = {"layout_version": LAYOUT_VERSION}
+    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
+    save_networks(folder / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
+    torn = metadata | {"networks": {"reflectance": network.as_metadata()}}
+    save_checkpoint(folder / "torn.safetensors", {}, torn)
     face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     return folder

@@ -12,11 +12,11 @@ import facerf_cli.pipeline
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
-from facerf_cli.files.checkpoints import save_checkpoint
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.saved import save_networks
 from facerf_cli.raster.texture import normal_map
 from facerf_cli.stage.sky.skies import kind_of
 
@@ -33,8 +33,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     network = ReflectanceNetwork(settings)
     normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
     network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
-    metadata = {"layout_version": LAYOUT_VERSION, "network": settings.as_dict()}
-    save_checkpoint(folder / "lambert.safetensors", network.state_dict(), metadata)
+    metadata = {"layout_version": LAYOUT_VERSION}
+    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
     face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     (folder / "maps").mkdir()

@@ -4,7 +4,7 @@ from pathlib import Path
 import torch
 
 from facerf_cli.network.reflectance import ReflectanceSettings
-from facerf_cli.pipeline import load_network
+from facerf_cli.network.saved import load_networks
 from facerf_cli.stage.bank import Bank
 from facerf_cli.training import TrainSettings, train
 
@@ -22,8 +22,8 @@ def test_training_lowers_the_loss_and_writes_a_checkpoint_that_loads(bank: Bank,
     losses = torch.tensor([row["loss"] for row in rows])
     assert len(losses) == 60
     assert losses[-10:].mean() < 0.9 * losses[:10].mean()
-    network, metadata = load_network(path)
-    assert network.settings == NETWORK and metadata["metrics"]["si_mse"] > 0
+    networks, metadata = load_networks(path, 1)
+    assert networks["reflectance"].settings == NETWORK and metadata["metrics"]["si_mse"] > 0
     assert metadata["licence"] == "MIT"
     assert (tmp_path / "validation.png").stat().st_size > 1000
     train(

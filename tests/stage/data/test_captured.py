@@ -11,7 +11,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceSettings
-from facerf_cli.pipeline import load_network
+from facerf_cli.network.saved import load_networks
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.stage.data.captured import Captured, View, open_captured
 from facerf_cli.stage.data.dataset import Dataset
@@ -169,7 +169,7 @@ def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: Captured, tmp_
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])
     assert losses[-10:].mean() < 0.85 * losses[:10].mean()
-    _, metadata = load_network(path)
+    _, metadata = load_networks(path, 1)
     assert metadata["provenance"]["trained_on"] == f"{lazy.dataset.folder.name}, 2 subjects"
     assert metadata["metrics"]["si_mse"] > 0 and lazy.dataset.folder.name in metadata["licence"]
 
