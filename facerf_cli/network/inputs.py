@@ -1,0 +1,25 @@
+"""What every form of the Reflectance Network does with the fields that it is given."""
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.network.reflectance import MEAN_RADIANCE
+
+
+def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
+    """What to divide linear textures [B, 3, T, T] by, so that their visible mean is `MEAN_RADIANCE`.
+
+    visible [B, 1, T, T] in 0..1; the result is [B, 1, 1, 1] and positive.
+    """
+    radiance = (texture.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
+    exposure = radiance / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) / MEAN_RADIANCE
+    return exposure.clamp_min(1e-6)
+
+
+def resize(x: Tensor, side: int) -> Tensor:
+    """Resample [B, C, H, W] to a side: averaged when smaller, bilinear when larger."""
+    if x.shape[-1] == side:
+        return x
+    if x.shape[-1] > side:
+        return F.interpolate(x, (side, side), mode="area")
+    return F.interpolate(x, (side, side), mode="bilinear", align_corners=False)

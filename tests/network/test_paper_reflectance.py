@@ -1,0 +1,142 @@
+import json
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork, PaperReflectanceSettings
+
+SMALL = PaperReflectanceSettings(side=32, widths=(8, 8, 12, 16), features=8)
+
+
+@pytest.fixture(scope="module")
+def network() -> PaperReflectanceNetwork:
+    torch.manual_seed(3)
+    network = PaperReflectanceNetwork(SMALL)
+    with torch.no_grad():
+        network.light_convolutions[-1].weight.mul_(30)  # an untrained one would hide what comes before it
+    return network.eval()
+
+
+def _face(side: int, faces: int = 1) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(side)
+    normals = F.normalize(torch.randn(faces, 3, side, side, generator=generator), dim=1)
+    texture = torch.rand(faces, 3, side, side, generator=generator)
+    return texture, normals, (torch.rand(faces, 1, side, side, generator=generator) > 0.2).float()
+
+
+def _lights(count: int, faces: int = 1) -> Tensor:
+    return F.normalize(torch.randn(faces, count, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+
+
+def test_structure_is_the_papers() -> None:
+    with torch.device("meta"):
+        network = PaperReflectanceNetwork()
+        convolutions = [m for m in network.modules() if isinstance(m, nn.Conv2d)]
+        texture = torch.zeros(1, 3, 512, 512)
+        encoded = network.encode(texture, texture, texture[:, :1])
+        olat = network.decode(encoded, texture, torch.zeros(1, 2, 3))
+    assert all(m.kernel_size == (3, 3) for m in convolutions)
+    assert (len(network.down), len(network.up), len(network.light_convolutions)) == (8, 8, 5)
+    assert len(convolutions) == 8 + 8 + 5
+    assert [m.stride[0] for m in convolutions] == [2] * 8 + [1] * 13
+    assert network.down[0].convolution.in_channels == 6
+    assert [f.shape[-1] for f in encoded.features] == [256, 128, 64, 32, 16, 8, 4, 2]
+    assert olat.shape == (1, 2, 3, 512, 512)
+
+
+@torch.no_grad()
+def test_what_each_input_reaches() -> None:
+    """The skips carry the finest source, the light comes in below, the target's normals above."""
+    torch.manual_seed(0)
+    network = PaperReflectanceNetwork(SMALL)
+    seen: dict[str, Tensor] = {}
+    for name, module in (("down", network.down[-1]), ("up", network.up[0])):
+        module.register_forward_hook(lambda _m, _i, out, name=name: seen.__setitem__(name, out))
+    texture, normals, visible = _face(32)
+    results = []
+    for target, light in ((normals, _lights(1)), (-normals, _lights(1)), (normals, -_lights(1))):
+        network.decode(network.encode(texture, normals, visible), target, light)
+        results.append(dict(seen))
+    assert all(torch.equal(results[0]["down"], other["down"]) for other in results)
+    assert torch.equal(results[0]["up"], results[1]["up"])  # N_t comes after the U-Net
+    assert not torch.allclose(results[0]["up"], results[2]["up"], atol=1e-4)
+    encoded = network.encode(texture, normals, visible)
+    before = network.decode(encoded, normals, _lights(1))
+    for feature in encoded.features:
+        kept = feature.clone()
+        feature.add_(1)
+        assert not torch.allclose(network.decode(encoded, normals, _lights(1)), before, atol=1e-6)
+        feature.copy_(kept)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("side", [16, 32, 80])
+def test_any_texture_side_comes_out_linear_and_non_negative(
+    network: PaperReflectanceNetwork, side: int
+) -> None:
+    texture, normals, visible = _face(side, faces=2)
+    olat = network.decode(network.encode(texture, normals, visible), normals, _lights(3, faces=2))
+    assert olat.shape == (2, 3, 3, side, side)
+    assert olat.min() >= 0 and olat.isfinite().all()
+
+
+@torch.no_grad()
+def test_exposure_of_the_source_comes_back(network: PaperReflectanceNetwork) -> None:
+    texture, normals, visible = _face(32)
+    dim, bright = (
+        network.decode(network.encode(texture * gain, normals, visible), normals, _lights(2))
+        for gain in (0.1, 20.0)
+    )
+    assert torch.allclose(dim * 200, bright, rtol=1e-3, atol=1e-4)
+    black = network.decode(network.encode(texture * 0, normals, visible * 0), normals, _lights(2))
+    assert black.isfinite().all()
+
+
+@torch.no_grad()
+def test_lights_do_not_depend_on_the_batch_they_come_in(network: PaperReflectanceNetwork) -> None:
+    texture, normals, visible = _face(32, faces=2)
+    lights = _lights(5, faces=2)
+    encoded = network.encode(texture, normals, visible)
+    together = network.decode(encoded, normals, lights)
+    apart = torch.cat([network.decode(encoded, normals, light) for light in lights.split(1, 1)], 1)
+    assert torch.allclose(together, apart, atol=1e-5)
+    assert (together[:, 0] - together[:, 1]).abs().max() > 1e-4  # and the light matters
+
+
+@torch.no_grad()
+def test_skips_are_convolved_as_if_stacked(network: PaperReflectanceNetwork) -> None:
+    up = network.up[2]
+    x, skip = torch.randn(2, 12, 4, 4), torch.randn(2, 12, 4, 4)
+    stacked = F.interpolate(torch.cat([x, skip], 1), scale_factor=2.0)
+    expected = F.leaky_relu(up.norm(up.convolution(stacked)), 0.2)
+    assert torch.allclose(up(x, skip), expected, atol=1e-5)
+
+
+@torch.no_grad()
+def test_without_normals_they_are_not_looked_at() -> None:
+    network = PaperReflectanceNetwork(PaperReflectanceSettings(32, (8, 8, 12, 16), 8, normals=False))
+    texture, normals, visible = _face(32)
+    one = network.decode(network.encode(texture, normals, visible), normals, _lights(1))
+    other = network.decode(network.encode(texture, -normals, visible), normals * 0, _lights(1))
+    assert torch.equal(one, other)
+    assert network.down[0].convolution.in_channels == 3
+
+
+def test_metadata_makes_the_same_network() -> None:
+    network = PaperReflectanceNetwork(SMALL)
+    again = PaperReflectanceNetwork.from_metadata(json.loads(json.dumps(network.as_metadata())))
+    assert again.settings == SMALL and network.as_metadata()["form"] == "paper"
+    again.load_state_dict(network.state_dict())
+    with pytest.raises(TypeError):
+        PaperReflectanceNetwork.from_metadata({"form": "paper", "depth": 3})
+    with pytest.raises(ValueError, match="halved 4 times"):
+        PaperReflectanceNetwork(PaperReflectanceSettings(40, (8, 8, 8, 8)))
+
+
+def test_every_weight_learns() -> None:
+    network = PaperReflectanceNetwork(SMALL)
+    texture, normals, visible = _face(32)
+    network.decode(network.encode(texture, normals, visible), normals, _lights(2)).mean().backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
