@@ -63,8 +63,8 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     albedo = skin.albedo * (1 - clothed) + clothed * cloth
     mouth = mask(window, "mouth", 1.0)
     albedo = albedo * (1 - mouth) + mouth * slit
-    shine = torch.exp(_uniform(faces, -0.5, 0.7, generator))
-    smoothness = _uniform(faces, -0.06, 0.2, generator)
+    shine = torch.exp(_uniform(faces, -0.5, 0.5, generator))
+    smoothness = 0.24 * _uniform(faces, 0, 1, generator) ** 2 - 0.06
     specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp_min(0.16)
     return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
 
