@@ -1,21 +1,33 @@
-"""Relight the real faces of Extended Yale B to its real point lights, and score that.
+"""Relight the real faces of Extended Yale B to its real point lights, and score that beside the peers.
 
-    python benchmarks/yale_b.py [--data ../shared/data/extended_yale_b] [--out PRED]
+    python benchmarks/yale_b.py [--checkpoint SEED0 SEED1 ...] [--json FILE] [--jobs 2]
+    python benchmarks/yale_b.py --subjects yaleB05 yaleB15 yaleB22   # for choosing settings: these alone
 
-writes PRED/SUBJECT/SOURCE/LIGHT.npy, 168x192, aligned with the source, then runs the benchmark's scorer. The
-pictures are close to linear in light and taken as linear; a subject's sources share its frontal landmarks.
+Several checkpoints are seeds of one recipe: their mean is held against the bar, and each is shown. Every
+picture is measured by the benchmark's own score.py. `--out` keeps the pictures as that wants them,
+OUT/CHECKPOINT/SUBJECT/SOURCE/LIGHT.npy, 168x192, aligned with the source.
+
+Pictures are close to linear in light and taken as linear; a subject's sources share its frontal landmarks.
 """
 
 import argparse
-import importlib.util
-import subprocess
+import importlib
+import json
 import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from multiprocessing import get_context
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from yale_table import Row, results, table
 
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.pipeline import (
@@ -36,57 +48,130 @@ CROP_PX, TEXTURE_SIDE = 512, 256  # as the verbs have them
 _DARK = 0.02  # keeps ratios finite in the source's shadows
 
 
+@dataclass(frozen=True)
+class Task:
+    """What every process needs to relight and score a subject."""
+
+    data: Path
+    bench: Path
+    checkpoints: tuple[Path | None, ...]  # None is the one shipped
+    face_model: str
+    out: Path | None
+
+
 def main() -> None:
+    given = _arguments()
+    task = Task(given.data, given.bench, tuple(given.checkpoint or [None]), given.face_model, given.out)
+    everyone = load_yale(given.bench).Yale(str(given.data)).subjects
+    chosen = given.subjects or everyone
+    if strangers := sorted(set(chosen) - set(everyone)):
+        raise SystemExit(f"{', '.join(strangers)}: not in {given.data}")
+    begin = time.monotonic()
+    seeds: list[list[Row]] = [[] for _ in task.checkpoints]
+    for subject, by_checkpoint in zip(chosen, _scored(task, chosen, given.jobs), strict=True):
+        for rows, more in zip(seeds, by_checkpoint, strict=True):
+            rows += more
+        print(f"{subject} {time.monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
+    found = results([str(path or "shipped") for path in task.checkpoints], seeds, whole=chosen == everyone)
+    print(table(found))
+    if given.json:
+        given.json.parent.mkdir(parents=True, exist_ok=True)
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--data", type=Path, default=SHARED / "data/extended_yale_b", help="the yaleBXX folders"
-    )
-    parser.add_argument(
-        "--bench", type=Path, default=SHARED / "bench/yale_b", help="its yale.py and score.py"
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/yale_b"), help="folder for the predictions")
-    parser.add_argument("--checkpoint", type=Path)
-    parser.add_argument("--face-model", default="builtin")
-    parser.add_argument("--subjects", nargs="*", help="only these, such as yaleB05 (an incomplete set)")
-    arguments = parser.parse_args()
-    yale = load_yale(arguments.bench)
-    data = yale.Yale(str(arguments.data))
-    models = load_models(arguments.checkpoint, arguments.face_model, torch.device("cpu"))
-    for subject in arguments.subjects or data.subjects:
-        relight_subject(models, yale, data, subject, arguments.out / subject)
-        print(subject, flush=True)
-    score = [sys.executable, str(arguments.bench / "score.py"), "--data", str(arguments.data)]
-    score += ["--pred", str(arguments.out), "--json", str(arguments.out / "result.json")]
-    subprocess.run(score + (["--partial"] if arguments.subjects else []), check=True)
+    add = parser.add_argument
+    add("--data", type=Path, default=SHARED / "data/extended_yale_b", help="the yaleBXX folders")
+    add("--bench", type=Path, default=SHARED / "bench/yale_b", help="its yale.py and score.py")
+    add("--checkpoint", type=Path, nargs="+", help="seeds of one recipe (default: the one shipped)")
+    add("--face-model", default="builtin")
+    add("--subjects", nargs="+", help="only these, such as yaleB05: no bar is held against them")
+    add("--jobs", type=int, default=1, help="processes, a core each")
+    add("--out", type=Path, help="keep the predictions here, for score.py")
+    add("--json", type=Path, help="write all figures here")
+    given = parser.parse_args()
+    for path in given.checkpoint or []:
+        if not path.is_file():
+            parser.error(f"{path}: no such checkpoint")
+    return given
+
+
+def _scored(task: Task, subjects: list[str], jobs: int) -> Iterator[list[list[Row]]]:
+    """The scored rows of every checkpoint, subject by subject."""
+    if jobs == 1:
+        yield from (score_subject(task, subject) for subject in subjects)
+        return
+    with ProcessPoolExecutor(jobs, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        yield from pool.map(score_subject, [task] * len(subjects), subjects)
 
 
 def load_yale(bench: Path) -> ModuleType:
     """The benchmark's own module of data, lights and cases."""
-    spec = importlib.util.spec_from_file_location("yale", bench / "yale.py")
-    assert spec and spec.loader
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_bench(bench)[0]
 
 
-def relight_subject(models: Models, yale: ModuleType, data, subject: str, folder: Path) -> None:  # type: ignore[no-untyped-def]
-    """Write the predictions of all of one subject's cases."""
+@lru_cache(maxsize=1)
+def load_bench(bench: Path) -> tuple[ModuleType, ModuleType]:
+    """Its yale.py and its score.py."""
+    if not (bench / "yale.py").is_file():
+        raise SystemExit(f"{bench}: no yale.py there; give the benchmark's folder with --bench")
+    sys.path.insert(0, str(bench.resolve()))
+    return importlib.import_module("yale"), importlib.import_module("score")
+
+
+@lru_cache(maxsize=1)
+def _load_all(checkpoints: tuple[Path | None, ...], face_model: str) -> list[Models]:
+    return [load_models(path, face_model, torch.device("cpu")) for path in checkpoints]
+
+
+def score_subject(task: Task, subject: str) -> list[list[Row]]:
+    """The measures of all of a subject's cases, for every checkpoint."""
+    yale, score = load_bench(task.bench)
+    data = yale.Yale(str(task.data))
     frontal = np.repeat(data.source(subject, "frontal")[..., None], 3, -1)
     landmarks_px = find_faces(frontal, subject)[0].landmarks_px
+    scored = []
+    for number, models in enumerate(_load_all(task.checkpoints, task.face_model)):
+        rows = []
+        for case, picture in relight_subject(models, yale, data, subject, landmarks_px):
+            name = dict(zip(("task", "source", "light"), case, strict=True))
+            measures = score.measure(picture, data.target(subject, name["light"]))
+            angle_deg = _angle_deg(yale, name["light"])
+            rows.append({"subject": subject, "angle_deg": angle_deg, **name, **measures})
+            if task.out:
+                _keep(task.out / f"{number}-{models.checkpoint_name}" / subject, name, picture)
+        scored.append(rows)
+    return scored
+
+
+def _angle_deg(yale: ModuleType, light: str) -> float | None:
+    """Between a single light and the camera."""
+    parsed = yale.parse_light(light)
+    return None if parsed is None else float(yale.angle_to_camera(*parsed))
+
+
+def _keep(folder: Path, name: dict[str, str], picture: np.ndarray) -> None:
+    (folder / name["source"]).mkdir(parents=True, exist_ok=True)
+    np.save(folder / name["source"] / f"{name['light']}.npy", picture)
+
+
+def relight_subject(
+    models: Models, yale: ModuleType, data: Any, subject: str, landmarks_px: np.ndarray
+) -> Iterator[tuple[tuple[str, str, str], np.ndarray]]:
+    """Every case of a subject (task, source, light), and its prediction [H, W]."""
     lights = data.lights(subject)
     directions = torch.tensor(np.array([yale.light_dir(*light) for light in lights]), dtype=torch.float32)
     names = [yale.light_name(*light) for light in lights]
     for source in yale.SOURCES:
-        picture = data.source(subject, source)
-        targets = [target for _, s, target in data.cases(subject) if s == source]
-        weights = torch.stack([target_weights(yale, names, lights, target) for target in targets])
+        cases = [case for case in data.cases(subject) if case[1] == source]
+        weights = torch.stack([target_weights(yale, names, lights, case[2]) for case in cases])
         used = weights.sum(0) > 0
+        picture = data.source(subject, source)
         predicted = relight(models, picture, landmarks_px, directions[used], weights[:, used])
-        (folder / source).mkdir(parents=True, exist_ok=True)
-        for target, image in zip(targets, predicted, strict=True):
-            np.save(folder / source / f"{target}.npy", image.numpy().astype(np.float16))
+        yield from zip(cases, predicted.numpy(), strict=True)
 
 
 def target_weights(yale: ModuleType, names: list[str], lights: list[tuple[int, int]], target: str) -> Tensor:

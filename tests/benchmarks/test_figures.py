@@ -1,0 +1,87 @@
+"""The arithmetic behind the benchmarks' figures: intervals over people, and what clears the bar."""
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from bootstrap import average, mean_interval
+from yale_table import COLUMNS, results, table
+
+
+def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
+    random = np.random.default_rng(0)
+    groups = random.normal(size=40)
+    interval = mean_interval((g, groups[g] + 0.01 * random.normal()) for g in range(40) for _ in range(50))
+    assert interval is not None and (interval.pictures, interval.groups) == (2000, 40)
+    half = 1.96 * groups.std() / math.sqrt(40)
+    np.testing.assert_allclose(interval.high - interval.low, 2 * half, rtol=0.1)
+    assert interval.low < interval.mean < interval.high
+
+
+def test_one_group_tells_nothing_of_others() -> None:
+    interval = mean_interval([("a", 1.0), ("a", 3.0)])
+    assert interval is not None and interval.mean == 2 and math.isnan(interval.low)
+    assert mean_interval([]) is None
+
+
+def test_seeds_are_averaged_picture_by_picture() -> None:
+    assert average([{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 2.0}]) == {"a": 2.0, "b": 2.0}
+
+
+def rows(si_mse: float, ssim: float) -> list[dict[str, Any]]:
+    found = []
+    for subject in ("p", "q", "r"):
+        for angle in (5.0, 20.0, 40.0, 50.0, 79.9):
+            found.append(row(subject, "A", "frontal", f"light{angle}", angle, si_mse, ssim))
+        found.append(row(subject, "A", "dome", "light", 5.0, si_mse, ssim))
+        found.append(row(subject, "B", "frontal", "env_sky", None, si_mse, ssim))
+        found.append(row(subject, "B", "win_left", "env_sky", None, si_mse, ssim))
+    return found
+
+
+def row(
+    subject: str, task: str, source: str, light: str, angle: float | None, si_mse: float, ssim: float
+) -> dict[str, Any]:
+    names = {"subject": subject, "task": task, "source": source, "light": light, "angle_deg": angle}
+    return names | {"si_mse": si_mse, "ssim": ssim}
+
+
+@pytest.mark.parametrize(
+    ("si_mse", "ssim", "bar", "aim"),
+    [
+        (0.005, 0.80, True, True),
+        (0.010, 0.80, True, False),
+        (0.012, 0.80, False, False),  # between the peers
+        (0.005, 0.68, False, True),
+    ],
+)
+def test_bar_and_aim_of_the_frontal_column(si_mse: float, ssim: float, bar: bool, aim: bool) -> None:
+    column = results(["a"], [rows(si_mse, ssim)], whole=True)["columns"]["frontal"]
+    assert column["bar"] == {"mean": bar, "every_seed": bar, "interval": bar} and column["aim"] is aim
+
+
+def test_every_seed_must_clear_the_bar_itself() -> None:
+    found = results(["a", "b"], [rows(0.002, 0.8), rows(0.0118, 0.8)], whole=True)
+    bar = found["columns"]["soft"]["bar"]
+    assert bar == {"mean": True, "every_seed": True, "interval": True}
+    frontal = found["columns"]["frontal"]
+    assert frontal["bar"] == {"mean": True, "every_seed": False, "interval": True}
+    np.testing.assert_allclose(frontal["si_mse"]["spread"], 0.0098)
+
+
+def test_columns_hold_their_pictures_only() -> None:
+    counts = {c.name: sum(c.holds(r) for r in rows(0.0, 0.0)) for c in COLUMNS}
+    assert counts == {"frontal": 15, "soft": 3, "environment": 6} | {c.name: 3 for c in COLUMNS[3:]}
+
+
+def test_no_bar_is_held_against_a_part_of_the_subjects() -> None:
+    found = results(["a"], [rows(0.001, 0.9)], whole=False)
+    assert not any("bar" in column for column in found["columns"].values())
+    assert "no bar" in table(found) and "0.0010" in table(found)
+    assert "bar: yes" in table(results(["a"], [rows(0.001, 0.9)], whole=True))
