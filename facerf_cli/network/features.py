@@ -1,0 +1,163 @@
+"""Features in which pictures and textures are compared (paper, 'Loss Functions').
+
+V_f is the trunk of VGG-16 (Simonyan and Zisserman, *Very deep convolutional networks for large-scale image
+recognition*, 2015, configuration D) with ImageNet's weights, and is never trained here. S_f is the same
+trunk, narrower where the settings say so, under a head that says where the light of a texture stands; it is
+trained (`objectives/light_features.py`), then frozen like V_f.
+
+Both read scene-linear Rec.709, encode it to sRGB as ImageNet's pictures are, and normalise by ImageNet's mean
+and deviation. The exposure is the caller's: white at 1; what is brighter goes on above the encoded 1.
+"""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+# The trunk up to conv3_3: each convolution's place in torchvision's `features`, and its channels.
+CONVOLUTIONS = ((0, 64), (2, 64), (5, 128), (7, 128), (10, 256), (12, 256), (14, 256))
+FEATURE_LAYERS = {"conv1_2": 3, "conv2_2": 8, "conv3_3": 15}  # where the ReLU of each stands
+_POOLS = (4, 9)
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of encoded RGB in 0..1, as torchvision's weights were trained
+IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
+
+
+class Layered(Protocol):
+    """V_f or S_f."""
+
+    def layers(self, linear: Tensor) -> list[Tensor]:
+        """Features of linear pictures [B, 3, H, W] after the ReLU of each of `FEATURE_LAYERS`."""
+
+
+def feature_distance(net: Layered, prediction: Tensor, target: Tensor) -> Tensor:
+    """Squared distance of features, summed over the layers [B]; prediction and target [B, 3, H, W] linear.
+
+    One term of the paper's L_I (with V_f) or L_L (with S_f). The paper leaves open whether a layer's squared
+    norm is a sum or a mean: here it is the mean over the layer's elements, so that a weight means the same at
+    every size. No gradient goes to `target`. Mask both before, with the same mask.
+    """
+    with torch.no_grad():
+        wanted = net.layers(target)
+    differences = [a.float() - b.float() for a, b in zip(net.layers(prediction), wanted, strict=True)]
+    return torch.stack([d.square().mean((1, 2, 3)) for d in differences]).sum(0)
+
+
+class VggFeatures(nn.Module):
+    """VGG-16 up to conv3_3; its tensors have torchvision's names (`features.N.weight`, `features.N.bias`)."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, width: float = 1.0) -> None:
+        """`width` scales the channels of every layer, up to 4 times; 1 is VGG-16."""
+        super().__init__()
+        if not 0 < width <= 4:
+            raise ValueError(f"a width of {width}")
+        channels = {place: max(1, round(count * width)) for place, count in CONVOLUTIONS}
+        self.out_channels = channels[CONVOLUTIONS[-1][0]]
+        modules: list[nn.Module] = []
+        entering = 3
+        for place in range(FEATURE_LAYERS["conv3_3"] + 1):
+            if place in channels:
+                modules.append(_convolution(entering, channels[place]))
+                entering = channels[place]
+            else:
+                modules.append(nn.MaxPool2d(2) if place in _POOLS else nn.ReLU(inplace=True))
+        self.features = nn.Sequential(*modules)
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
+        self.register_buffer("deviation", torch.tensor(IMAGENET_DEVIATION).view(3, 1, 1), persistent=False)
+
+    def layers(self, linear: Tensor) -> list[Tensor]:
+        """Features [B, C, H / s, W / s], s = 1, 2, 4, of linear pictures [B, 3, H, W]: `FEATURE_LAYERS`."""
+        x = (encode_display(linear.float()) - self.mean) / self.deviation
+        found = []
+        for place, module in enumerate(self.features):
+            x = module(x)
+            if place in FEATURE_LAYERS.values():
+                found.append(x)
+        return found
+
+    def load_published(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take the trunk out of a VGG-16's weights by torchvision's names; other layers are passed over.
+
+        Raises ValueError in words where a layer is missing or is no VGG-16's.
+        """
+        own = self.state_dict()
+        for name, tensor in own.items():
+            given = tensors.get(name)
+            if not isinstance(given, Tensor):
+                raise ValueError(f"it has no {name}")
+            if given.shape != tensor.shape or not given.is_floating_point():
+                raise ValueError(f"its {name} is {_words(given)}, not {_words(tensor)}")
+            if not given.isfinite().all():
+                raise ValueError(f"its {name} holds values that are not finite")
+        self.load_state_dict({name: tensors[name] for name in own})
+
+
+@dataclass(frozen=True)
+class LightSettings:
+    """S_f: the default's is cheap on a CPU at 128 px; `LightSettings(width=1.0)` is VGG-16's own trunk."""
+
+    width: float = 0.25
+    grid: int = 8  # the side to which conv3_3 is pooled before the head: where things are lit tells the light
+    hidden: int = 128
+
+
+class LightNetwork(nn.Module):
+    """S_f: a texture lit by one light -> the light's direction, in the head's own frame.
+
+    A texture does not show how the head is turned, so the direction is in the head frame (DESIGN, 'Axes').
+    """
+
+    def __init__(self, settings: LightSettings = LightSettings()) -> None:
+        super().__init__()
+        self.settings = settings
+        self.trunk = VggFeatures(settings.width)
+        self.pool = nn.AdaptiveAvgPool2d(settings.grid)
+        self.head = nn.Sequential(
+            nn.Linear(self.trunk.out_channels * settings.grid**2, settings.hidden),
+            nn.ReLU(),
+            nn.Linear(settings.hidden, 3),
+        )
+
+    def forward(self, textures: Tensor) -> Tensor:
+        """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where unseen."""
+        deepest = self.trunk.layers(textures)[-1]
+        return F.normalize(self.head(self.pool(deepest).flatten(1)).float(), dim=-1)
+
+    def layers(self, linear: Tensor) -> list[Tensor]:
+        """The trunk's; see `VggFeatures.layers`."""
+        return self.trunk.layers(linear)
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "vgg", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """An untrained network of these; raises KeyError, TypeError or ValueError where they make none."""
+        return cls(LightSettings(**{name: value for name, value in metadata.items() if name != "form"}))
+
+
+def encode_display(linear: Tensor) -> Tensor:
+    """IEC 61966-2-1 of any shape, with a gradient everywhere; `colour.linear_to_srgb` for 0 and above.
+
+    Below zero, where a prediction may stray and no picture is, its straight part goes on.
+    """
+    curved = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, 12.92 * linear, curved)
+
+
+def _convolution(channels_in: int, channels_out: int) -> nn.Conv2d:
+    convolution = nn.Conv2d(channels_in, channels_out, 3, padding=1)
+    nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+    nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
+    return convolution
+
+
+def _words(tensor: Tensor) -> str:
+    return f"{' x '.join(map(str, tensor.shape))} {str(tensor.dtype).removeprefix('torch.')}"

@@ -1,0 +1,166 @@
+"""Stage `light-features`: S_f learns to tell from a texture where its one light stands.
+
+The paper trains S_f 'to predict the light direction from images' after Meka et al. (*Deep reflectance
+fields*, 2019), and says no more of it; what it learns to look at, shading, shadows and highlights, is what
+the loss L_L then compares. Textures are those that the Reflectance Network is trained to make, of one light
+each, black where the target pose does not see the face.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.features import LightNetwork
+from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.stage.samples import SampleSource
+
+_NORMALS_SIDE = 64  # at which head frames are found
+_VALIDATION_SEED = 12345
+_SHEET_FACES = 6
+
+
+@dataclass(frozen=True)
+class LightTextures:
+    """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
+
+    The lights are unit vectors in the head's own frame.
+    """
+
+    textures: Tensor
+    lights_head: Tensor
+
+    def to(self, device: torch.device) -> "LightTextures":
+        """The same batch on `device`."""
+        return LightTextures(self.textures.to(device), self.lights_head.to(device))
+
+
+@dataclass(frozen=True)
+class LightFeaturesSettings:
+    """Lights of a face and step; and held-out heads, each seen `held_out_views` times."""
+
+    lights: int = 8
+    held_out_heads: int = 12
+    held_out_views: int = 4
+
+
+class LightFeaturesObjective(Objective):
+    """1 - the cosine between the predicted direction and the light's."""
+
+    def __init__(
+        self,
+        source: SampleSource,
+        network: LightNetwork | None = None,
+        settings: LightFeaturesSettings = LightFeaturesSettings(),
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleDict({"light_features": network or LightNetwork()})
+        self.chooses_by = "angle_deg"
+        self.provenance = source.provenance
+        self.source = source
+        self.settings = settings
+        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        self.mean_normals = _small(source.mean_face()[0][None])[0]
+        self._validation: LightTextures | None = None
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> LightTextures:
+        """`count` faces, sample i with `generator_of(i)` alone."""
+        drawn = []
+        for i in range(count):
+            generator = generator_of(i)
+            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+            drawn.append(self._textures(head, generator))
+        return concatenate(drawn)
+
+    def forward(self, batch: LightTextures) -> dict[str, Tensor]:
+        """The one term, a mean over faces and their lights."""
+        return {"light": 1 - _cosines(self._network(), batch).mean()}
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Mean and median angle in degrees to the true light, of held-out heads."""
+        if self._validation is None:
+            self._validation = self._held_out()
+        network = self._network()
+        batch = self._validation.to(next(network.parameters()).device)
+        cosines = torch.cat([_cosines(network, face) for face in _one_by_one(batch)])
+        angles = torch.rad2deg(cosines.double().clamp(-1, 1).acos())
+        front = batch.lights_head[..., 2] > 0
+        metrics = {
+            "angle_deg": float(angles.mean()),
+            "angle_median_deg": float(angles.median()),
+            "angle_front_deg": float(angles[front].mean()),  # of lights before the face's plane
+            "angle_behind_deg": float(angles[~front].mean()),
+        }
+        return Validation(metrics, _sheet(network, self._validation))
+
+    def _network(self) -> LightNetwork:
+        network: Any = self.networks["light_features"]
+        return network
+
+    def _held_out(self) -> LightTextures:
+        return concatenate(
+            [
+                self._textures(head[None], seeded(_VALIDATION_SEED, int(head), view))
+                for view in range(self.settings.held_out_views)
+                for head in self.held_out
+            ]
+        )
+
+    def _textures(self, heads: Tensor, generator: torch.Generator) -> LightTextures:
+        sample = self.source.draw(heads, self.settings.lights, generator)
+        seen = (sample.weight > 0).float()
+        head_to_camera = _rotations(self.mean_normals, _small(sample.normals_target))
+        return LightTextures(sample.target * seen[:, None], sample.lights @ head_to_camera)  # rows: R^T w
+
+
+def _one_by_one(batch: LightTextures) -> Iterator[LightTextures]:
+    for i in range(len(batch.textures)):
+        yield LightTextures(batch.textures[i : i + 1], batch.lights_head[i : i + 1])
+
+
+def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
+    """Between predicted and true directions [B, L]."""
+    predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
+    return (predicted * batch.lights_head).sum(-1)
+
+
+def _small(normals: Tensor) -> Tensor:
+    return F.interpolate(normals, (_NORMALS_SIDE, _NORMALS_SIDE), mode="area")
+
+
+def _rotations(mean_normals: Tensor, normals: Tensor) -> Tensor:
+    """head_to_camera [B, 3, 3] that best turn the mean face's normals [3, S, S] to normals [B, 3, S, S]."""
+    moment = torch.einsum("bcij,dij->bcd", normals.double(), mean_normals.double())
+    u, _, vt = torch.linalg.svd(moment)
+    signs = torch.ones(len(moment), 3, dtype=moment.dtype)
+    signs[:, 2] = torch.det(u @ vt)
+    return (u @ torch.diag_embed(signs) @ vt).float()
+
+
+def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
+    """For some faces three rows of pictures: textures, a ball under the true light, and under the predicted.
+
+    The balls are seen from before the face, in the head's frame.
+    """
+    rows = []
+    for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
+        predicted = network(textures.to(next(network.parameters()).device)).cpu()
+        for pictures in (textures, _balls(lights, textures.shape[-1]), _balls(predicted, textures.shape[-1])):
+            rows.append(torch.cat(list(pictures), -1))
+    picture: np.ndarray = torch.cat(rows, -2).permute(1, 2, 0).numpy()
+    return picture
+
+
+def _balls(lights: Tensor, side: int) -> Tensor:
+    """White balls [N, 3, side, side] under lights [N, 3], a little brighter than the black around them."""
+    along = torch.linspace(-1, 1, side) * 1.05
+    y, x = torch.meshgrid(-along, along, indexing="ij")
+    inside = 1 - x**2 - y**2
+    normals = torch.stack([x, y, inside.clamp_min(0).sqrt()])
+    shading = torch.einsum("nc,cij->nij", lights, normals).clamp_min(0) * 0.9 + 0.02
+    return (shading * (inside > 0))[:, None].expand(-1, 3, -1, -1)
