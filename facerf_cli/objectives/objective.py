@@ -34,6 +34,7 @@ class Objective(nn.Module):
     networks: nn.ModuleDict  # trained, averaged, saved: among 'reflectance', 'geometry', 'light_features'
     chooses_by: str  # the metric of `validate`, lower is better, that chooses best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; its 'licence' is the words for the whole
+    bf16: bool = False  # set by the loop: networks may run in mixed precision, see `mixed_precision`
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:
         """`count` samples, sample i with `generator_of(i)` alone, so that it never depends on its neighbours.
@@ -51,10 +52,15 @@ class Objective(nn.Module):
         """Measure the networks as they are on held-out people, on the same samples every time."""
         raise NotImplementedError
 
+    def mixed_precision(self) -> torch.autocast:
+        """For the networks' share of `forward` alone: geometry and losses want single precision."""
+        device = next(self.networks.parameters()).device
+        return torch.autocast(device.type, torch.bfloat16, enabled=self.bf16)
+
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A generator of the CPU that depends on all of these non-negative numbers, and on their order."""
-    state = int(np.random.SeedSequence(numbers).generate_state(1, np.uint64)[0])
+    """A generator of the CPU that depends on all of these non-negative numbers, their order and count."""
+    state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
 
 
