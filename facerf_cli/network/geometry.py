@@ -1,0 +1,160 @@
+"""From a face's crop to pose, identity and expression (paper, 'Network Architecture').
+
+Two forms. `paper`: the trunk of AlexNet (Krizhevsky et al., *ImageNet classification with deep convolutional
+neural networks*, 2012) with the layer sizes of its one-tower form (Krizhevsky, *One weird trick for
+parallelizing convolutional neural networks*, 2014), without dropout, for a regression needs none. `default`:
+a small residual trunk on a smaller crop. Rotations leave the network as two columns that are made orthonormal
+(Zhou et al., *On the continuity of rotation representations in neural networks*, 2019).
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Form = Literal["default", "paper"]
+_SIDES: dict[str, int] = {"default": 96, "paper": 224}
+_MAX_COEFFICIENTS = 500
+_SHIFT, _DEPTH = (
+    0.05,
+    0.2,
+)  # how much one unit of an output moves the head: a share of the depth, of log depth
+_ALPHA, _BETA = 0.3, 0.7  # and the coefficients, in deviations; as wide as the fit's priors
+_BRIGHTEST = 4.0  # deviations from the crop's mean that its square root may have
+
+
+@dataclass(frozen=True)
+class GeometrySettings:
+    """Form, numbers of coefficients, and the translation (m, camera space) that outputs of zero stand for."""
+
+    form: Form = "default"
+    identity: int = 40
+    expression: int = 29
+    mean_translation_m: tuple[float, float, float] = (0.0, 0.0, -1.1)
+
+
+class GeometryEstimate(NamedTuple):
+    """Heads of B faces in the space of the crop camera: `raster.camera.crop_camera`."""
+
+    rotation: Tensor  # [B, 3, 3] head_to_camera
+    translation_m: Tensor  # [B, 3]
+    alpha: Tensor  # [B, Ki], coefficients of the built-in model, as beta
+    beta: Tensor  # [B, Ke]
+
+
+class GeometryNetwork(nn.Module):
+    """Crops [B, 3, S, S], scene-linear at any exposure and side -> GeometryEstimate."""
+
+    mean_translation_m: Tensor
+
+    def __init__(self, settings: GeometrySettings = GeometrySettings()) -> None:
+        super().__init__()
+        self.settings = settings
+        self.side = _SIDES[settings.form]
+        self.trunk, width = _alexnet() if settings.form == "paper" else _small()
+        self.regress = nn.Linear(width, 9 + settings.identity + settings.expression)
+        nn.init.normal_(self.regress.weight, std=1e-3)
+        nn.init.zeros_(self.regress.bias)
+        mean = torch.tensor(settings.mean_translation_m)
+        self.register_buffer("mean_translation_m", mean, persistent=False)
+
+    def forward(self, crops: Tensor) -> GeometryEstimate:
+        """Estimate pose and shape; crops are normalised here, so that their exposure does not matter."""
+        raw = self.regress(self.trunk(self._normalised(crops))).float()
+        columns, shift, alpha, beta = raw.split(
+            (6, 3, self.settings.identity, self.settings.expression), dim=1
+        )
+        return GeometryEstimate(_rotation(columns), self._translation(shift), _ALPHA * alpha, _BETA * beta)
+
+    def _normalised(self, crops: Tensor) -> Tensor:
+        """Square roots of the crops at the network's side, of zero mean and unit deviation each."""
+        if crops.shape[-1] > self.side:
+            crops = F.interpolate(crops, (self.side, self.side), mode="area")
+        elif crops.shape[-1] < self.side:
+            crops = F.interpolate(crops, (self.side, self.side), mode="bilinear", align_corners=False)
+        root = (crops.clamp_min(0) / crops.mean((1, 2, 3), keepdim=True).clamp_min(1e-8)).sqrt()
+        centred = root - root.mean((1, 2, 3), keepdim=True)
+        deviation = (centred * centred).mean((1, 2, 3), keepdim=True).sqrt()
+        return (centred / (deviation + 1e-3)).clamp(-_BRIGHTEST, _BRIGHTEST)
+
+    def _translation(self, raw: Tensor) -> Tensor:
+        mean = self.mean_translation_m
+        depth_m = -mean[2] * torch.exp(_DEPTH * raw[:, 2])
+        across = depth_m[:, None] * (_SHIFT * raw[:, :2] - mean[:2] / mean[2])
+        return torch.cat([across, -depth_m[:, None]], 1)
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return asdict(self.settings)
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """What `as_metadata` describes, untrained; ValueError, TypeError or KeyError if it is none."""
+        form, counts = metadata["form"], (int(metadata["identity"]), int(metadata["expression"]))
+        x, y, z = (float(value) for value in metadata["mean_translation_m"])
+        if (
+            form not in _SIDES
+            or not all(0 <= count <= _MAX_COEFFICIENTS for count in counts)
+            or not -100 < z < 0
+        ):
+            raise ValueError(f"no Geometry Network has the settings {metadata}")
+        return cls(GeometrySettings(form, *counts, (x, y, z)))
+
+
+def _rotation(columns: Tensor) -> Tensor:
+    """Rotations [B, 3, 3] of their first two columns' differences [B, 6] from the identity's."""
+    identity = columns.new_tensor([1.0, 0, 0, 0, 1.0, 0])
+    first, second = (columns + identity).chunk(2, 1)
+    x = F.normalize(first, dim=1)
+    y = F.normalize(second - (x * second).sum(1, keepdim=True) * x, dim=1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], 2)
+
+
+def _alexnet() -> tuple[nn.Module, int]:
+    """All of AlexNet but its last layer."""
+
+    def convolution(channels: int, out: int, side: int, stride: int = 1, padding: int = 1) -> list[nn.Module]:
+        return [nn.Conv2d(channels, out, side, stride, padding), nn.ReLU()]
+
+    def full(channels: int, out: int) -> list[nn.Module]:
+        return [nn.Linear(channels, out), nn.ReLU()]
+
+    trunk = nn.Sequential(
+        *convolution(3, 64, 11, stride=4, padding=2),
+        nn.MaxPool2d(3, 2),
+        *convolution(64, 192, 5, padding=2),
+        nn.MaxPool2d(3, 2),
+        *convolution(192, 384, 3),
+        *convolution(384, 256, 3),
+        *convolution(256, 256, 3),
+        nn.MaxPool2d(3, 2),
+        nn.AdaptiveAvgPool2d(6),
+        nn.Flatten(),
+        *full(256 * 6 * 6, 4096),
+        *full(4096, 4096),
+    )
+    return trunk, 4096
+
+
+def _small() -> tuple[nn.Module, int]:
+    """Five halvings, each with a residual; the last cells keep their places, which pose and shape hang on."""
+    widths = (24, 48, 88, 144, 192)
+    stages = [_Stage(a, b) for a, b in zip((3, *widths), widths, strict=False)]
+    return nn.Sequential(*stages, nn.Flatten(), nn.Linear(widths[-1] * 3 * 3, 160), nn.SiLU()), 160
+
+
+class _Stage(nn.Module):
+    """Halve the side, then a convolution around which the input goes on."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=2, padding=1)
+        self.norm = nn.GroupNorm(8, channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = F.silu(self.norm(self.enter(x)))
+        result: Tensor = x + F.silu(self.inner(x))
+        return result
