@@ -16,6 +16,7 @@ from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.stage.baked_faces import Geometry, draw_sample
+from facerf_cli.stage.lids import lid_shadows
 from facerf_cli.stage.samples import Sample
 from facerf_cli.stage.shards import in_shards
 from facerf_cli.stage.views import build_views
@@ -74,21 +75,22 @@ def load_bank(geometries: Path, views: Path, provenance: dict[str, Any]) -> Bank
     if not heads:
         raise InputError(f"{geometries}: no baked heads with views; let `facerf train` build them anew")
     return Bank(
-        [_geometry(load_file(path)) for path in heads],
+        [geometry_of(load_file(path)) for path in heads],
         [load_file(views / path.name) for path in heads],
         provenance,
     )
 
 
-def _geometry(head: dict[str, Tensor]) -> Geometry:
+def geometry_of(head: dict[str, Tensor]) -> Geometry:
+    """The fields of one baked head, as `stage.geometries` writes it."""
     side = head["visibility"].shape[-1]
     positions = bake_attributes(head["vertices"], GRID, side)
     normals = normal_map(head["vertices"], grid_triangles(), side)
     along_u = F.normalize(_central_difference(positions, -1), dim=0)
     along_v = F.normalize(_central_difference(positions, -2), dim=0)
-    return Geometry(
-        positions, normals, (along_u, along_v), head["directions"], head["visibility"], head["bounce"]
-    )
+    lit = head["visibility"] * lid_shadows(head["directions"], side)
+    visibility = lit.round().byte()
+    return Geometry(positions, normals, (along_u, along_v), head["directions"], visibility, head["bounce"])
 
 
 def _central_difference(field: Tensor, dim: int) -> Tensor:

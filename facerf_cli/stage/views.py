@@ -58,7 +58,7 @@ def build_views(
     fitted texel; visible [W, T, T] bytes; normals [W, 3, T, T] half, camera-space, of the fit.
     """
     random = np.random.default_rng([seed, 1])
-    shots = [_photograph(vertices, random, settings) for _ in range(count)]
+    shots = [photograph_head(vertices, random, settings) for _ in range(count)]
     landmarks = torch.stack([shot.landmarks_px for shot in shots])
     fits = fit_batch(fitted_with, landmarks, crop_camera(settings.crop_px))
     triangles = grid_triangles()
@@ -86,8 +86,8 @@ def build_views(
 
 
 @dataclass(frozen=True)
-class _Shot:
-    """A head in camera space and what the crop makes of it."""
+class Shot:
+    """A head in camera space [V, 3] and what a crop by noisy landmarks makes of it."""
 
     vertices_camera: Tensor
     rotation: Tensor
@@ -95,7 +95,8 @@ class _Shot:
     landmarks_px: Tensor  # [68, 2], in the crop, with a detector's errors
 
 
-def _photograph(vertices: Tensor, random: np.random.Generator, settings: ViewSettings) -> _Shot:
+def photograph_head(vertices: Tensor, random: np.random.Generator, settings: ViewSettings) -> Shot:
+    """One random photograph of a head [V, 3] (head frame)."""
     frontal = random.random() < settings.frontal_share
     spread = np.array([settings.yaw_deg, settings.pitch_deg, settings.roll_deg]) * (0.3 if frontal else 1.0)
     pose = np.clip(random.normal(0, spread), -settings.limit_deg, settings.limit_deg)
@@ -121,7 +122,7 @@ def _photograph(vertices: Tensor, random: np.random.Generator, settings: ViewSet
         (photo.cy_px - crop.y0_px) * scale,
     )
     in_crop = torch.as_tensor(crop.to_crop(landmarks_px.numpy()), dtype=torch.float32)
-    return _Shot(vertices_camera, rotation, camera, in_crop)
+    return Shot(vertices_camera, rotation, camera, in_crop)
 
 
 def _detected(landmarks_px: Tensor, random: np.random.Generator, settings: ViewSettings) -> Tensor:
@@ -143,7 +144,7 @@ def _detected(landmarks_px: Tensor, random: np.random.Generator, settings: ViewS
     return landmarks_px + torch.from_numpy(error).float() * unit_px
 
 
-def _uv_picture(shot: _Shot) -> Tensor:
+def _uv_picture(shot: Shot) -> Tensor:
     """(u, v, 1) of the true surface [3, H, W], zero off the face."""
     triangles = grid_triangles()
     fragments = rasterize(shot.vertices_camera, triangles, shot.camera)
