@@ -19,9 +19,10 @@ _LOW, _HIGH = 2.5, 97.5  # percent
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over pictures, its 95 % interval over groups, and the pictures' own spread."""
+    """A mean over pictures, its 95 % interval over groups, and the pictures' own median and spread."""
 
     mean: float
+    median: float
     low: float
     high: float
     sd: float  # over pictures
@@ -45,9 +46,8 @@ def mean_interval(values: Iterable[tuple[Hashable, float]]) -> Interval | None:
         return None
     everything = np.concatenate([np.asarray(group, float) for group in by_group.values()])
     low, high = _percentiles(list(by_group.values()))
-    return Interval(
-        float(everything.mean()), low, high, float(everything.std()), len(everything), len(by_group)
-    )
+    mean, median, sd = (float(f(everything)) for f in (np.mean, np.median, np.std))
+    return Interval(mean, median, low, high, sd, len(everything), len(by_group))
 
 
 def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:

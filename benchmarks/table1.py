@@ -1,0 +1,186 @@
+"""The paper's Table 1 on a prepared dataset: Si-MSE of pictures of held-out people, same and different pose.
+
+    python benchmarks/table1.py --dataset DATASET [--split test] [--checkpoint FILE] [--json FILE]
+
+Every pair of the split (`facerf relight-dataset`) is taken as a user's photo is: the source picture is
+unwrapped by its fit, one light is predicted, and the texture is rendered into the target camera's crop. The
+error is of the linear picture inside the masked interior of the face, after the best single scale. Beside it
+stands the source's own texture under Lambert's cosine. The paper's figures are of other people, photographed
+in a light stage: they are printed for orientation, not as a bar.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from bootstrap import mean_interval
+from torch import Tensor
+
+from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.interior import interior_mask
+from facerf_cli.face.topology import grid_triangles, grid_uv
+from facerf_cli.files.images import read_image
+from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
+from facerf_cli.network.losses import si_mse
+from facerf_cli.pipeline import FaceTexture, Models, load_models, predict_olat, turn_to
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
+from facerf_cli.stage.data.dataset import SPLITS, Dataset, read_dataset
+from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs
+
+PAPER = {"same pose": (0.00070, 0.00059), "different pose": (0.00084, 0.00088)}  # its Table 1: mean, sd
+_SIDE = 256  # of textures, as the verbs have it
+_INSIDE = 0.9  # of the pixels that a texel shows, the share that must be face
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One pair's errors."""
+
+    subject: str
+    same_pose: bool
+    si_mse: float
+    lambert: float
+
+
+def main() -> None:
+    given = _arguments()
+    dataset = read_dataset(given.dataset)
+    models = load_models(given.checkpoint, given.face_model, torch.device("cpu"))
+    if models.face.name != dataset.face_model:
+        raise SystemExit(f"{given.dataset}: fitted with {dataset.face_model}; give that with --face-model")
+    pairs = [pair for pair in read_pairs(dataset) if given.split in ("all", pair.split)]
+    if not pairs:
+        raise SystemExit(f"{given.dataset}: no pairs in the split {given.split}; run facerf relight-dataset")
+    measured = list(measure(models, dataset, pairs[:: given.every]))
+    found = summary(measured) | {
+        "checkpoint": str(given.checkpoint or "shipped"),
+        "split": given.split,
+        "people": len({m.subject for m in measured}),
+    }
+    print(table(found))
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--dataset", type=Path, required=True, help="of prepare-dataset and relight-dataset")
+    add("--split", default="test", choices=[*SPLITS, "all"], help="all: of a dataset never trained on")
+    add("--checkpoint", type=Path, help="default: the one shipped")
+    add("--face-model", default="builtin", help="that the dataset was fitted with")
+    add("--every", type=int, default=1, help="take every Nth pair only")
+    add("--json", type=Path, help="write all figures here")
+    return parser.parse_args()
+
+
+@torch.no_grad()
+def measure(models: Models, dataset: Dataset, pairs: list[Pair]) -> Iterator[Measured]:
+    """The errors of pairs."""
+    for subject, of_subject in groupby(pairs, lambda pair: pair.subject):
+        stacks = {camera: dataset.stack_path(subject, camera) for camera in dataset.cameras[subject]}
+        views = {camera: View.of(models, read_olat_header(stack)) for camera, stack in stacks.items()}
+        for pair in of_subject:
+            path = picture_path(dataset, *pair.key)
+            yield _measure_pair(models, pair, path, stacks[pair.target_camera], views)
+
+
+def _measure_pair(models: Models, pair: Pair, path: Path, stack: Path, views: dict[str, "View"]) -> Measured:
+    """The errors of one pair: `path` is its source, `stack` holds its target."""
+    source, target = views[pair.source_camera], views[pair.target_camera]
+    fit, face = source.fit, source.texture_of(path)
+    if not torch.equal(fit.alpha, target.fit.alpha):  # fits of the same camera, or joint ones, are alike
+        target = View.of(models, target.header, replace(target.fit, alpha=fit.alpha, beta=fit.beta))
+    light = torch.from_numpy(target.header.directions[pair.target_light]).float()
+    turn = turn_to(fit, target.fit.rotation)
+    predicted = next(predict_olat(models, face, light[None], turn))[0]
+    cosine = torch.einsum("c,dc,dij->ij", light, turn, face.normals).clamp_min(0)
+    truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
+    errors = (target.error(texture, truth) for texture in (predicted, face.texture * cosine))
+    return Measured(pair.subject, pair.source_camera == pair.target_camera, *errors)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A stack's crop, and what of the fitted face each of its pixels sees."""
+
+    header: StackHeader
+    fit: FaceFit
+    vertices: Tensor  # [V, 3] camera space
+    uv: Tensor  # [H, W, 2]
+    mask: Tensor  # [1, H, W] in 0..1
+
+    @staticmethod
+    def of(models: Models, header: StackHeader, fit: FaceFit | None = None) -> "View":
+        """A stack seen with its own fit, or another."""
+        fit = fit or fit_from_arrays(header.fit)
+        vertices = fit.vertices_camera(models.face)
+        fragments = rasterize(vertices, grid_triangles(), fit.camera)
+        uv = interpolate(grid_uv(), grid_triangles(), fragments)
+        seen = torch.from_numpy(header.seen).float()
+        return View(header, fit, vertices, uv, interior_mask(vertices, fragments, uv, _SIDE) * seen)
+
+    def texture_of(self, path: Path) -> FaceTexture:
+        """A source picture in the chart, as `pipeline.unwrap_face` has a photo."""
+        if not path.is_file():
+            raise SystemExit(f"{path}: no such source; run facerf relight-dataset without --lazy")
+        planes = np.dstack([read_image(path).pixels, self.header.seen]).astype(np.float32)
+        picture = torch.from_numpy(planes).permute(2, 0, 1)
+        unwrapped, visible = unwrap(picture, self.vertices, grid_triangles(), self.fit.camera, _SIDE)
+        visible = visible * (unwrapped[3] > _INSIDE)
+        normals = normal_map(self.vertices, grid_triangles(), _SIDE)
+        return FaceTexture(inpaint(unwrapped[:3], visible), visible, normals)
+
+    def error(self, texture: Tensor, truth: Tensor) -> float:
+        """Si-MSE of a texture [3, T, T] rendered into the crop, to a picture [3, H, W]."""
+        picture = sample_texture(texture, self.uv).permute(2, 0, 1)
+        return float(si_mse(picture[None, None], truth[None, None], self.mask[None]))
+
+
+def summary(measured: list[Measured]) -> dict[str, Any]:
+    """Figures by pose, and each person's mean."""
+    rows = {}
+    for name, same in (("same pose", True), ("different pose", False)):
+        chosen = [m for m in measured if m.same_pose is same]
+        if not chosen:
+            continue
+        ours = mean_interval((m.subject, m.si_mse) for m in chosen)
+        naive = mean_interval((m.subject, m.lambert) for m in chosen)
+        assert ours and naive
+        people = {
+            subject: float(np.mean([m.si_mse for m in chosen if m.subject == subject]))
+            for subject in sorted({m.subject for m in chosen})
+        }
+        rows[name] = {"si_mse": ours.as_dict(), "lambert": naive.as_dict(), "people": people}
+    return {"rows": rows, "paper": PAPER}
+
+
+def table(found: dict[str, Any]) -> str:
+    """The figures for reading."""
+    head = f"{'':16}{'n':>5}{'Si-MSE':>9} (sd)      {'95 % interval':21}{'Lambert':>8}"
+    head += "   paper, on its own data (sd)"
+    lines = [f"{found['people']} synthetic people, split {found['split']}, {found['checkpoint']}", head]
+    for name, row in found["rows"].items():
+        ours, (mean, sd) = row["si_mse"], found["paper"][name]
+        lines.append(
+            f"{name:16}{ours['pictures']:5}{ours['mean']:9.5f} ({ours['sd']:.5f}) "
+            f"[{ours['low']:.5f}, {ours['high']:.5f}]   {row['lambert']['mean']:8.5f}   {mean:.5f} ({sd:.5f})"
+        )
+    for name, row in found["rows"].items():
+        if len(row["people"]) <= 12:
+            each = ", ".join(f"{person} {mean:.5f}" for person, mean in row["people"].items())
+            lines.append(f"  {name}, by person: {each}")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
