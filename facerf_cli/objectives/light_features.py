@@ -28,15 +28,16 @@ _SHEET_FACES = 6
 class LightTextures:
     """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
 
-    The lights are unit vectors in the head's own frame.
+    The lights are unit vectors in the head's own frame; `heads` [B] are the heads' numbers.
     """
 
     textures: Tensor
     lights_head: Tensor
+    heads: Tensor
 
     def to(self, device: torch.device) -> "LightTextures":
         """The same batch on `device`."""
-        return LightTextures(self.textures.to(device), self.lights_head.to(device))
+        return LightTextures(self.textures.to(device), self.lights_head.to(device), self.heads)
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,8 @@ class LightFeaturesObjective(Objective):
 
     def forward(self, batch: LightTextures) -> dict[str, Tensor]:
         """The one term, a mean over faces and their lights."""
-        return {"light": 1 - _cosines(self._network(), batch).mean()}
+        with self.mixed_precision():
+            return {"light": 1 - _cosines(self._network(), batch).mean()}
 
     @torch.no_grad()
     def validate(self) -> Validation:
@@ -115,12 +117,14 @@ class LightFeaturesObjective(Objective):
         sample = self.source.draw(heads, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
         head_to_camera = _rotations(self.mean_normals, _small(sample.normals_target))
-        return LightTextures(sample.target * seen[:, None], sample.lights @ head_to_camera)  # rows: R^T w
+        lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
+        return LightTextures(sample.target * seen[:, None], lights_head, heads)
 
 
 def _one_by_one(batch: LightTextures) -> Iterator[LightTextures]:
     for i in range(len(batch.textures)):
-        yield LightTextures(batch.textures[i : i + 1], batch.lights_head[i : i + 1])
+        one = slice(i, i + 1)
+        yield LightTextures(batch.textures[one], batch.lights_head[one], batch.heads[one])
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
