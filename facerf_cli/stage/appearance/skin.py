@@ -65,7 +65,7 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     albedo = albedo * (1 - mouth) + mouth * slit
     shine = torch.exp(_uniform(faces, -0.5, 0.5, generator))
     smoothness = 0.24 * _uniform(faces, 0, 1, generator) ** 2 - 0.06
-    specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp_min(0.16)
+    specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp(0.16, 0.85)
     return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
 
 
