@@ -8,7 +8,7 @@ SIDE = 128
 
 
 def _through(*directions: tuple[float, float, float]) -> torch.Tensor:
-    return lid_shadows(F.normalize(torch.tensor(directions), dim=-1), SIDE)
+    return lid_shadows(F.normalize(torch.tensor(directions, dtype=torch.float32), dim=-1), SIDE)
 
 
 def test_a_light_from_the_front_reaches_the_eyes_and_steeper_ones_less_and_less() -> None:
