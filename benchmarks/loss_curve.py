@@ -83,20 +83,23 @@ def draw_chart(
     last = max(loss[-1, 0] for loss in losses if len(loss))
     left, right = _Axis(losses, last), _Axis([*validations, np.zeros((0, 2))], last)
     _draw_axes(draw, left, right, last, titles)
-    for number, (loss, validation, name) in enumerate(zip(losses, validations, names, strict=True)):
-        colour = _COLOURS[number % len(_COLOURS)]
-        faint = tuple(255 - (255 - part) // 4 for part in colour)
-        draw.line(left.places(loss), fill=faint, width=1)
-        if not len(loss):
-            continue
-        window = min(max(3, round(_WINDOW * len(loss))), len(loss))
-        mean = np.exp(uniform_filter1d(np.log(loss[:, 1]), window, mode="mirror"))
-        smooth = np.column_stack([loss[:, 0], mean])
-        draw.line(left.places(smooth), fill=colour, width=2 * _SCALE)
-        for x, y in right.places(validation):
+    colours = [_COLOURS[number % len(_COLOURS)] for number in range(len(losses))]
+    for loss, colour in zip(losses, colours, strict=True):
+        draw.line(left.places(loss), fill=tuple(255 - (255 - part) // 4 for part in colour), width=1)
+    for number, (loss, colour) in enumerate(zip(losses, colours, strict=True)):
+        draw.line(left.places(_smoothed(loss)), fill=colour, width=2 * _SCALE)
+        for x, y in right.places(validations[number]):
             draw.ellipse([x - 7, y - 7, x + 7, y + 7], outline="black", fill=colour)
-        _text(draw, (_BOX[2] - 180, _BOX[1] + 8 + 18 * number), name, colour)
+        _text(draw, (_BOX[2] - 180, _BOX[1] + 8 + 18 * number), names[number], colour)
     return image.resize(_SIZE_PX, Image.Resampling.LANCZOS)
+
+
+def _smoothed(loss: Curve) -> Curve:
+    """The running geometric mean."""
+    if not len(loss):
+        return loss
+    window = min(max(3, round(_WINDOW * len(loss))), len(loss))
+    return np.column_stack([loss[:, 0], np.exp(uniform_filter1d(np.log(loss[:, 1]), window, mode="mirror"))])
 
 
 class _Axis:
@@ -137,9 +140,9 @@ def _draw_axes(
     for step in np.arange(0, last + 1, max(width, 1)):
         x = _BOX[0] + step / last * (_BOX[2] - _BOX[0])
         _text(draw, (x - 15, _BOX[3] + 8), f"{step:.0f}", (0, 0, 0))
-    _text(draw, (_BOX[0] + 8, _BOX[1] + 6), f"{titles[0]} (lines, left)", (0, 0, 0))
+    _text(draw, (_BOX[0] + 320, _BOX[1] + 8), f"{titles[0]} (lines, left)", (0, 0, 0))
     if not right.empty:
-        _text(draw, (_BOX[0] + 8, _BOX[1] + 24), f"validation {titles[1]} (points, right)", (0, 0, 0))
+        _text(draw, (_BOX[0] + 320, _BOX[1] + 26), f"validation {titles[1]} (points, right)", (0, 0, 0))
     _text(draw, ((_BOX[0] + _BOX[2]) / 2 - 15, _BOX[3] + 30), "step", (0, 0, 0))
 
 

@@ -1,0 +1,139 @@
+"""MODEL_CARD.md's tables from what the benchmarks wrote with --json, so that no figure is typed.
+
+    python benchmarks/model_card.py yale.json synthetic.json table1.json ablations.json training_speed.json
+
+Prints Markdown, a table a file, each told by what it holds. A figure is given with its 95 % interval.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+Table = dict[str, Any]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("files", type=Path, nargs="+", help="written by --json")
+    for path in parser.parse_args().files:
+        found = json.loads(path.read_text())
+        for key, write in WRITERS.items():
+            if key in found:
+                print("\n".join(write(found)) + "\n")
+                break
+        else:
+            raise SystemExit(f"{path}: not what a benchmark writes with --json")
+
+
+def _interval(part: Table, digits: int) -> str:
+    """A mean with its interval, zeros before the point left out."""
+    mean, low, high = (f"{part[key]:.{digits}f}".replace("0.", ".", 1) for key in ("mean", "low", "high"))
+    return f"{mean} [{low}, {high}]"
+
+
+def yale(found: Table) -> list[str]:
+    """Extended Yale B: a row a column of the benchmark."""
+    if not found["whole"]:
+        raise SystemExit("Extended Yale B: a part of the subjects; published figures are of all of them")
+    lines = [
+        f"| {len(found['subjects'])} subjects, {len(found['checkpoints'])} seeds | n | Si-MSE | SSIM "
+        "| Si-MSE by seed | DPR | GeomConsistentFR | quotient image | bar | aim |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, column in found["columns"].items():
+        error, alike, published = column["si_mse"], column["ssim"], column["published"]
+        seeds = " · ".join(f"{mean:.4f}".lstrip("0") for mean in error["seeds"])
+        others = [
+            f"{a:.4f}".lstrip("0") + ("" if b is None else f" / {b:.3f}".replace("0.", "."))
+            for a, b in published.values()
+        ]
+        verdicts = [_word(column.get("bar", {}).get("mean")), _word(column.get("aim"))]
+        cells = [name, error["pictures"], _interval(error, 4), _interval(alike, 3), seeds, *others, *verdicts]
+        lines.append(_row(cells))
+    return lines
+
+
+def synthetic(found: Table) -> list[str]:
+    """Held-out heads: by pose and angle, then by skin tone."""
+    lines = ["| held-out heads | n | Si-MSE | median | sd | Lambert |", "|---|---|---|---|---|---|"]
+    lines += [_row([name, *_errors(row)]) for name, row in found["rows"].items() if row["si_mse"]]
+    lines += [
+        "",
+        "| skin | n | Si-MSE | median | sd | Lambert | tone drift, degrees of ITA | its mean size |",
+    ]
+    lines += ["|---|---|---|---|---|---|---|---|"]
+    for name, row in found["tones"].items():
+        if row["si_mse"]:
+            drift = row["drift_deg"]
+            shown = (
+                "" if drift is None else f"{drift['mean']:+.1f} [{drift['low']:+.1f}, {drift['high']:+.1f}]"
+            )
+            size = "" if drift is None else f"{row['drift_size_deg']['mean']:.1f}"
+            lines.append(_row([name, *_errors(row), shown, size]))
+    return lines
+
+
+def _errors(row: Table) -> list[Any]:
+    ours = row["si_mse"]
+    spread = [f"{ours['median']:.5f}", f"{ours['sd']:.5f}", f"{row['lambert']['mean']:.5f}"]
+    return [ours["pictures"], _interval(ours, 5), *spread]
+
+
+def table1(found: Table) -> list[str]:
+    """The paper's Table 1."""
+    lines = [
+        f"| {found['people']} synthetic people | n | Si-MSE (sd) | 95 % interval | Lambert "
+        "| the paper, on its own data (sd) |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, row in found["rows"].items():
+        ours, (mean, sd) = row["si_mse"], found["paper"][name]
+        cells = [f"{ours['mean']:.5f} ({ours['sd']:.5f})", f"[{ours['low']:.5f}, {ours['high']:.5f}]"]
+        lambert = f"{row['lambert']['mean']:.5f}"
+        lines.append(_row([name, ours["pictures"], *cells, lambert, f"{mean:.5f} ({sd:.5f})"]))
+    return lines
+
+
+def ablations(found: Table) -> list[str]:
+    """The paper's ablations: a column a run."""
+    names = list(found["ablations"])
+    lines = [_row([f"Si-MSE (sd), {found['steps']} steps each", *names]), "|---" * (len(names) + 1) + "|"]
+    for row in ("same pose", "different pose"):
+        cells = [found["ablations"][name]["rows"][row]["si_mse"] for name in names]
+        lines.append(_row([row, *(f"{cell['mean']:.5f} ({cell['sd']:.5f})" for cell in cells)]))
+    return lines
+
+
+def speed(found: Table) -> list[str]:
+    """Steps per second of training."""
+    lines = [
+        "| preset | steps a second | bare loop | ratio | waiting on data |",
+        "|---|---|---|---|---|",
+    ]
+    for name, row in found["presets"].items():
+        rates = [f"{row['steps_per_s']:.2f}", f"{row['bare_steps_per_s']:.2f}", f"{row['ratio']:.2f}"]
+        lines.append(_row([name, *rates, f"{100 * row['waiting']:.1f} %"]))
+    return lines
+
+
+def _row(cells: list[Any]) -> str:
+    return "| " + " | ".join(str(cell) for cell in cells) + " |"
+
+
+def _word(held: bool | None) -> str:
+    return "" if held is None else "yes" if held else "no"
+
+
+WRITERS = {
+    "columns": yale,
+    "tones": synthetic,
+    "paper": table1,
+    "ablations": ablations,
+    "presets": speed,
+}
+
+if __name__ == "__main__":
+    main()
