@@ -193,14 +193,14 @@ def open_captured(
             f"{folder}: fitted with the face model {dataset.face_model}, not {model.name}; give --fit-with"
         )
     subjects = [*dataset.splits["train"], *dataset.splits["validation"]]
-    captured = Captured(dataset, model, side, _provenance(dataset, model), {}, rig_lights)
+    captured = Captured(dataset, model, side, provenance_of(dataset, model), {}, rig_lights)
     captured.heads(1)  # a split without subjects is named before anything is unwrapped
     build_textures(dataset, face_model, side, subjects, jobs)
     written = {subject: sources_path(dataset, side, subject) for subject in subjects}
     return replace(captured, sources={name: path for name, path in written.items() if path.exists()})
 
 
-def _provenance(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
+def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
     name = dataset.folder.resolve().name
     return {
         "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",

@@ -1,0 +1,268 @@
+"""Stage `joint`: both networks through the differentiable rasterizer, under all of the paper's terms.
+
+Source and target crops give two heads; the source unwrapped with its own, relit by the Reflectance Network
+and rendered with the target's is compared with the target (paper, 'Loss Functions'). A share of the batches
+are photos of faces, for the terms of geometry alone (paper, 'Training').
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.network.features import Layered
+from facerf_cli.network.geometry import GeometryEstimate
+from facerf_cli.network.inputs import resize
+from facerf_cli.network.losses import si_mse
+from facerf_cli.network.paper_losses import (
+    PaperWeights,
+    Seen,
+    appearance_loss,
+    landmark_loss,
+    light_loss,
+    photometric_loss,
+    regularisation,
+)
+from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.objectives.posed_heads import (
+    LANDMARKS,
+    PosedHeads,
+    head_normals,
+    pose_heads,
+    render_textures,
+    unwrap_pictures,
+)
+from facerf_cli.raster.camera import Camera, crop_camera
+from facerf_cli.stage.data.captured import Captured, provenance_of
+from facerf_cli.stage.data.crops import CropPairs, open_pairs, spread_pairs
+from facerf_cli.stage.data.dataset import Dataset
+from facerf_cli.stage.data.recipes import Pair
+from facerf_cli.stage.photos import PhotoCrops, Photos
+
+_PAPER = PaperWeights()
+_DARK = 1e-4  # radiance; networks take square roots, whose slope ends before it is infinite
+_SHEET_ROWS, _SHEET_PX = 8, 256
+
+
+@dataclass(frozen=True)
+class JointSettings:
+    """The paper's, but for what the ablations leave out."""
+
+    crop_px: int = 512
+    texture_side: int = 512
+    photos_share: float = 0.2  # of the batches, where there are photos
+    mean_face: bool = False  # pose alone: alpha = beta = 0 (paper, 'Ablative Study')
+    weights: PaperWeights = _PAPER
+    validation_pairs: int = 12  # of each kind: the source's own pose, and another
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class _Relit:
+    """What both networks make of pairs of crops."""
+
+    target: PosedHeads
+    texture: Tensor  # [B, 3, T, T] predicted
+    picture: Tensor  # [B, 3, S, S], it rendered
+    mask: Tensor  # [B, 1, S, S] M_t
+
+
+class JointObjective(Objective):
+    """The paper's loss over a prepared dataset's pairs, and photos.
+
+    `appearance` is V_f, `light` S_f; without one its term is left out. They are frozen, and are not saved.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        model: MorphableModel,
+        reflectance: nn.Module,
+        geometry: nn.Module,
+        appearance: nn.Module | None = None,
+        light: nn.Module | None = None,
+        photos: Photos | None = None,
+        settings: JointSettings = JointSettings(),
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleDict({"reflectance": reflectance, "geometry": geometry})
+        self.chooses_by = "si_mse"
+        self.provenance = _provenance(dataset, model, photos, appearance is not None, light is not None)
+        self.settings = settings
+        self.photos = photos
+        self.feature_networks = nn.ModuleDict(
+            {
+                name: network.requires_grad_(False).eval()
+                for name, network in (("appearance", appearance), ("light", light))
+                if network is not None
+            }
+        )
+        self.camera = crop_camera(settings.crop_px)
+        self._model = model
+        self._train = open_pairs(dataset, "train", settings.crop_px)
+        self._held_out = open_pairs(dataset, "validation", settings.crop_px)
+        self._validation: dict[str, list[CropPairs]] | None = None
+        if isinstance(reflectance, ReflectanceNetwork) and not reflectance.mean_normals.any():
+            rig_lights = reflectance.settings.rig_lights
+            reflectance.set_mean_face(*Captured(dataset, model, 0, {}, {}, rig_lights).mean_face())
+
+    def draw(
+        self, count: int, generator_of: Callable[[int], torch.Generator], step: int
+    ) -> CropPairs | PhotoCrops:
+        """`count` pairs, or, on `photos_share` of the steps, photos."""
+        generators = [generator_of(i) for i in range(count)]
+        chance = torch.rand((), generator=seeded(self.settings.seed, step))
+        if self.photos is not None and chance < self.settings.photos_share:
+            return concatenate([self.photos.draw(generator) for generator in generators])
+        return concatenate([self._train.draw(generator) for generator in generators])
+
+    def forward(self, batch: CropPairs | PhotoCrops) -> dict[str, Tensor]:
+        """The weighed terms: landmarks and regularisation of either, the others of pairs alone."""
+        if isinstance(batch, PhotoCrops):
+            estimate, heads = self._heads(batch.crops)
+            terms = self._geometry_terms(estimate, heads, batch.landmarks_px)
+            return {name: term.mean() for name, term in terms.items()}
+        estimate, heads = self._heads(torch.cat([batch.source, batch.target]))
+        detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
+        terms = self._geometry_terms(estimate, heads, detected_px)
+        # a mean over twice the samples, times two: source and target each add theirs
+        result = {name: 2 * term.mean() for name, term in terms.items()}
+        relit = self._relit(batch, heads)
+        return result | {name: term.mean() for name, term in self._picture_terms(batch, relit).items()}
+
+    def _heads(self, crops: Tensor) -> tuple[GeometryEstimate, PosedHeads]:
+        with self.mixed_precision():
+            raw = self.networks["geometry"](crops)
+        estimate = GeometryEstimate(*(tensor.float() for tensor in raw))
+        if self._model.mean.device != crops.device:
+            self._model = self._model.to(crops.device)
+        return estimate, pose_heads(self._model, estimate, self.settings.mean_face)
+
+    def _geometry_terms(
+        self, estimate: GeometryEstimate, heads: PosedHeads, detected_px: Tensor
+    ) -> dict[str, Tensor]:
+        """L_l and L_r of each picture [B]."""
+        weights = self.settings.weights
+        found_px = heads.landmarks_px(detected_px, self.camera)
+        landmarks = landmark_loss(found_px, detected_px[:, list(LANDMARKS)], self.settings.crop_px)
+        terms = {"landmarks": weights.landmarks * landmarks}
+        if not self.settings.mean_face:
+            prior = regularisation(estimate.alpha, estimate.beta, weights)
+            terms["regularisation"] = weights.regularisation * prior
+        return terms
+
+    def _relit(self, batch: CropPairs, heads: PosedHeads) -> _Relit:
+        """The sources of pairs in the light and pose of their targets; heads are of both, sources first."""
+        side, count = self.settings.texture_side, len(batch.source)
+        source, target = _part(heads, slice(None, count)), _part(heads, slice(count, None))
+        face = unwrap_pictures(batch.source, source, self.camera, side)
+        normals = head_normals(target, side)
+        network: Any = self.networks["reflectance"]
+        with self.mixed_precision():
+            encoded = network.encode(face.texture.clamp_min(_DARK), face.normals, face.visible)
+            texture = network.decode(encoded, normals, batch.light[:, None])[:, 0]
+        picture, mask = render_textures(texture.float(), target, self.camera)
+        return _Relit(target, texture.float(), picture, mask)
+
+    def _picture_terms(self, batch: CropPairs, relit: _Relit) -> dict[str, Tensor]:
+        """L_p, L_I and L_L of each pair [B]."""
+        weights = self.settings.weights
+        photometric = photometric_loss(relit.picture, batch.target, relit.mask)
+        terms = {"photometric": weights.photometric * photometric}
+        if not self.feature_networks:
+            return terms
+        with torch.no_grad():
+            truth = unwrap_pictures(batch.target, relit.target, self.camera, self.settings.texture_side)
+        texture = Seen(relit.texture, truth.texture, (truth.visible > 0).float())
+        with self.mixed_precision():
+            if "appearance" in self.feature_networks:
+                image = Seen(relit.picture, batch.target, relit.mask)
+                appearance = appearance_loss(self._features("appearance"), image, texture)
+                terms["appearance_features"] = weights.features * appearance
+            if "light" in self.feature_networks:
+                terms["light_features"] = weights.features * light_loss(self._features("light"), texture)
+        return terms
+
+    def _features(self, name: str) -> Layered:
+        network: Any = self.feature_networks[name]
+        return network
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Si-MSE in the image (paper, 'Reflectance'), for the source's own pose and another, and landmarks.
+
+        `landmarks_iod` is the mean distance of the 66 over that of the outer eye corners.
+        """
+        if self._validation is None:
+            self._validation = self._held_out_pairs()
+        metrics: dict[str, float] = {}
+        errors, distances, rows = [], [], []
+        device = next(self.networks.parameters()).device
+        for kind, pairs in self._validation.items():
+            of_kind = []
+            for index, pair in enumerate(pairs):
+                batch = pair.to(device)
+                _, heads = self._heads(torch.cat([batch.source, batch.target]))
+                relit = self._relit(batch, heads)
+                of_kind.append(si_mse(relit.picture[:, None], batch.target[:, None], relit.mask))
+                distances.append(_landmark_error(heads, batch, self.camera))
+                if index < _SHEET_ROWS // 2:
+                    rows.append(_sheet_row(batch, relit, self.camera))
+            metrics[f"si_mse_{kind}"] = float(torch.cat(of_kind).mean())
+            metrics[f"si_mse_{kind}_std"] = float(torch.cat(of_kind).std(correction=0))
+            errors += of_kind
+        metrics["si_mse"] = float(torch.cat(errors).mean())
+        metrics["landmarks_iod"] = float(torch.cat(distances).mean())
+        return Validation(metrics, np.concatenate(rows))
+
+    def _held_out_pairs(self) -> dict[str, list[CropPairs]]:
+        """By kind, what the validation looks at; a dataset of one camera has no other pose."""
+
+        def same(pair: Pair) -> bool:
+            return pair.source_camera == pair.target_camera
+
+        kinds = {"same_pose": same, "other_pose": lambda pair: not same(pair)}
+        chosen = {
+            kind: spread_pairs(self._held_out, self.settings.validation_pairs, wanted)
+            for kind, wanted in kinds.items()
+        }
+        return {
+            kind: [self._held_out.read(pair) for pair in pairs] for kind, pairs in chosen.items() if pairs
+        }
+
+
+def _part(heads: PosedHeads, which: slice) -> PosedHeads:
+    return PosedHeads(heads.vertices[which], heads.rotation[which], heads.fixed_landmarks[which])
+
+
+def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:
+    """Mean distance of the 66 landmarks over that of the outer eye corners, of sources and targets [2 B]."""
+    detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
+    distance_px = (heads.landmarks_px(detected_px, camera) - detected_px[:, list(LANDMARKS)]).norm(dim=-1)
+    left, right = (detected_px[:, corner] for corner in OUTER_EYE_CORNERS)
+    return distance_px.mean(1) / (left - right).norm(dim=-1)
+
+
+def _sheet_row(batch: CropPairs, relit: _Relit, camera: Camera) -> np.ndarray:
+    """Source, target, prediction in M_t, and the target's normals as found [S, 4 S, 3] of the first pair."""
+    normals = head_normals(relit.target, _SHEET_PX)
+    shape, _ = render_textures((normals + 1) / 4, relit.target, camera)
+    pictures = (batch.source, batch.target, relit.picture * relit.mask, shape)
+    row = torch.cat([resize(picture[:1], min(_SHEET_PX, camera.width_px))[0] for picture in pictures], -1)
+    result: np.ndarray = row.permute(1, 2, 0).cpu().numpy()
+    return result
+
+
+def _provenance(
+    dataset: Dataset, model: MorphableModel, photos: Photos | None, appearance: bool, light: bool
+) -> dict[str, Any]:
+    """The dataset's, and what else the networks learnt from."""
+    terms = [name for name, there in (("V_f", appearance), ("S_f", light)) if there]
+    found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
+    return provenance_of(dataset, model) | found

@@ -1,0 +1,104 @@
+"""Heads as the Geometry Network finds them: meshes in the fixed camera, landmarks, textures and pictures.
+
+The differentiable path of the joint stage, from coefficients and pose to pixels (paper, 'Network
+Architecture'): gradients run through the mesh, the unwrapped texture, the normals and the rendered picture.
+Which vertex is a contour landmark, which texel is seen and which triangle a pixel sees are constants.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from facerf_cli.face.interior import interior_mask
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.silhouette import silhouette_ids
+from facerf_cli.face.topology import CONTOUR, INNER_MOUTH_CORNERS, grid_triangles, grid_uv
+from facerf_cli.network.geometry import GeometryEstimate
+from facerf_cli.network.paper_losses import slid_contour
+from facerf_cli.raster.camera import Camera, project
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
+
+FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)
+LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011), sliding ones first
+
+
+@dataclass(frozen=True)
+class PosedHeads:
+    """B meshes in camera space [B, V, 3], their rotations head_to_camera [B, 3, 3] and fixed landmarks."""
+
+    vertices: Tensor
+    rotation: Tensor
+    fixed_landmarks: Tensor  # [B, 49, 3] camera space
+
+    def landmarks_px(self, detected_px: Tensor, camera: Camera) -> Tensor:
+        """L(v): where the 66 `LANDMARKS` lie [B, 66, 2]; detected_px [B, 68, 2] tells the contour's place."""
+        px = project(self.vertices, camera)
+        outline = silhouette_ids(px, self.rotation)
+        outline_px = px.gather(1, outline[..., None].expand(-1, -1, 2))
+        contour_px = slid_contour(outline_px, detected_px[:, list(CONTOUR)])
+        return torch.cat([contour_px, project(self.fixed_landmarks, camera)], 1)
+
+
+def pose_heads(model: MorphableModel, estimate: GeometryEstimate, mean_face: bool = False) -> PosedHeads:
+    """v^c = R v(alpha, beta) + t of the leading shapes of the model; `mean_face` leaves the shapes out."""
+    head = leading(model, estimate.alpha.shape[1], estimate.beta.shape[1])
+    alpha, beta = estimate.alpha, estimate.beta
+    if mean_face:
+        alpha, beta = torch.zeros_like(alpha), torch.zeros_like(beta)
+    turned = head.vertices(alpha, beta) @ estimate.rotation.mT
+    vertices = turned + estimate.translation_m[:, None]
+    return PosedHeads(vertices, estimate.rotation, head.landmarks(vertices)[:, list(FIXED_LANDMARKS)])
+
+
+def leading(model: MorphableModel, identities: int, expressions: int) -> MorphableModel:
+    """The model without the shapes that a Geometry Network of so many coefficients does not know."""
+    return MorphableModel(
+        model.name,
+        model.licence,
+        model.mean,
+        model.identity[:identities],
+        model.expression[:expressions],
+        model.expression_names[:expressions],
+    )
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """B textures [B, 3, T, T], unseen texels filled; how well seen [B, 1, T, T]; normals [B, 3, T, T]."""
+
+    texture: Tensor
+    visible: Tensor
+    normals: Tensor
+
+
+def unwrap_pictures(pictures: Tensor, heads: PosedHeads, camera: Camera, side: int) -> Unwrapped:
+    """T_s and N_s of pictures [B, 3, S, S] of the heads."""
+    triangles = grid_triangles().to(pictures.device)
+    faces = []
+    for picture, vertices in zip(pictures, heads.vertices, strict=True):
+        texture, visible = unwrap(picture, vertices, triangles, camera, side)
+        faces.append((inpaint(texture, visible), visible[None], normal_map(vertices, triangles, side)))
+    textures, seen, normals = (torch.stack(parts) for parts in zip(*faces, strict=True))
+    return Unwrapped(textures, seen, normals)
+
+
+def head_normals(heads: PosedHeads, side: int) -> Tensor:
+    """N_t: camera-space normal maps [B, 3, T, T] of the heads."""
+    triangles = grid_triangles().to(heads.vertices.device)
+    return torch.stack([normal_map(vertices, triangles, side) for vertices in heads.vertices])
+
+
+def render_textures(textures: Tensor, heads: PosedHeads, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Pictures [B, C, S, S] of textures [B, C, T, T] on the heads, and M_t [B, 1, S, S] in 0..1."""
+    device = textures.device
+    triangles, uv = grid_triangles().to(device), grid_uv().to(device)
+    pictures, masks = [], []
+    for texture, vertices in zip(textures, heads.vertices, strict=True):
+        fragments = rasterize(vertices, triangles, camera)
+        seen_uv = interpolate(uv, triangles, fragments)
+        covered = fragments.covered[..., None].to(texture.dtype)
+        pictures.append((sample_texture(texture, seen_uv) * covered).permute(2, 0, 1))
+        masks.append(interior_mask(vertices, fragments, seen_uv, texture.shape[-1]))
+    return torch.stack(pictures), torch.stack(masks)
