@@ -11,10 +11,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.checkpoints import load_checkpoint, save_checkpoint
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 FORMS: dict[tuple[str, str], type[Any]] = {  # by what a network is for, and its form
     ("reflectance", "default"): ReflectanceNetwork,
+    ("reflectance", "paper"): PaperReflectanceNetwork,
     ("geometry", "default"): GeometryNetwork,
     ("geometry", "paper"): GeometryNetwork,
     ("light_features", "vgg"): LightNetwork,

@@ -96,6 +96,7 @@ class JointObjective(Objective):
         self.provenance = _provenance(dataset, model, photos, appearance is not None, light is not None)
         self.settings = settings
         self.photos = photos
+        self.skips_networks = photos is not None  # which teach the geometry alone
         self.feature_networks = nn.ModuleDict(
             {
                 name: network.requires_grad_(False).eval()

@@ -1,4 +1,6 @@
 import json
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -6,6 +8,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork, PaperReflectanceSettings
+from facerf_cli.network.saved import load_networks, save_networks
 
 SMALL = PaperReflectanceSettings(side=32, widths=(8, 8, 12, 16), features=8)
 
@@ -133,6 +136,18 @@ def test_metadata_makes_the_same_network() -> None:
         PaperReflectanceNetwork.from_metadata({"form": "paper", "depth": 3})
     with pytest.raises(ValueError, match="halved 4 times"):
         PaperReflectanceNetwork(PaperReflectanceSettings(40, (8, 8, 8, 8)))
+
+
+def test_a_checkpoint_gives_the_same_network(network: PaperReflectanceNetwork, tmp_path: Path) -> None:
+    save_networks(tmp_path / "a.safetensors", {"reflectance": network}, {"layout_version": 1})
+    loaded: Any = load_networks(tmp_path / "a.safetensors", 1)[0]["reflectance"]
+    texture, normals, visible = _face(32)
+    with torch.no_grad():
+        one, other = (
+            net.decode(net.encode(texture, normals, visible), normals, _lights(1))
+            for net in (network, loaded)
+        )
+    assert torch.allclose(one, other, atol=2e-3)  # weights are kept in half precision
 
 
 def test_every_weight_learns() -> None:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.fit import fit_from_arrays
+from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.network.inputs import resize
@@ -27,6 +27,7 @@ from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs
 from facerf_cli.stage.data.relighting import relit_pictures
 
 _VIEWS_KEPT = 2048  # of cameras and subjects; a few KiB each
+_SUBJECTS_ASKED = 16  # for where heads stand
 _DARKEST = 1e-4  # mean radiance that is told from none
 
 
@@ -145,3 +146,12 @@ def _view(path: Path) -> _View:
         lit_mean=max(float(header.source[face].mean()), _DARKEST),
         face_bits=np.packbits(face),
     )
+
+
+def mean_translation_m(reader: PairReader) -> tuple[float, float, float]:
+    """Where heads stand before the crops' camera by the fits of some subjects: a Geometry Network's start."""
+    dataset = reader.dataset
+    subjects = sorted({pair.subject for pair in reader.pairs})[:_SUBJECTS_ASKED]
+    paths = [dataset.fit_path(subject, camera) for subject in subjects for camera in dataset.cameras[subject]]
+    x, y, z = torch.stack([load_fit(path).translation_m for path in paths]).mean(0).tolist()
+    return x, y, z

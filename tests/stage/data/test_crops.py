@@ -8,7 +8,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.reflectance import MEAN_RADIANCE
-from facerf_cli.stage.data.crops import PairReader, open_pairs, spread_pairs
+from facerf_cli.stage.data.crops import PairReader, mean_translation_m, open_pairs, spread_pairs
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.map_weights import name_maps
 from facerf_cli.stage.data.pair_weights import load_pairs, settle_pairs
@@ -111,3 +111,10 @@ def test_a_split_without_pairs_is_named(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
     with pytest.raises(InputError, match="in the split train; make them with `facerf relight-"):
         open_pairs(dataset, "train", 32)
+
+
+def test_heads_stand_where_their_fits_say(dataset: Dataset, reader: PairReader) -> None:
+    fits = [load_fit(dataset.fit_path(s, c)) for s in dataset.splits["train"] for c in dataset.cameras[s]]
+    expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
+    assert torch.allclose(torch.tensor(mean_translation_m(reader)), expected, atol=1e-6)
+    assert expected[2] < -0.9
