@@ -84,20 +84,18 @@ class LightFeaturesObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean and median angle in degrees to the true light, of held-out heads."""
+        """Mean and median angle in degrees to the true light of held-out heads, and by where it stands."""
         if self._validation is None:
             self._validation = self._held_out()
         network = self._network()
         batch = self._validation.to(next(network.parameters()).device)
         cosines = torch.cat([_cosines(network, face) for face in _one_by_one(batch)])
         angles = torch.rad2deg(cosines.double().clamp(-1, 1).acos())
-        front = batch.lights_head[..., 2] > 0
-        metrics = {
-            "angle_deg": float(angles.mean()),
-            "angle_median_deg": float(angles.median()),
-            "angle_front_deg": float(angles[front].mean()),  # of lights before the face's plane
-            "angle_behind_deg": float(angles[~front].mean()),
-        }
+        metrics = {"angle_deg": float(angles.mean()), "angle_median_deg": float(angles.median())}
+        front = batch.lights_head[..., 2] > 0  # of the plane of the face
+        for name, lights in (("angle_front_deg", front), ("angle_behind_deg", ~front)):
+            if lights.any():
+                metrics[name] = float(angles[lights].mean())
         return Validation(metrics, _sheet(network, self._validation))
 
     def _network(self) -> LightNetwork:
@@ -161,10 +159,10 @@ def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
 
 
 def _balls(lights: Tensor, side: int) -> Tensor:
-    """White balls [N, 3, side, side] under lights [N, 3], a little brighter than the black around them."""
+    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black around them."""
     along = torch.linspace(-1, 1, side) * 1.05
     y, x = torch.meshgrid(-along, along, indexing="ij")
     inside = 1 - x**2 - y**2
     normals = torch.stack([x, y, inside.clamp_min(0).sqrt()])
-    shading = torch.einsum("nc,cij->nij", lights, normals).clamp_min(0) * 0.9 + 0.02
+    shading = torch.einsum("nc,cij->nij", lights, normals).clamp_min(0) * 0.45 + 0.01
     return (shading * (inside > 0))[:, None].expand(-1, 3, -1, -1)
