@@ -17,24 +17,27 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks
+from facerf_cli.face.fit_start import FitStart, seeded_state
 from facerf_cli.face.gauss_newton import (
+    CONTOUR_RAYS,
     INNER_COUNT,
     POINTS_PER_RAY,
-    RAYS_PER_LANDMARK,
     FitBasis,
+    FitState,
     Problem,
+    fit_points,
     minimise,
     residuals,
+    total_cost,
     weak_perspective,
 )
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, LANDMARKS_M, OUTER_EYE_CORNERS, locate
+from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
 from facerf_cli.raster.camera import Camera
 
 Quality = Literal["good", "fair", "poor"]
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # a mean landmark error up to this is a good, a fair fit
 IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
-_BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _INVISIBLE_M = 1e-4  # a direction of shape that moves no landmark further at one deviation is left out
 _BORDER = 0.01  # of the crop's side: contour landmarks closer to the photo's border are guesses
 _LARGEST_CROP_PX = 8192
@@ -117,11 +120,15 @@ def fit_landmarks(
     crop: Crop,
     settings: FitSettings = FitSettings(),
     trust: np.ndarray | None = None,
+    start: FitStart | None = None,
 ) -> FaceFit:
-    """Fit one face to landmarks [68, 2] in the crop's pixels; trust [68] in 0..1 weighs each landmark."""
+    """Fit one face to landmarks [68, 2] in the crop's pixels; trust [68] in 0..1 weighs each landmark.
+
+    `start` [1, ...] is where a Geometry Network sees the face in the crop, see `fit_batch`.
+    """
     target_px = torch.from_numpy(check_landmarks(landmarks_px))
     weights = None if trust is None else torch.from_numpy(np.asarray(trust, np.float64))[None]
-    fit = fit_batch(model, target_px[None], crop.camera, settings, weights)
+    fit = fit_batch(model, target_px[None], crop.camera, settings, weights, start)
     return FaceFit(
         model=model.name,
         crop=crop,
@@ -140,20 +147,37 @@ def fit_batch(
     camera: Camera,
     settings: FitSettings = FitSettings(),
     trust: Tensor | None = None,
+    start: FitStart | None = None,
 ) -> FitBatch:
-    """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weighs them."""
+    """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weighs them.
+
+    Each face starts from `start` or from its landmarks alone, whichever costs less.
+    """
     target_px = torch.from_numpy(np.stack([check_landmarks(face.numpy()) for face in landmarks_px]))
     trust = torch.ones(target_px.shape[:2], dtype=torch.float64) if trust is None else trust.double()
-    basis = fit_basis(model, settings)
-    start, scale = weak_perspective(basis, target_px, camera)
-    noise_px = landmark_noise(settings) * (IOD_M * scale)[:, None]  # [B, 68]
-    problem = Problem(basis, target_px, camera, trust.sqrt() / noise_px, settings.huber)
-    state = minimise(problem, start, settings.steps)
+    problem, begin = problem_of(model, target_px, camera, settings, trust)
+    state = minimise(problem, begin if start is None else better_start(problem, begin, start), settings.steps)
     distance_px = residuals(problem, state).difference_px.norm(dim=-1)
     error_iod = (distance_px * trust).sum(1) / trust.sum(1) / _iod_px(target_px)
-    coefficients = state.coordinates @ basis.spread.mT
+    coefficients = state.coordinates @ problem.basis.spread.mT
     alpha, beta = coefficients[:, : len(model.identity)], coefficients[:, len(model.identity) :]
     return FitBatch(state.rotation, state.translation_m, alpha, beta, error_iod)
+
+
+def problem_of(
+    model: MorphableModel, target_px: Tensor, camera: Camera, settings: FitSettings, trust: Tensor
+) -> tuple[Problem, FitState]:
+    """What is minimised for landmarks [B, 68, 2] of trust [B, 68], and the start that they alone give."""
+    basis = fit_basis(model, settings)
+    state, scale = weak_perspective(basis, target_px, camera)
+    noise_px = landmark_noise(settings) * (IOD_M * scale)[:, None]  # [B, 68]
+    return Problem(basis, target_px, camera, trust.sqrt() / noise_px, settings.huber), state
+
+
+def better_start(problem: Problem, begin: FitState, start: FitStart) -> FitState:
+    """Of each face the start that costs less: `begin`, or the head closest to `start`."""
+    seeded = seeded_state(problem.basis, start)
+    return seeded.where(total_cost(problem, seeded) < total_cost(problem, begin), begin)  # False for NaN
 
 
 def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px: int) -> np.ndarray:
@@ -224,17 +248,10 @@ def _iod_px(landmarks_px: Tensor) -> Tensor:
 @lru_cache(maxsize=4)
 def fit_basis(model: MorphableModel, settings: FitSettings) -> FitBasis:
     """The model at the points that a fit may use, with the settings' priors; once for each pair."""
-    rays = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
-    along = np.arange(rays) / RAYS_PER_LANDMARK
-    contour = LANDMARK_UV[list(CONTOUR)]
-    ends = np.stack([np.interp(along, CONTOUR, contour[:, axis]) for axis in (0, 1)], -1)
-    centre = np.array([0.5, LANDMARK_UV[[28, 33], 1].mean()])
-    share = np.linspace(*_BAND, POINTS_PER_RAY)[:, None]
-    band = centre + share * (ends - centre)[:, None]  # [rays, points, 2]
-    corners, weights = locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band.reshape(-1, 2)]))
+    corners, weights = fit_points()
     modes, spread = _turned(model, settings, corners, weights.double())
     mean = (model.mean[corners].double() * weights[..., None].double()).sum(1)
-    ends_m = mean[INNER_COUNT:].reshape(rays, POINTS_PER_RAY, 3)[:, -1]
+    ends_m = mean[INNER_COUNT:].reshape(CONTOUR_RAYS, POINTS_PER_RAY, 3)[:, -1]
     nose_m = mean[[28 - len(CONTOUR), 33 - len(CONTOUR)]].mean(0)
     outward = (ends_m - nose_m) * torch.tensor([1.0, 1.0, 0.0])
     return FitBasis(mean, modes, spread, outward / outward.norm(dim=-1, keepdim=True))

@@ -6,16 +6,20 @@ anew at every step (paper, 'Landmark loss').
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import CONTOUR
+from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, locate
 from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
 
 INNER_COUNT = 68 - len(CONTOUR)
 RAYS_PER_LANDMARK, POINTS_PER_RAY = 8, 10  # of the contour's band
+CONTOUR_RAYS = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
+_BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _FIRST_DAMPING = 1e-3
 _WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides at most two landmarks' way along the jaw
 
@@ -42,6 +46,18 @@ class FitBasis:
     modes: Tensor  # [N, 3, Q]
     spread: Tensor  # [K, Q], coordinates to coefficients, identity then expression
     outward: Tensor  # [rays, 3], head frame
+
+
+@cache
+def fit_points() -> tuple[Tensor, Tensor]:
+    """Vertices [N, 3] and weights [N, 3] of the points of every model's FitBasis."""
+    along = np.arange(CONTOUR_RAYS) / RAYS_PER_LANDMARK
+    contour = LANDMARK_UV[list(CONTOUR)]
+    ends = np.stack([np.interp(along, CONTOUR, contour[:, axis]) for axis in (0, 1)], -1)
+    centre = np.array([0.5, LANDMARK_UV[[28, 33], 1].mean()])
+    share = np.linspace(*_BAND, POINTS_PER_RAY)[:, None]
+    band = centre + share * (ends - centre)[:, None]  # [rays, points, 2]
+    return locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band.reshape(-1, 2)]))
 
 
 @dataclass(frozen=True)
@@ -189,6 +205,11 @@ def moved(state: FitState, step: Tensor) -> FitState:
     omega, shift, change = step[:, :3], step[:, 3:6], step[:, 6:]
     translation = state.translation_m - shift * state.translation_m[:, 2:]
     return FitState(so3_exp(omega) @ state.rotation, translation, state.coordinates + change)
+
+
+def total_cost(problem: Problem, state: FitState) -> Tensor:
+    """What is minimised [B]."""
+    return landmark_cost(problem, residuals(problem, state)) + prior_cost(state)
 
 
 def landmark_cost(problem: Problem, at: Residuals) -> Tensor:
