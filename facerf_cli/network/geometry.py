@@ -8,6 +8,7 @@ a small residual trunk on a smaller crop. Rotations leave the network as two col
 """
 
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, Literal, NamedTuple, Self
 
 import torch
@@ -15,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 Form = Literal["default", "paper"]
-_SIDES: dict[str, int] = {"default": 96, "paper": 224}
+_SIDES: dict[str, int] = {"default": 64, "paper": 224}
 _MAX_COEFFICIENTS = 500
 _SHIFT, _DEPTH = (
     0.05,
@@ -139,10 +140,11 @@ def _alexnet() -> tuple[nn.Module, int]:
 
 
 def _small() -> tuple[nn.Module, int]:
-    """Five halvings, each with a residual; the last cells keep their places, which pose and shape hang on."""
+    """Five halvings, all but the first with a residual. The last cells keep their places: pose is in them."""
     widths = (24, 48, 88, 144, 192)
-    stages = [_Stage(a, b) for a, b in zip((3, *widths), widths, strict=False)]
-    return nn.Sequential(*stages, nn.Flatten(), nn.Linear(widths[-1] * 3 * 3, 160), nn.SiLU()), 160
+    enter = (nn.Conv2d(3, widths[0], 3, stride=2, padding=1), nn.GroupNorm(8, widths[0]), nn.SiLU())
+    stages = [*enter, *(_Stage(a, b) for a, b in pairwise(widths))]
+    return nn.Sequential(*stages, nn.Flatten(), nn.Linear(widths[-1] * 2 * 2, 160), nn.SiLU()), 160
 
 
 class _Stage(nn.Module):

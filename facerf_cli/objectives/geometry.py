@@ -78,7 +78,8 @@ class GeometryObjective(Objective):
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
         """The weighted terms, each a mean over faces."""
-        estimate = self.estimate(batch.crops)
+        with self.mixed_precision():
+            estimate = GeometryEstimate(*(x.float() for x in self.estimate(batch.crops)))
         settings, fit = self.settings, FitSettings()
         weight = torch.ones(68, device=batch.crops.device)
         weight[list(CONTOUR)] = settings.contour
