@@ -40,7 +40,7 @@ def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module]
             name: _built(name, described, _part(tensors, name))
             for name, described in metadata["networks"].items()
         }
-    except (KeyError, TypeError, RuntimeError, ValueError, AttributeError):
+    except (LookupError, ArithmeticError, TypeError, RuntimeError, ValueError, AttributeError):
         raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
     return networks, metadata
 

@@ -1,0 +1,54 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.checkpoints import save_checkpoint
+from facerf_cli.network.features import LightNetwork
+from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+from facerf_cli.network.paper_reflectance import PaperReflectanceSettings
+from facerf_cli.network.reflectance import ReflectanceSettings
+from facerf_cli.network.saved import load_networks
+
+DESCRIBED: dict[str, dict[str, Any]] = {
+    "reflectance": {"form": "default", **ReflectanceSettings().__dict__},
+    "paper": {"form": "paper", **PaperReflectanceSettings().__dict__},
+    "geometry": {"form": "default", **GeometrySettings().__dict__},
+    "light_features": LightNetwork().as_metadata(),
+}
+NONSENSE = [[], [0], [[1]], [1e400], -1, 1e30, 10**30, float("inf"), float("nan"), "x", None, {"a": 1}]
+
+
+@pytest.mark.parametrize(("name", "key"), [(name, key) for name in DESCRIBED for key in DESCRIBED[name]])
+@pytest.mark.filterwarnings("ignore:Initializing zero-element tensors")  # torch's, of layers without channels
+def test_settings_that_make_no_network_are_refused_in_words(tmp_path: Path, name: str, key: str) -> None:
+    path = tmp_path / "a.safetensors"
+    for value in NONSENSE:
+        kind = "reflectance" if name == "paper" else name
+        networks = {kind: DESCRIBED[name] | {key: value}}
+        save_checkpoint(path, {f"{kind}.x": torch.zeros(1)}, {"layout_version": 3, "networks": networks})
+        with pytest.raises(InputError, match="do not fit this version's network"):
+            load_networks(path, 3)
+
+
+@pytest.mark.parametrize(
+    "networks", [[], "x", {"reflectance": []}, {"reflectance": {}}, {"other": {"form": "a"}}]
+)
+def test_metadata_that_describe_no_networks_are_refused_in_words(tmp_path: Path, networks: Any) -> None:
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, {"w": torch.zeros(1)}, {"layout_version": 3, "networks": networks})
+    with pytest.raises(InputError, match="do not fit this version's network"):
+        load_networks(path, 3)
+
+
+def test_weights_of_other_sizes_are_refused_in_words(tmp_path: Path) -> None:
+    network = GeometryNetwork()
+    tensors = {f"geometry.{name}": tensor for name, tensor in network.state_dict().items()}
+    tensors["geometry.regress.bias"] = torch.zeros(3)
+    path = tmp_path / "a.safetensors"
+    described = {"geometry": network.as_metadata()}
+    save_checkpoint(path, tensors, {"layout_version": 3, "networks": described})
+    with pytest.raises(InputError, match="do not fit this version's network"):
+        load_networks(path, 3)
