@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
+from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
 from facerf_cli.network.reflectance import ReflectanceNetwork
@@ -75,12 +76,29 @@ def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tupl
     return crop, crop.apply(photo)
 
 
+@torch.no_grad()
+def see_head(models: Models, cropped: np.ndarray) -> FitStart | None:
+    """Where the Geometry Network sees the head in a crop [S, S, 3]; None where there is no such network."""
+    if models.geometry is None:
+        return None
+    picture = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
+    return FitStart(*(tensor.cpu() for tensor in models.geometry(picture)))
+
+
 def fit_face(
-    model: MorphableModel, crop: Crop, landmarks_px: np.ndarray, photo_shape: tuple[int, ...]
+    model: MorphableModel,
+    crop: Crop,
+    landmarks_px: np.ndarray,
+    photo_shape: tuple[int, ...],
+    start: FitStart | None = None,
 ) -> FaceFit:
-    """Fit the face model to landmarks [68, 2] in the pixels of a photo [H, W, ...]."""
+    """Fit the face model to landmarks [68, 2] in the pixels of a photo [H, W, ...].
+
+    `start` is what `see_head` found in the crop; without it the fit starts from the landmarks alone.
+    """
     in_crop = crop.to_crop(landmarks_px)
-    return fit_landmarks(model, in_crop, crop, trust=trust_inside(in_crop, crop, *photo_shape[:2]))
+    trust = trust_inside(in_crop, crop, *photo_shape[:2])
+    return fit_landmarks(model, in_crop, crop, trust=trust, start=start)
 
 
 def unwrap_face(

@@ -57,6 +57,7 @@ class GeometryObjective(Objective):
         self.chooses_by = "landmarks_percent"
         self.provenance = faces.provenance
         self.faces = faces
+        self.side = network.side
         self.settings = settings
         self.heads, self.held_out = faces.heads(settings.held_out_heads)
         model = load_face_model()
@@ -73,7 +74,7 @@ class GeometryObjective(Objective):
         for i in range(count):
             generator = generator_of(i)
             head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
-            drawn.append(self.faces.draw(head, generator))
+            drawn.append(self.faces.draw(head, self.side, generator))
         return concatenate(drawn)
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
@@ -110,9 +111,10 @@ class GeometryObjective(Objective):
         return project(in_camera, crop_camera(side))
 
     def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
-        """Distances [B, 68] to the true landmarks in units of the true inter-ocular distance.
+        """Distances [B, 68] to the true landmarks in units of the inter-ocular distance.
 
-        The distance of the eyes in space, seen from the front, as turned heads' eyes come close in a picture.
+        Here that is the mean face's at the head's depth: a turned head's eyes come close in the picture, and
+        its landmarks would weigh the more.
         """
         predicted = self.landmarks_px(estimate, batch.crops.shape[-1])
         unit_px = _frontal_iod_px(self.mean_m, batch)
@@ -126,7 +128,10 @@ class GeometryObjective(Objective):
         device = next(self.networks.parameters()).device
         batch = self._validation.to(device)
         estimate = self.estimate(batch.crops)
-        percent = 100 * self.distances_iod(estimate, batch)
+        distance_px = (self.landmarks_px(estimate, self.side) - batch.landmarks_px).norm(dim=-1)
+        left, right = OUTER_EYE_CORNERS
+        eyes_px = (batch.landmarks_px[:, left] - batch.landmarks_px[:, right]).norm(dim=-1)
+        percent = 100 * distance_px / eyes_px[:, None]
         chord = (estimate.rotation - batch.rotation).flatten(1).norm(dim=1)
         angle_deg = torch.rad2deg(2 * torch.asin((chord / 8**0.5).clamp(max=1)))
         depth = (estimate.translation_m[:, 2] / batch.translation_m[:, 2]).log().abs()
@@ -141,7 +146,7 @@ class GeometryObjective(Objective):
     def _held_out(self) -> FaceCrops:
         return concatenate(
             [
-                self.faces.draw(int(head), seeded(_VALIDATION_SEED, int(head), index))
+                self.faces.draw(int(head), self.side, seeded(_VALIDATION_SEED, int(head), index))
                 for index in range(self.settings.held_out_draws)
                 for head in self.held_out
             ]

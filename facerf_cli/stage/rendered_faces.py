@@ -45,20 +45,18 @@ class FaceCrops:
 
 
 class RenderedFaces:
-    """The pictures of a bank's heads, held in memory as bytes; crops of `side` pixels are drawn from them."""
+    """The pictures of a bank's heads, held in memory as bytes, from which crops are drawn."""
 
     def __init__(
         self,
         folder: Path,
         provenance: dict[str, Any],
-        side: int,
         settings: PictureSettings = _PICTURES,
     ) -> None:
         paths = sorted(folder.glob("*.safetensors"))
         if not paths:
             raise InputError(f"{folder}: no pictures of heads; let `facerf train --stage geometry` make them")
         self.provenance = provenance
-        self.side = side
         self.settings = settings
         self.pictures = [load_file(path) for path in paths]
 
@@ -71,20 +69,19 @@ class RenderedFaces:
         x, y, z = torch.cat([head["translation_m"] for head in self.pictures]).mean(0).tolist()
         return x, y, z
 
-    def draw(self, head: int, generator: torch.Generator) -> FaceCrops:
-        """One crop of a head."""
+    def draw(self, head: int, side: int, generator: torch.Generator) -> FaceCrops:
+        """One crop of a head, of that many pixels along each side."""
         stored = self.pictures[head]
         index = int(torch.randint(len(stored["pictures"]), (), generator=generator))
         own = {name: tensor[index] for name, tensor in stored.items()}
         if torch.rand((), generator=generator) < 0.5:
             own = _mirrored(own, self.settings.crop_px)
         move = _Move.draw(generator)
-        crop = move.picture(own["pictures"], self.side, self.settings)
-        pixel = self.side / self.settings.crop_px
+        crop = move.picture(own["pictures"], side, self.settings)
         rotation, translation_m = move.pose(own["rotation"], own["translation_m"])
         return FaceCrops(
             _photographed(_composed(crop, generator), generator)[None],
-            move.points(own["landmarks_px"] / self.settings.crop_px)[None] * self.settings.crop_px * pixel,
+            side * move.points(own["landmarks_px"] / self.settings.crop_px)[None],
             rotation[None],
             translation_m[None],
             own["alpha"][None],

@@ -32,7 +32,7 @@ def pictures(bank_folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def faces(pictures: Path) -> RenderedFaces:
-    return RenderedFaces(pictures, {"licence": "MIT"}, 64)
+    return RenderedFaces(pictures, {"licence": "MIT"})
 
 
 @pytest.fixture
@@ -120,6 +120,6 @@ def test_the_paper_form_learns_from_the_same_crops(faces):
 
 def test_no_pictures_is_said(tmp_path):
     with pytest.raises(InputError, match="no pictures"):
-        RenderedFaces(tmp_path, {}, 96)
+        RenderedFaces(tmp_path, {})
     with pytest.raises(InputError, match="no baked heads"):
         add_pictures(tmp_path, tmp_path / "out", 1, 1, 0)
