@@ -1,213 +1,241 @@
-"""Training of the Reflectance Network, on the synthetic bank or a prepared dataset, top to bottom."""
+"""The training loop: draw, losses, backward, step, log, validate, save, resume. It knows no stage."""
 
-import json
+import logging
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor
+from torch import nn
 
-from facerf_cli.errors import FacerfError
+from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.images import write_display
-from facerf_cli.network.losses import root_loss, si_mse
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.saved import load_networks, save_networks
-from facerf_cli.stage.samples import Sample, SampleSource
+from facerf_cli.objectives.objective import Objective, seeded
+from facerf_cli.records import LOGGER_NAME
+from facerf_cli.runs.draws import Drawn, drawn_batches
+from facerf_cli.runs.folder import RunLog, refuse_another_run
+from facerf_cli.runs.processes import (
+    first_says,
+    mean_of_all,
+    own_device,
+    process_count,
+    process_rank,
+    shared,
+)
+from facerf_cli.runs.settings import TrainSettings
+from facerf_cli.runs.signals import stop_on_signals
+from facerf_cli.runs.state import State, averaged, begin, load_state, save_state, update_average
 
-DEFAULT_NETWORK = ReflectanceSettings()
 CPU = torch.device("cpu")
+Row = dict[str, Any]
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
-class TrainSettings:
-    """The `default` preset: AdamW under a cosine schedule, and a running average of the weights."""
+class Start:
+    """The checkpoint that a run begins from: its other networks, which are carried over, and its metadata."""
 
-    batch: int = 4
-    lights: int = 4
-    learning_rate: float = 1.5e-3
-    warmup_steps: int = 150
-    weight_decay: float = 1e-4
-    gradient_clip: float = 1.0
-    ema_decay: float = 0.998
-    max_seconds: float = 3600.0
-    max_steps: int = 1_000_000  # whichever of the two comes first; the rate falls toward it
-    validate_every: int = 500
-    held_out_heads: int = 12
-    bf16: bool = True
-    seed: int = 0
+    carried: dict[str, nn.Module] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
 
 
 def train(
-    source: SampleSource,
+    objective: Objective,
     folder: Path,
-    settings: TrainSettings = TrainSettings(),
-    network_settings: ReflectanceSettings = DEFAULT_NETWORK,
-    start_from: Path | None = None,
+    settings: TrainSettings,
+    start: Start = Start(),
+    resume: bool = False,
     device: torch.device = CPU,
-    report: Callable[[dict[str, float]], None] = lambda row: None,
+    report: Callable[[Row], None] = lambda row: None,
 ) -> Path:
-    """Train on what `source` draws until the time is up; returns the checkpoint, `folder/last.safetensors`.
+    """Minimise an objective until the steps or the time are up; returns `folder/last.safetensors`.
 
-    `start_from` is a checkpoint whose weights to begin with, and whose settings hold then. Samples are drawn
-    on the CPU, the network runs on `device`. Rows go to `report` and `folder/log.jsonl`.
+    On a CPU a run that ends by its steps is the same to the last digit however often it was stopped and
+    resumed, for draws and dropout depend on (seed, step, index) alone. Rows go to `folder/log.jsonl` and
+    `report`. Under torchrun (`runs.processes`) every process calls this; the first one alone writes.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(settings.seed)
-    network = _network(source, network_settings, start_from, device)
-    average = {name: tensor.detach().clone() for name, tensor in network.state_dict().items()}
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=(0.9, 0.98)
-    )
-    heads, held_out = source.heads(settings.held_out_heads)
-    validation = _held_out_samples(source, held_out)
-    begin, step = time.monotonic(), 0
-
-    def finish(row: dict[str, float]) -> Path:
-        row["si_mse"] = _validate(average, network.settings, validation, folder / "validation.png")
-        return _save(folder / "last.safetensors", average, network.settings, settings, source, row)
-
-    with (folder / "log.jsonl").open("a") as log:
-        for step, drawn in enumerate(_draws(source, heads, settings), 1):
-            _set_rate(optimizer, settings, step - 1, drawn.seconds)
-            loss = _step(network, optimizer, drawn.sample.to(device), settings)
-            if not math.isfinite(loss):
-                raise FacerfError(f"the loss is not finite at step {step - 1} (heads {drawn.heads.tolist()})")
-            _update_average(average, network, min(settings.ema_decay, step / (step + 10)))
-            row = {"step": step, "seconds": drawn.seconds, "loss": loss, "drawing": drawn.drawing}
-            if step % settings.validate_every == 0:
-                finish(row)
-            log.write(json.dumps(row) + "\n")
-            log.flush()
-            report(row)
-    return finish({"step": step, "seconds": time.monotonic() - begin})
+    if process_rank() == 0 and not resume:
+        refuse_another_run(folder)
+    device = own_device(device)
+    objective.to(device)
+    objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    objective.bf16 = settings.bf16
+    state = begin(objective.networks, settings, start.metadata)
+    if resume and (folder / "state.pt").exists():
+        load_state(folder / "state.pt", state, settings)
+        saved, _ = load_networks(folder / "last.safetensors", LAYOUT_VERSION)
+        start = Start({name: saved[name] for name in saved.keys() - objective.networks.keys()})
+    if settings.done(state.step, state.seconds) >= 1:
+        log.info("%s: complete at step %d; give more --steps or --max-time to go on", folder, state.step)
+    elif process_rank() == 0:
+        with RunLog(folder, state.step) as run_log:
+            _loop(_Run(objective, folder, settings, state, start.carried, device, run_log, report))
+    else:
+        _loop(_Run(objective, folder, settings, state, start.carried, device, None, report))
+    return folder / "last.safetensors"
 
 
 @dataclass(frozen=True)
-class _Draw:
-    """A sample, and when it came."""
+class _Run:
+    """What the loop works on."""
 
-    sample: Sample
-    heads: Tensor  # [B]
-    seconds: float  # since the first
-    drawing: float  # the share of these that went into drawing
-
-
-def _draws(source: SampleSource, heads: Tensor, settings: TrainSettings) -> Iterator[_Draw]:
-    """Samples of random heads until the time or the steps are up."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    begin, drawing_s = time.monotonic(), 0.0
-    for _ in range(settings.max_steps):
-        start_s = time.monotonic() - begin
-        if start_s >= settings.max_seconds:
-            return
-        chosen = heads[torch.randint(len(heads), (settings.batch,), generator=generator)]
-        sample = source.draw(chosen, settings.lights, generator)
-        drawing_s += time.monotonic() - begin - start_s
-        yield _Draw(sample, chosen, start_s, drawing_s / (start_s + 1e-6))
+    objective: Objective
+    folder: Path
+    settings: TrainSettings
+    state: State
+    carried: dict[str, nn.Module]
+    device: torch.device
+    log: RunLog | None  # of process 0 alone
+    report: Callable[[Row], None]
 
 
-def _network(
-    source: SampleSource, settings: ReflectanceSettings, start_from: Path | None, device: torch.device
-) -> ReflectanceNetwork:
-    """The network to train, with the mean face that the source knows."""
-    network: Any = ReflectanceNetwork(settings)
-    if start_from:
-        network = load_networks(start_from, LAYOUT_VERSION)[0]["reflectance"]
-    network.set_mean_face(*source.mean_face())
-    moved: ReflectanceNetwork = network.to(device, memory_format=torch.channels_last)
-    return moved
+def _loop(run: _Run) -> None:
+    """Steps from where the state is, to the end or to a signal."""
+    settings, state = run.settings, run.state
+    if settings.compile:
+        run.objective.compile()
+    model, clock = shared(run.objective, run.objective.skips_networks), _Clock(state.seconds)
+    run.objective.networks.train()
+    with stop_on_signals() as stop:
+        for drawn in _draws(run):
+            clock.waited_s += drawn.waited_s
+            seconds, signal = first_says(torch.tensor([clock.seconds(), stop.signal]).double()).tolist()
+            row = {"step": drawn.step, "seconds": seconds}
+            row |= _step(run, model, drawn, settings.done(drawn.step - 1, seconds))
+            row |= {"waiting": clock.waiting()}
+            state.step, state.seconds = drawn.step, clock.seconds()
+            ended = bool(signal) or settings.done(state.step, seconds) >= 1
+            due = not signal and (ended or state.step % settings.validate_every == 0)
+            if run.log:
+                with clock.stopped():
+                    _write(run, row, validate=due, save=due or ended)
+            if ended:
+                break
+        stop.leave()
 
 
-def _step(
-    network: ReflectanceNetwork, optimizer: torch.optim.Optimizer, sample: Sample, settings: TrainSettings
-) -> float:
-    """One step down the gradient; the loss before it. A loss that is not finite moves nothing."""
-    loss = _loss(network, sample, settings.bf16)
-    if loss.isfinite():
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(network.parameters(), settings.gradient_clip)
-        optimizer.step()
-    return float(loss.detach())
+def _draws(run: _Run) -> Any:
+    """This process's share of every batch after the state's step."""
+    processes, batch = process_count(), run.settings.batch
+    if batch % processes:
+        raise UsageError(f"{processes} processes cannot share a batch of {batch}; give another --batch")
+    share, seed, workers = batch // processes, run.settings.seed, run.settings.workers
+    return drawn_batches(run.objective, run.state.step + 1, share, process_rank() * share, seed, workers)
 
 
-def _set_rate(optimizer: torch.optim.Optimizer, settings: TrainSettings, step: int, elapsed: float) -> None:
-    """Linear warm-up, then a half cosine over the allotted time or steps down to 2 %."""
-    warm = min(1.0, (step + 1) / settings.warmup_steps)
-    done = min(1.0, max(elapsed / settings.max_seconds, step / settings.max_steps))
-    cosine = 0.5 * (1 + math.cos(math.pi * done))
-    for group in optimizer.param_groups:
-        group["lr"] = settings.learning_rate * warm * (0.02 + 0.98 * cosine)
+def _step(run: _Run, model: nn.Module, drawn: Drawn, done: float) -> Row:
+    """One step down the gradient; what there is to log of it. One that is not finite moves nothing."""
+    settings, state = run.settings, run.state
+    rate = settings.optimizer.learning_rate * settings.schedule.factor(drawn.step - 1, done)
+    for group in state.optimizer.param_groups:
+        group["lr"] = rate
+    torch.manual_seed(seeded(settings.seed, drawn.step, process_rank(), 0).initial_seed())  # of dropout
+    state.optimizer.zero_grad(set_to_none=True)
+    terms = model(drawn.batch.to(run.device))
+    loss = torch.stack(list(terms.values())).sum()
+    loss.backward()  # type: ignore[no-untyped-call]
+    clip = settings.gradient_clip or math.inf
+    norm = nn.utils.clip_grad_norm_(state.networks.parameters(), clip)
+    values = mean_of_all(torch.stack([loss, *terms.values()]).detach())
+    total, gradient, *parts = torch.cat([values[:1], norm[None], values[1:]]).tolist()
+    _stop_if_not_finite(run, drawn, total, gradient)
+    state.optimizer.step()
+    if settings.ema_decay:
+        update_average(state, settings.ema_decay, drawn.step)
+    return {"loss": total, "terms": dict(zip(terms, parts, strict=True)), "gradient": gradient, "rate": rate}
 
 
-def _loss(network: ReflectanceNetwork, sample: Sample, bf16: bool) -> Tensor:
-    with torch.autocast(sample.source.device.type, torch.bfloat16, enabled=bf16):
-        encoded = network.encode(sample.source, sample.normals_source, sample.visible)
-        root = network.decode_root(encoded, sample.normals_target, sample.lights)
-    # The network divides by its own measure of exposure, which the fill of unseen texels does not enter.
-    return root_loss(root.float(), sample.target / encoded.exposure[:, None], sample.weight)
+def _stop_if_not_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -> None:
+    if math.isfinite(loss) and math.isfinite(gradient):
+        return
+    what = "loss" if not math.isfinite(loss) else "gradient"
+    heads = getattr(drawn.batch, "heads", None)
+    of = f", heads {heads.tolist()}" if heads is not None else ""
+    kept = run.folder / "state.pt"
+    raise FacerfError(
+        f"the {what} is not finite at step {drawn.step} (seed {run.settings.seed}{of}); "
+        + (f"the last good state is kept in {kept}" if kept.exists() else "no state was saved before it")
+    )
+
+
+def _write(run: _Run, row: Row, validate: bool, save: bool) -> None:
+    """The row, after a validation if one is due; the state last, so that all it knows of is on disk."""
+    last = run.folder / "last.safetensors"
+    with averaged(run.state) if save else nullcontext():
+        if validate:
+            row["validation"] = _validate(run, row["step"])
+        if save:
+            save_networks(last, {**run.carried, **run.objective.networks}, _metadata(run, row))
+    chosen = row.get("validation", {}).get(run.objective.chooses_by, math.inf)
+    if chosen < run.state.best:
+        run.state.best = chosen
+        with atomic_path(run.folder / "best.safetensors") as temporary:
+            shutil.copyfile(last, temporary)
+    assert run.log
+    run.log.write(row)
+    if save:
+        save_state(run.folder / "state.pt", run.state, run.settings)
+    run.report(row)
 
 
 @torch.no_grad()
-def _update_average(average: dict[str, Tensor], network: ReflectanceNetwork, decay: float) -> None:
-    for name, tensor in network.state_dict().items():
-        if tensor.is_floating_point():
-            average[name].lerp_(tensor, 1 - decay)
+def _validate(run: _Run, step: int) -> dict[str, float]:
+    run.objective.networks.eval()
+    validation = run.objective.validate()
+    run.objective.networks.train()
+    if validation.sheet is not None and run.log:
+        run.log.sheet(step, validation.sheet)
+    return validation.metrics
 
 
-def _held_out_samples(source: SampleSource, heads: Tensor) -> list[Sample]:
-    generator = torch.Generator().manual_seed(12345)
-    return [source.draw(chunk, 6, generator) for chunk in torch.split(heads, 4) for _ in range(4)]
-
-
-@torch.no_grad()
-def _validate(
-    weights: dict[str, Tensor], network_settings: ReflectanceSettings, samples: list[Sample], sheet: Path
-) -> float:
-    """Mean Si-MSE of held-out heads, and a contact sheet: source, then truth over prediction a light."""
-    network = ReflectanceNetwork(network_settings)
-    network.load_state_dict(weights)
-    errors, rows = [], []
-    for sample in samples:
-        encoded = network.encode(sample.source, sample.normals_source, sample.visible)
-        predicted = network.decode(encoded, sample.normals_target, sample.lights)
-        errors.append(si_mse(predicted, sample.target, sample.weight).mean())
-        rows.append(_sheet_row(sample, predicted))
-    write_display(sheet, np.concatenate(rows[:5]), exposure=1.0)
-    return float(torch.stack(errors).mean())
-
-
-def _sheet_row(sample: Sample, predicted: Tensor) -> np.ndarray:
-    """Two rows of pictures [2T, (L + 1) T, 3] of a sample's first face."""
-    mask = (sample.weight[0] > 0).float()
-    truth = torch.cat([sample.source[0], *(sample.target[0] * mask)], -1)
-    guess = torch.cat([sample.source[0] * sample.visible[0], *(predicted[0] * mask)], -1)
-    picture: np.ndarray = torch.cat([truth, guess], -2).permute(1, 2, 0).numpy()
-    return picture
-
-
-def _save(
-    path: Path,
-    weights: dict[str, Tensor],
-    network_settings: ReflectanceSettings,
-    settings: TrainSettings,
-    source: SampleSource,
-    row: dict[str, float],
-) -> Path:
-    metadata: dict[str, Any] = {
-        "layout_version": LAYOUT_VERSION,
-        "licence": source.provenance["licence"],
-        "provenance": source.provenance,
-        "training": asdict(settings),
-        "metrics": row,
+def _metadata(run: _Run, row: Row) -> dict[str, Any]:
+    """Of the checkpoint; what it began from is part of its past."""
+    start, provenance = run.state.start, dict(run.objective.provenance)
+    licences = [provenance["licence"], start.get("licence")]
+    if "provenance" in start:
+        provenance["started_from"] = start["provenance"]
+    leg = {
+        "objective": type(run.objective).__name__,
+        "networks": sorted(run.objective.networks),
+        "steps_done": row["step"],
+        "seconds": round(run.state.seconds, 1),
+        "processes": process_count(),
+        **asdict(run.settings),
     }
-    network = ReflectanceNetwork(network_settings)
-    network.load_state_dict(weights)
-    save_networks(path, {"reflectance": network}, metadata)
-    return path
+    return {
+        "layout_version": LAYOUT_VERSION,
+        "licence": "; ".join(dict.fromkeys(words for words in licences if words)),
+        "provenance": provenance,
+        "training": [*start.get("training", []), leg],
+        "metrics": {"step": row["step"], "loss": row["loss"], **row.get("validation", {})},
+    }
+
+
+@dataclass
+class _Clock:
+    """Seconds of a run in all its legs, and the share of this leg's steps that waited for batches."""
+
+    before_s: float
+    waited_s: float = 0.0
+    begun: float = field(default_factory=time.monotonic)
+    paused_s: float = 0.0
+
+    def seconds(self) -> float:
+        return self.before_s + time.monotonic() - self.begun
+
+    def waiting(self) -> float:
+        return self.waited_s / max(time.monotonic() - self.begun - self.paused_s, 1e-9)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Validating and saving is not a step."""
+        begun = time.monotonic()
+        yield
+        self.paused_s += time.monotonic() - begun

@@ -11,7 +11,7 @@ LEVELS = (
     ("main",),
     ("commands",),
     ("training",),
-    ("objectives",),
+    ("objectives", "runs"),
     ("pipeline", "stage", "baselines", "report"),
     ("network", "face", "metrics"),
     ("raster", "light"),

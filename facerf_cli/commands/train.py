@@ -1,158 +1,263 @@
-"""`facerf train`: the Reflectance Network, on synthetic heads baked for it or on a prepared dataset."""
+"""`facerf train`: the networks, on synthetic heads baked for them or on a prepared dataset."""
 
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from facerf_cli.commands.options import Settings, settings_of, torch_device
+from facerf_cli.commands.options import settings_of, torch_device
+from facerf_cli.commands.train_objective import (
+    Preset,
+    Stage,
+    TrainOptions,
+    build_objective,
+    trained_networks,
+)
+from facerf_cli.commands.train_progress import TrainProgress
+from facerf_cli.commands.train_refusals import refuse_what_makes_no_sense
 from facerf_cli.errors import UsageError
-from facerf_cli.records import STDERR
 
 if TYPE_CHECKING:
-    from facerf_cli.stage.bank import Bank
-    from facerf_cli.stage.samples import SampleSource
+    from torch import nn
 
-_OF_THE_BANK = ("heads_from", "heads", "views", "bank")
-_OF_A_DATASET = ("texture_size",)
+    from facerf_cli.runs.settings import TrainSettings
+    from facerf_cli.training import Start
+
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
+_DEFAULT_TIME = "2h"
+_WORKERS_ON_GPU = 4
+
+_run = partial(typer.Option, rich_help_panel="The run")
+_data = partial(typer.Option, rich_help_panel="Data")
+_length = partial(typer.Option, rich_help_panel="Length")
+_loss = partial(typer.Option, rich_help_panel="Losses and ablations")
+_speed = partial(typer.Option, rich_help_panel="Speed")
 
 
 def train(
     context: typer.Context,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Folder of the run.")],
+    output: Annotated[Path, _run("--output", "-o", metavar="DIR", help="Folder of the run.")],
+    preset: Annotated[
+        Preset,
+        _run(
+            help="default: what is shipped; paper: the paper's networks, losses and Adadelta; tiny: small "
+            "networks, to try things out."
+        ),
+    ] = "default",
+    stage: Annotated[
+        Stage | None,
+        _run(
+            help="reflectance: that network, in the chart; geometry: that network, on rendered heads; joint: "
+            "both, through the rasterizer; light-features: what --light-features takes.",
+            show_default="joint with --preset paper, else reflectance",
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        _run("--resume", help="Go on with the run in DIR where it was last saved; give its options."),
+    ] = False,
+    start_from: Annotated[
+        Path | None,
+        _run(
+            metavar="FILE",
+            help="Checkpoint to begin with; networks that the stage does not train are carried over.",
+            show_default="none",
+        ),
+    ] = None,
     dataset: Annotated[
         Path | None,
-        typer.Option(
-            "--dataset",
+        _data(
             metavar="DIR",
             help="Train on this prepared dataset (prepare-dataset, relight-dataset) in the place of heads.",
             show_default="synthetic heads",
         ),
     ] = None,
+    texture_size: Annotated[
+        int, _data(min=32, max=1024, metavar="PX", help="Side of a dataset's textures.")
+    ] = 128,
+    photos: Annotated[
+        Path | None,
+        _data(
+            metavar="DIR",
+            help="Photos of faces, for a fifth of the batches of the stage joint.",
+            show_default="none",
+        ),
+    ] = None,
     heads_from: Annotated[
-        str, typer.Option(metavar="NAME|PATH", help="Face model that the synthetic heads are drawn from.")
+        str, _data(metavar="NAME|PATH", help="Face model that the synthetic heads are drawn from.")
     ] = "builtin",
     fit_with: Annotated[
         str,
-        typer.Option(metavar="NAME|PATH", help="Face model that they are, or the dataset was, fitted with."),
+        _data(metavar="NAME|PATH", help="Face model that they are, or the dataset was, fitted with."),
     ] = "builtin",
-    heads: Annotated[int, typer.Option(min=16, help="Synthetic heads to bake.")] = 240,
-    views: Annotated[int, typer.Option(min=1, help="Fitted views of each head.")] = 8,
+    heads: Annotated[int, _data(min=16, help="Synthetic heads to bake.")] = 240,
+    views: Annotated[int, _data(min=1, help="Fitted views of each head.")] = 8,
     bank: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where baked heads are kept.", show_default="DIR/bank")
+        Path | None, _data(metavar="DIR", help="Where baked heads are kept.", show_default="DIR/bank")
     ] = None,
-    texture_size: Annotated[
-        int, typer.Option(min=32, max=1024, metavar="PX", help="Side of a dataset's textures.")
-    ] = 128,
-    max_time: Annotated[str, typer.Option(metavar="TIME", help="Stop after 90s, 45m or 2h.")] = "2h",
-    start_from: Annotated[
+    jobs: Annotated[int, _data("--jobs", "-j", min=1, help="Processes that bake, or unwrap.")] = 2,
+    steps: Annotated[
+        int | None, _length(min=1, help="Stop after so many steps.", show_default="no limit")
+    ] = None,
+    max_time: Annotated[
+        str | None,
+        _length(
+            metavar="TIME",
+            help="Stop after 90s, 45m or 2h, counted over all legs of a resumed run.",
+            show_default=f"{_DEFAULT_TIME}; no limit with --steps",
+        ),
+    ] = None,
+    validate_every: Annotated[
+        int | None,
+        _length(
+            min=1,
+            metavar="STEPS",
+            help="Measure on held-out people, and save, after so many steps.",
+            show_default="500; paper 1000, tiny 10",
+        ),
+    ] = None,
+    vgg_weights: Annotated[
+        str | None,
+        _loss(
+            metavar="imagenet|PATH",
+            help="VGG-16 for the feature loss of the stage joint: imagenet fetches it; or a file.",
+            show_default="without this loss",
+        ),
+    ] = None,
+    light_features: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Checkpoint whose weights to begin with.", show_default="none"),
+        _loss(
+            metavar="FILE",
+            help="Checkpoint of the stage light-features, for the feature loss on textures.",
+            show_default="without this loss",
+        ),
     ] = None,
-    jobs: Annotated[int, typer.Option("--jobs", "-j", min=1, help="Processes that bake, or unwrap.")] = 2,
+    without_normals: Annotated[
+        bool, _loss("--without-normals", help="Ablation: the Reflectance Network sees no normal maps.")
+    ] = False,
+    mean_face: Annotated[
+        bool, _loss("--mean-face", help="Ablation: the mean face for everybody; only poses are fitted.")
+    ] = False,
+    batch: Annotated[
+        int | None,
+        _speed(min=1, help="Samples a step, of all processes together.", show_default="4; paper 1, tiny 2"),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        _speed(min=0, help="Processes that draw samples ahead.", show_default="0 on a CPU, 4 on a GPU"),
+    ] = None,
+    bf16: Annotated[
+        bool | None,
+        _speed("--bf16/--no-bf16", help="Mixed precision.", show_default="on; paper and tiny off"),
+    ] = None,
+    compile_model: Annotated[
+        bool, _speed("--compile", help="Let torch compile the step; the first ones take minutes.")
+    ] = False,
 ) -> None:
-    """Train the Reflectance Network on synthetic heads, without a light stage, or on a prepared dataset.
+    """Train the networks on synthetic heads, without a light stage, or on a prepared dataset.
 
     Heads are drawn from a face model and their light transport is baked once; skins, lights and cameras are
-    drawn anew at every step. DIR gets last.safetensors (for --checkpoint), log.jsonl and validation.png.
+    drawn anew at every step. A dataset is unwrapped once into DATASET/textures-PX; its split train is trained
+    on, its split validation measured, its split test left alone. Sources are those of relight-dataset, or,
+    where there are none, the stacks under lights that are drawn.
 
-    A dataset is unwrapped once into DATASET/textures-PX; its split train is trained on, its split validation
-    measured (si_mse in the log), its split test left alone. Sources are those of relight-dataset, or, where
-    there are none, the stacks under lights that are drawn.
+    DIR gets last.safetensors and best.safetensors (for --checkpoint and --start-from), log.jsonl,
+    validation-STEP.png, what TensorBoard shows (tensorboard --logdir DIR), and state.pt, from which --resume
+    goes on. On a CPU a run of --steps is the same to the last digit however often it was stopped.
+
+    Several processes, one a GPU: torchrun --nproc-per-node N -m facerf_cli train ...
     """
-    from facerf_cli.face.topology import LAYOUT_VERSION
-    from facerf_cli.network.saved import load_networks
-    from facerf_cli.training import TrainSettings
+    from facerf_cli.runs.processes import joined_processes
+
+    stage = stage or ("joint" if preset == "paper" else "reflectance")
+    refuse_what_makes_no_sense(context, stage)
+    settings = settings_of(context)
+    training = _training(preset, steps, max_time, settings.seed, compile_model)
+    training = replace(
+        training,
+        batch=batch or training.batch,
+        validate_every=validate_every or training.validate_every,
+        bf16=training.bf16 if bf16 is None else bf16,
+    )
+    options = TrainOptions(
+        output=output,
+        preset=preset,
+        stage=stage,
+        dataset=dataset,
+        heads_from=heads_from,
+        fit_with=fit_with,
+        heads=heads,
+        views=views,
+        bank=bank,
+        texture_size=texture_size,
+        photos=photos,
+        vgg_weights=vgg_weights,
+        light_features=light_features,
+        without_normals=without_normals,
+        mean_face=mean_face,
+        jobs=jobs,
+        settings=settings,
+    )
+    with joined_processes():
+        _train(options, training, workers, start_from, resume)
+
+
+def _train(
+    options: TrainOptions,
+    training: "TrainSettings",
+    workers: int | None,
+    start_from: Path | None,
+    resume: bool,
+) -> None:
+    from facerf_cli.runs.folder import refuse_another_run
+    from facerf_cli.runs.processes import first_process_first, process_rank
     from facerf_cli.training import train as run_training
 
-    settings = settings_of(context)
-    training = TrainSettings(max_seconds=_seconds(max_time), seed=settings.seed)
-    if dataset is None:
-        _refuse(context, _OF_A_DATASET, "is for a prepared dataset; give --dataset beside it")
-    else:
-        _refuse(
-            context, _OF_THE_BANK, "is for synthetic heads, and --dataset takes their place; give one of them"
-        )
-    if start_from:
-        load_networks(start_from, LAYOUT_VERSION)  # a bad file is named before hours of baking
-    source: SampleSource
-    if dataset is not None:
-        source = _open_dataset(dataset, fit_with, texture_size, jobs)
-    else:
-        source = _fill_bank(bank or output / "bank", heads_from, fit_with, heads, views, jobs, settings)
-    report = _Progress(training.max_seconds, settings)
-    with report:
-        checkpoint = run_training(
-            source, output, training, start_from=start_from, device=torch_device(settings), report=report.row
-        )
-    print(checkpoint)
+    device, first = torch_device(options.settings), process_rank() == 0
+    if workers is None:
+        workers = _WORKERS_ON_GPU if device.type == "cuda" else 0
+    training = replace(training, workers=workers)
+    trained, start = _start(start_from, options.stage)
+    with first_process_first():
+        if first and not resume:
+            refuse_another_run(options.output)  # before hours of baking
+        objective = build_objective(replace(options, networks=trained))
+    with TrainProgress(training.steps, training.max_seconds, options.settings, first) as progress:
+        checkpoint = run_training(objective, options.output, training, start, resume, device, progress.row)
+    if first:
+        print(checkpoint)
 
 
-def _refuse(context: typer.Context, names: tuple[str, ...], why: str) -> None:
-    """Raise for options that were given although they mean nothing here."""
-    for name in names:
-        given = context.get_parameter_source(name)
-        if given is not None and given.name == "COMMANDLINE":
-            raise UsageError(f"--{name.replace('_', '-')} {why}")
+def _training(
+    preset: Preset, steps: int | None, max_time: str | None, seed: int, compile_model: bool
+) -> "TrainSettings":
+    from facerf_cli.runs.settings import PRESETS
 
-
-def _open_dataset(folder: Path, fit_with: str, side: int, jobs: int) -> "SampleSource":
-    from facerf_cli.stage.data.captured import open_captured
-
-    return open_captured(folder, fit_with, side, jobs)
+    if max_time is None and steps is None:
+        max_time = _DEFAULT_TIME
+    max_seconds = _seconds(max_time) if max_time else None
+    return replace(PRESETS[preset], steps=steps, max_seconds=max_seconds, seed=seed, compile=compile_model)
 
 
 def _seconds(text: str) -> float:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
-    if not match:
+    if not match or not float(match[1]):
         raise UsageError(f"--max-time {text}: write a number and s, m or h, such as 45m")
     return float(match[1]) * _UNITS_S[match[2]]
 
 
-def _fill_bank(
-    folder: Path, heads_from: str, fit_with: str, heads: int, views: int, jobs: int, settings: Settings
-) -> "Bank":
-    from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.stage.bank import add_views, load_bank
-    from facerf_cli.stage.geometries import build_geometries
+def _start(path: Path | None, stage: Stage) -> "tuple[dict[str, nn.Module], Start]":
+    """The networks of a checkpoint that the stage goes on with, and what the run carries over."""
+    from facerf_cli.face.topology import LAYOUT_VERSION
+    from facerf_cli.network.saved import load_networks
+    from facerf_cli.training import Start
 
-    drawn, fitted = load_face_model(heads_from), load_face_model(fit_with)
-    build_geometries(folder / "heads", heads_from, heads, jobs, settings.seed)
-    add_views(folder / "heads", folder / f"views-{fitted.name}", fit_with, views, jobs, settings.seed)
-    filled = load_bank(folder / "heads", folder / f"views-{fitted.name}", {})
-    provenance = {
-        "heads": f"{len(filled.geometries)} synthetic heads drawn from {drawn.name} ({drawn.licence})",
-        "fitted_with": f"{fitted.name} ({fitted.licence})",
-        "skin": "procedural (facerf)",
-        "licence": f"MIT; the heads' shapes: {drawn.licence}",
-    }
-    return replace(filled, provenance=provenance)
-
-
-class _Progress:
-    """A bar on stderr where that is a terminal: time, step, loss, and the share of time spent drawing."""
-
-    def __init__(self, total_s: float, settings: Settings) -> None:
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-        self.bar = Progress(*columns, console=STDERR, disable=not shown)
-        self.task = self.bar.add_task("training", total=total_s)
-        self.smooth: float | None = None
-
-    def __enter__(self) -> "_Progress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.bar.stop()
-
-    def row(self, row: dict[str, float]) -> None:
-        """Show one row of the log."""
-        self.smooth = row["loss"] if self.smooth is None else 0.98 * self.smooth + 0.02 * row["loss"]
-        text = f"step {row['step']:.0f}  loss {self.smooth:.4f}  drawing {100 * row['drawing']:.0f} %"
-        self.bar.update(self.task, completed=row["seconds"], description=text)
+    if path is None:
+        return {}, Start()
+    networks, metadata = load_networks(path, LAYOUT_VERSION)
+    names = trained_networks(stage)
+    trained = {name: network for name, network in networks.items() if name in names}
+    return trained, Start({k: v for k, v in networks.items() if k not in names}, metadata)

@@ -29,6 +29,7 @@ class ReflectanceSettings:
     decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
     template_channels: int = 8
     rig_lights: int = 150  # whose shadows on the mean face it holds
+    normals: bool = True  # False: normal maps of zeros in their place (paper, 'Ablative Study')
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ class ReflectanceNetwork(nn.Module):
         exposure = exposure.clamp_min(1e-6)
         source_root = (texture / exposure).clamp_min(0).sqrt()
         side = self.settings.side
-        small = [_resize(x, side) for x in (source_root, visible, normals_source)]
+        small = [_resize(x, side) for x in (source_root, visible, self._seen(normals_source))]
         template = F.interpolate(self.template[None], (side, side), mode="bilinear", align_corners=False)
         x = torch.cat([*small, template.expand(len(texture), -1, -1, -1)], 1)
         features = []
@@ -119,7 +120,7 @@ class ReflectanceNetwork(nn.Module):
     def decode_root(self, encoded: Encoded, normals_target: Tensor, lights: Tensor) -> Tensor:
         """Square roots [B, L, 3, T, T] of the textures at the normalised exposure; may dip below zero."""
         faces, count, _ = lights.shape
-        maps, base, code = self._light_inputs(normals_target, lights)
+        maps, base, code = self._light_inputs(self._seen(normals_target), lights)
         x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
         for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
             x = up(x, skip, maps, code, count)
@@ -127,6 +128,9 @@ class ReflectanceNetwork(nn.Module):
         gain = gain + _resize(base, encoded.source_root.shape[-1])
         root = encoded.source_root.repeat_interleave(count, 0) * gain + bias
         return root.view(faces, count, *root.shape[1:])
+
+    def _seen(self, normals: Tensor) -> Tensor:
+        return normals if self.settings.normals else torch.zeros_like(normals)
 
     def _light_inputs(self, normals_target: Tensor, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], modulation code [B*L, 96]."""

@@ -34,6 +34,7 @@ class Objective(nn.Module):
     networks: nn.ModuleDict  # trained, averaged, saved: among 'reflectance', 'geometry', 'light_features'
     chooses_by: str  # the metric of `validate`, lower is better, that chooses best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; its 'licence' is the words for the whole
+    skips_networks: bool = False  # whether a batch may leave some of their weights without a gradient
     bf16: bool = False  # set by the loop: networks may run in mixed precision, see `mixed_precision`
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:

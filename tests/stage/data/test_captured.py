@@ -10,9 +10,11 @@ from safetensors import safe_open
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceSettings
+from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.network.saved import load_networks
+from facerf_cli.objectives.chart import ChartObjective, ChartSettings
 from facerf_cli.raster.texture import unwrap
+from facerf_cli.runs.settings import PRESETS
 from facerf_cli.stage.data.captured import Captured, View, open_captured
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.map_weights import name_maps
@@ -22,7 +24,7 @@ from facerf_cli.stage.data.relighting import relight_subject
 from facerf_cli.stage.data.textures import texture_path
 from facerf_cli.stage.samples import Sample
 from facerf_cli.stage.sky.skies import ProceduralMaps
-from facerf_cli.training import TrainSettings, train
+from facerf_cli.training import train
 from tests.stage.data.dataset_fixture import write_small_dataset
 
 SIDE, LIGHTS = 32, 20
@@ -162,10 +164,8 @@ def test_a_changed_stack_or_a_damaged_texture_is_unwrapped_again(dataset: Datase
 
 
 def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: Captured, tmp_path: Path) -> None:
-    settings = TrainSettings(
-        batch=2, lights=3, warmup_steps=5, learning_rate=4e-3, max_steps=60, validate_every=100, bf16=False
-    )
-    path = train(lazy, tmp_path, settings, NETWORK)
+    objective = ChartObjective(lazy, ReflectanceNetwork(NETWORK), settings=ChartSettings(lights=3))
+    path = train(objective, tmp_path, replace(PRESETS["tiny"], steps=60, validate_every=100))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])
     assert losses[-10:].mean() < 0.85 * losses[:10].mean()

@@ -1,0 +1,200 @@
+"""What `facerf train` trains: an objective, its networks and its data, from the options."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from facerf_cli.commands.options import Settings
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from facerf_cli.objectives.objective import Objective
+    from facerf_cli.stage.bank import Bank
+    from facerf_cli.stage.samples import SampleSource
+
+Preset = Literal["default", "paper", "tiny"]
+Stage = Literal["reflectance", "geometry", "joint", "light-features"]
+_PICTURES_OF_A_HEAD = 24
+_JOINT_SIDES = {"default": 256, "tiny": 64}  # of crops and textures; the paper has 512
+_TINY_WIDTHS = (8, 12, 16)
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """The line, checked; `networks` are those of --start-from."""
+
+    output: Path
+    preset: Preset
+    stage: Stage
+    dataset: Path | None
+    heads_from: str
+    fit_with: str
+    heads: int
+    views: int
+    bank: Path | None
+    texture_size: int
+    photos: Path | None
+    vgg_weights: str | None
+    light_features: Path | None
+    without_normals: bool
+    mean_face: bool
+    jobs: int
+    settings: Settings
+    networks: dict[str, "nn.Module"] = field(default_factory=dict)
+
+
+def build_objective(options: TrainOptions) -> "Objective":
+    """The stage's objective; bakes, unwraps and finds whatever it draws from, where that is missing."""
+    builders = {
+        "reflectance": _chart,
+        "geometry": _geometry,
+        "light-features": _light_features,
+        "joint": _joint,
+    }
+    return builders[options.stage](options)
+
+
+def trained_networks(stage: Stage) -> tuple[str, ...]:
+    """Names of the networks that a stage trains."""
+    return ("reflectance", "geometry") if stage == "joint" else (stage.replace("-", "_"),)
+
+
+def _chart(options: TrainOptions) -> "Objective":
+    from facerf_cli.objectives.chart import ChartObjective
+    from facerf_cli.objectives.feature_networks import load_light_features
+
+    light = load_light_features(options.light_features) if options.light_features else None
+    network = options.networks.get("reflectance") or _reflectance(options)
+    return ChartObjective(_samples(options), network, light)
+
+
+def _light_features(options: TrainOptions) -> "Objective":
+    from facerf_cli.network.features import LightNetwork, LightSettings
+    from facerf_cli.objectives.light_features import LightFeaturesObjective
+
+    width = {"default": LightSettings.width, "tiny": 0.05, "paper": 1.0}[options.preset]
+    network: Any = options.networks.get("light_features") or LightNetwork(LightSettings(width=width))
+    return LightFeaturesObjective(_samples(options), network)
+
+
+def _geometry(options: TrainOptions) -> "Objective":
+    from facerf_cli.objectives.geometry import GeometryObjective
+    from facerf_cli.stage.face_pictures import add_pictures
+    from facerf_cli.stage.rendered_faces import RenderedFaces
+
+    folder = options.bank or options.output / "bank"
+    provenance = _bake(options, folder)
+    pictures = folder / "pictures"
+    add_pictures(folder / "heads", pictures, _PICTURES_OF_A_HEAD, options.jobs, options.settings.seed)
+    faces = RenderedFaces(pictures, provenance)
+    network: Any = options.networks.get("geometry")
+    return GeometryObjective(faces, network or _geometry_network(options, faces.mean_translation_m()))
+
+
+def _joint(options: TrainOptions) -> "Objective":
+    from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.objectives.feature_networks import load_light_features, load_vgg
+    from facerf_cli.objectives.joint import JointObjective, JointSettings
+    from facerf_cli.stage.data.dataset import read_dataset
+
+    assert options.dataset
+    vgg = options.vgg_weights is not None or options.preset == "paper"  # which does not go without
+    side = _JOINT_SIDES.get(options.preset, 512)
+    objective = JointObjective(
+        read_dataset(options.dataset),
+        load_face_model(options.fit_with),
+        options.networks.get("reflectance") or _reflectance(options),
+        options.networks.get("geometry") or _geometry_network(options),
+        load_vgg(options.vgg_weights) if vgg else None,
+        load_light_features(options.light_features) if options.light_features else None,
+        _photos(options, side),
+        JointSettings(side, side, mean_face=options.mean_face, seed=options.settings.seed),
+    )
+    objective.skips_networks = options.photos is not None
+    return objective
+
+
+def _photos(options: TrainOptions, side: int) -> Any:
+    from facerf_cli.commands.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.stage.photos import open_photos
+
+    if options.photos is None:
+        return None
+    items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
+    paths = [item.input_path for item in items]
+    return open_photos(paths, options.output / "photos", side, options.jobs)
+
+
+def _reflectance(options: TrainOptions) -> Any:
+    from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork, PaperReflectanceSettings
+    from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+
+    normals = not options.without_normals
+    if options.preset == "paper":
+        return PaperReflectanceNetwork(PaperReflectanceSettings(normals=normals))
+    if options.preset == "tiny":
+        return ReflectanceNetwork(
+            ReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2, normals=normals)
+        )
+    return ReflectanceNetwork(ReflectanceSettings(normals=normals))
+
+
+def _geometry_network(options: TrainOptions, mean_m: tuple[float, float, float] | None = None) -> Any:
+    from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+
+    form: Any = "paper" if options.preset == "paper" else "default"
+    return GeometryNetwork(GeometrySettings(form, mean_translation_m=mean_m or (0.0, 0.0, -1.1)))
+
+
+def _samples(options: TrainOptions) -> "SampleSource":
+    """A dataset's textures, or the bank."""
+    from facerf_cli.stage.data.captured import open_captured
+
+    if options.dataset:
+        return open_captured(options.dataset, options.fit_with, options.texture_size, options.jobs)
+    return _fill_bank(options, options.bank or options.output / "bank")
+
+
+def _fill_bank(options: TrainOptions, folder: Path) -> "Bank":
+    from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.stage.bank import add_views, load_bank
+
+    provenance = _bake(options, folder)
+    fitted_with = _mean_model(options, folder) if options.mean_face else options.fit_with
+    fitted = load_face_model(fitted_with)
+    views = folder / f"views-{fitted.name}"
+    add_views(folder / "heads", views, fitted_with, options.views, options.jobs, options.settings.seed)
+    fit = {"fitted_with": f"{fitted.name} ({fitted.licence})", "skin": "procedural (facerf)"}
+    return load_bank(folder / "heads", views, provenance | fit)
+
+
+def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
+    """Bake the heads that are missing; what they are made of."""
+    from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.stage.geometries import build_geometries
+
+    drawn = load_face_model(options.heads_from)
+    load_face_model(options.fit_with)  # a bad one is named before anything is baked
+    build_geometries(folder / "heads", options.heads_from, options.heads, options.jobs, options.settings.seed)
+    return {
+        "heads": f"{options.heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "licence": f"MIT; the heads' shapes: {drawn.licence}",
+    }
+
+
+def _mean_model(options: TrainOptions, folder: Path) -> str:
+    """The face model to fit with, with shapes that do nothing: its fit is a pose."""
+    from facerf_cli.face.morphable import load_face_model, save_face_model
+
+    model = load_face_model(options.fit_with)
+    still = replace(
+        model,
+        name=f"{model.name}-mean",
+        identity=model.identity[:1] * 0,
+        expression=model.expression[:1] * 0,
+        expression_names=model.expression_names[:1],
+    )
+    path = folder / f"{still.name}.npz"
+    save_face_model(path, still)
+    return str(path)
