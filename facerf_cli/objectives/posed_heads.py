@@ -73,6 +73,7 @@ class Unwrapped:
     normals: Tensor
 
 
+@torch.compiler.disable  # type: ignore[untyped-decorator]  # its shapes depend on what is seen
 def unwrap_pictures(pictures: Tensor, heads: PosedHeads, camera: Camera, side: int) -> Unwrapped:
     """T_s and N_s of pictures [B, 3, S, S] of the heads."""
     triangles = grid_triangles().to(pictures.device)
@@ -90,6 +91,7 @@ def head_normals(heads: PosedHeads, side: int) -> Tensor:
     return torch.stack([normal_map(vertices, triangles, side) for vertices in heads.vertices])
 
 
+@torch.compiler.disable  # type: ignore[untyped-decorator]  # its shapes depend on what is seen
 def render_textures(textures: Tensor, heads: PosedHeads, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pictures [B, C, S, S] of textures [B, C, T, T] on the heads, and M_t [B, 1, S, S] in 0..1."""
     device = textures.device
