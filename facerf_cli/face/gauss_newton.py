@@ -177,7 +177,7 @@ def jacobian(problem: Problem, state: FitState, at: Residuals) -> Tensor:
     by_contour = contour @ modes[at.ids[:, : len(CONTOUR)]]
     # the inner landmarks' modes are the same for all faces: one product a landmark, all faces at once
     by_inner = (inner.permute(1, 0, 2, 3).flatten(1, 2) @ modes[:INNER_COUNT]).reshape(
-        INNER_COUNT, -1, 2, modes.shape[-1]
+        INNER_COUNT, len(inner), 2, modes.shape[-1]
     )
     by_coordinates = torch.cat([by_contour, by_inner.permute(1, 0, 2, 3)], 1)
     return torch.cat([by_pose, by_coordinates], -1)

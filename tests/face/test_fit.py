@@ -65,6 +65,14 @@ def test_the_pose_of_the_mean_is_found_exactly(model, pose):
     assert fit.alpha.abs().max() < 1e-2 and fit.error_iod.item() < 1e-5
 
 
+def test_a_model_whose_shapes_do_nothing_is_posed_alone(model):
+    still = replace(model, identity=model.identity[:1] * 0, expression=model.expression[:1] * 0)
+    landmarks_px = see(still, *coefficients(still, 0, batch=2), (25, -10, 5))
+    fit = fit_batch(still, landmarks_px, CAMERA, FitSettings(steps=40), INNER_ONLY.expand(2, -1))
+    assert angle_deg(fit.rotation[1], pose_to_rotation(25, -10, 5)) < 0.02
+    assert fit.alpha.shape == fit.beta.shape == (2, 1) and fit.error_iod.max() < 1e-5
+
+
 def test_with_weak_priors_any_shape_is_reached(model):
     landmarks_px = see(model, *coefficients(model, 0.5), (12, 5, 3))
     assert fit_batch(model, landmarks_px, CAMERA, WEAK, INNER_ONLY).error_iod.item() < 2e-3
