@@ -22,7 +22,7 @@ import torch
 from bootstrap import mean_interval
 from torch import Tensor
 
-from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.fit import FaceFit, fit_from_arrays, fit_landmarks
 from facerf_cli.face.interior import interior_mask
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.files.images import read_image
@@ -53,15 +53,14 @@ def main() -> None:
     given = _arguments()
     dataset = read_dataset(given.dataset)
     models = load_models(given.checkpoint, given.face_model, torch.device("cpu"))
-    if models.face.name != dataset.face_model:
-        raise SystemExit(f"{given.dataset}: fitted with {dataset.face_model}; give that with --face-model")
-    pairs = [pair for pair in read_pairs(dataset) if given.split in ("all", pair.split)]
-    if not pairs:
-        raise SystemExit(f"{given.dataset}: no pairs in the split {given.split}; run facerf relight-dataset")
-    measured = list(measure(models, dataset, pairs[:: given.every]))
+    if models.face.name != dataset.face_model and not given.refit:
+        raise SystemExit(f"{given.dataset}: fitted with {dataset.face_model}; give --face-model, or --refit")
+    pairs = pairs_of(dataset, given.split)
+    measured = list(measure(models, dataset, pairs[:: given.every], given.refit))
     found = summary(measured) | {
         "checkpoint": str(given.checkpoint or "shipped"),
         "split": given.split,
+        "refit": given.refit,
         "people": len({m.subject for m in measured}),
     }
     print(table(found))
@@ -78,17 +77,26 @@ def _arguments() -> argparse.Namespace:
     add("--split", default="test", choices=[*SPLITS, "all"], help="all: of a dataset never trained on")
     add("--checkpoint", type=Path, help="default: the one shipped")
     add("--face-model", default="builtin", help="that the dataset was fitted with")
+    add("--refit", action="store_true", help="fit each picture's landmarks alone, not a person's all at once")
     add("--every", type=int, default=1, help="take every Nth pair only")
     add("--json", type=Path, help="write all figures here")
     return parser.parse_args()
 
 
+def pairs_of(dataset: Dataset, split: str) -> list[Pair]:
+    """A split's pairs, or all."""
+    pairs = [pair for pair in read_pairs(dataset) if split in ("all", pair.split)]
+    if not pairs:
+        raise SystemExit(f"{dataset.folder}: no pairs in the split {split}; run facerf relight-dataset")
+    return pairs
+
+
 @torch.no_grad()
-def measure(models: Models, dataset: Dataset, pairs: list[Pair]) -> Iterator[Measured]:
+def measure(models: Models, dataset: Dataset, pairs: list[Pair], refit: bool) -> Iterator[Measured]:
     """The errors of pairs."""
     for subject, of_subject in groupby(pairs, lambda pair: pair.subject):
         stacks = {camera: dataset.stack_path(subject, camera) for camera in dataset.cameras[subject]}
-        views = {camera: View.of(models, read_olat_header(stack)) for camera, stack in stacks.items()}
+        views = {camera: _view(models, read_olat_header(stack), refit) for camera, stack in stacks.items()}
         for pair in of_subject:
             path = picture_path(dataset, *pair.key)
             yield _measure_pair(models, pair, path, stacks[pair.target_camera], views)
@@ -98,7 +106,7 @@ def _measure_pair(models: Models, pair: Pair, path: Path, stack: Path, views: di
     """The errors of one pair: `path` is its source, `stack` holds its target."""
     source, target = views[pair.source_camera], views[pair.target_camera]
     fit, face = source.fit, source.texture_of(path)
-    if not torch.equal(fit.alpha, target.fit.alpha):  # fits of the same camera, or joint ones, are alike
+    if not torch.equal(fit.alpha, target.fit.alpha):  # not of one joint fit: the source's face in that pose
         target = View.of(models, target.header, replace(target.fit, alpha=fit.alpha, beta=fit.beta))
     light = torch.from_numpy(target.header.directions[pair.target_light]).float()
     turn = turn_to(fit, target.fit.rotation)
@@ -107,6 +115,14 @@ def _measure_pair(models: Models, pair: Pair, path: Path, stack: Path, views: di
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
     errors = (target.error(texture, truth) for texture in (predicted, face.texture * cosine))
     return Measured(pair.subject, pair.source_camera == pair.target_camera, *errors)
+
+
+def _view(models: Models, header: StackHeader, refit: bool) -> "View":
+    """A stack's crop seen with the dataset's fit, or with one of its own landmarks."""
+    fit = fit_from_arrays(header.fit)
+    if refit:
+        fit = fit_landmarks(models.face, fit.landmarks_px.double().numpy(), fit.crop)
+    return View.of(models, header, fit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +136,8 @@ class View:
     mask: Tensor  # [1, H, W] in 0..1
 
     @staticmethod
-    def of(models: Models, header: StackHeader, fit: FaceFit | None = None) -> "View":
-        """A stack seen with its own fit, or another."""
-        fit = fit or fit_from_arrays(header.fit)
+    def of(models: Models, header: StackHeader, fit: FaceFit) -> "View":
+        """A stack seen with a fit."""
         vertices = fit.vertices_camera(models.face)
         fragments = rasterize(vertices, grid_triangles(), fit.camera)
         uv = interpolate(grid_uv(), grid_triangles(), fragments)
