@@ -10,7 +10,11 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
+import torch
 from bootstrap import average, mean_interval
+from loss_curve import curve, draw_chart, read_log
+from synthetic import Picture, summary, tone_drift_deg, tone_of
+from synthetic import table as held_out_table
 from yale_table import COLUMNS, results, table
 
 
@@ -85,3 +89,53 @@ def test_no_bar_is_held_against_a_part_of_the_subjects() -> None:
     assert not any("bar" in column for column in found["columns"].values())
     assert "no bar" in table(found) and "0.0010" in table(found)
     assert "bar: yes" in table(results(["a"], [rows(0.001, 0.9)], whole=True))
+
+
+@pytest.mark.parametrize(
+    ("ita", "tone"),
+    [(70, "very light"), (55, "light"), (41, "intermediate"), (28, "tan"), (10, "brown"), (-30, "dark")],
+)
+def test_tones_are_the_published_classes(ita: float, tone: str) -> None:
+    assert tone_of(ita) == tone
+
+
+def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
+    albedo = np.array([0.45, 0.30, 0.22])
+    truth = torch.from_numpy(albedo).float().view(3, 1, 1).expand(3, 32, 32)
+    weight = torch.ones(32, 32)
+    for exposure in (0.2, 1.0, 5.0):  # a picture's own says nothing of the skin
+        assert tone_drift_deg(exposure * truth, exposure * truth, weight, albedo) == pytest.approx(
+            0, abs=1e-3
+        )
+    darker = tone_drift_deg(0.6 * truth, truth, weight, albedo)
+    redder = tone_drift_deg(truth * torch.tensor([1.1, 0.95, 1.0]).view(3, 1, 1), truth, weight, albedo)
+    assert darker is not None and darker < -5
+    assert redder is not None and abs(redder) < 5  # the angle is of lightness and blue to yellow
+    assert tone_drift_deg(truth, truth.mean(0, keepdim=True).expand(3, -1, -1), weight, albedo) is None
+
+
+def test_rows_of_held_out_heads() -> None:
+    pictures = [
+        Picture(head, same, angle, tone, error, 2 * error, drift)
+        for head in (1, 2)
+        for same, angle, tone, error, drift in (
+            (True, 10.0, "tan", 0.001, -2.0),
+            (False, 75.0, None, 0.003, None),
+        )
+    ]
+    found = summary(pictures)
+    assert found["rows"]["same pose"]["si_mse"]["mean"] == pytest.approx(0.001)
+    assert found["rows"]["60 to 90 deg"]["lambert"]["mean"] == pytest.approx(0.006)
+    assert found["tones"]["tan"]["drift_deg"]["mean"] == -2 and found["tones"]["dark"]["si_mse"] is None
+    assert found["tones"]["random colours"]["si_mse"]["pictures"] == 2
+    assert "random colours" in held_out_table(found | {"checkpoint": "one"})
+
+
+def test_the_log_is_read_to_where_it_was_cut_short(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_text('{"step": 1, "loss": 2.0, "terms": {"root": 1.5}}\n{"step": 2, "loss": 1.0, "validat')
+    rows = read_log(path)
+    np.testing.assert_equal(curve(rows, "loss"), [[1, 2.0]])
+    np.testing.assert_equal(curve(rows, "root"), [[1, 1.5]])
+    assert len(curve(rows, "si_mse")) == 0
+    assert draw_chart([curve(rows, "loss")], [curve(rows, "si_mse")], ["a"], ("loss", "si_mse")).width == 1100
