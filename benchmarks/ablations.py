@@ -127,7 +127,8 @@ def measure(checkpoint: Path, bank: Path, mean_face: bool, given: argparse.Names
 def table(result: dict[str, Any]) -> str:
     """The figures for reading, in the shape of the paper's tables."""
     names = list(result["ablations"])
-    lines = [f"{result['steps']} steps each on {result['heads']} heads, seed {result['seed']}: Si-MSE (sd)"]
+    lines = [f"{result['steps']} steps each on {result['heads']} heads, seed {result['seed']}: "]
+    lines[0] += "Si-MSE, truth clipped at white (sd)"
     people = result["ablations"][names[0]]["people"]
     parts = [("chart", "held-out heads, in the chart")]
     if people:
@@ -135,7 +136,7 @@ def table(result: dict[str, Any]) -> str:
     for part, title in parts:
         lines.append(f"{title:34}" + "".join(f"{name:>24}" for name in names))
         for row in ("same pose", "different pose"):
-            cells = [result["ablations"][name][part][row]["si_mse"] for name in names]
+            cells = [result["ablations"][name][part][row]["clipped"] for name in names]
             lines.append(f"  {row:32}" + "".join(f"{c['mean']:13.5f} ({c['sd']:.5f})  " for c in cells))
     return "\n".join(lines)
 

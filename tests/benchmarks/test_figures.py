@@ -116,7 +116,7 @@ def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
 
 def test_rows_of_held_out_heads() -> None:
     pictures = [
-        Picture(head, same, angle, tone, error, 2 * error, drift)
+        Picture(head, same, angle, tone, error, error, 2 * error, drift)
         for head in (1, 2)
         for same, angle, tone, error, drift in (
             (True, 10.0, "tan", 0.001, -2.0),
