@@ -25,8 +25,13 @@ lint: $(STAMP)
 test: lint
 	OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest
 
-bench: $(STAMP)  # but for those that want a bank, a capture or a command
-	set -e; for script in $(filter-out benchmarks/synthetic.py benchmarks/synth_stage.py benchmarks/resume.py, $(wildcard benchmarks/*.py)); do echo "== $$script"; $(VENV)/bin/python $$script; done
+# Those that want a bank, a dataset, a run or a command, and what scripts share.
+NOT_ALONE := ablations bootstrap geometry_network loss_curve model_card resume synth_stage synthetic table1 \
+	training_speed yale_table
+ALONE = $(filter-out $(NOT_ALONE:%=benchmarks/%.py), $(wildcard benchmarks/*.py))
+
+bench: $(STAMP)
+	set -e; for script in $(ALONE); do echo "== $$script"; $(VENV)/bin/python $$script; done
 
 man: $(STAMP)
 	$(VENV)/bin/python -m facerf_cli.manpages man
