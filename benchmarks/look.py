@@ -88,7 +88,9 @@ def _row(photo: Path, folder: Path, envmap: Path, cell_px: int) -> list[np.ndarr
     shots = [f"light_{lamp.replace(',', '_')}" for lamp in LAMPS.values()] + [envmap.stem]
     (own,) = (path for path in folder.iterdir() if path.name.rsplit("-", 1)[0] == photo.stem)
     relit = [read_image(own / f"{photo.stem}_{shot}.png").pixels for shot in shots]
-    return [_displayed(frame.apply(picture)) for picture in (original, *relit)]
+    beyond = ~frame.valid(*original.shape[:2])
+    shown = [_displayed(frame.apply(picture)) for picture in (original, *relit)]
+    return [np.where(beyond[..., None], np.uint8(255), picture) for picture in shown]
 
 
 def _head(photo: np.ndarray, path: Path, cell_px: int) -> Crop:
