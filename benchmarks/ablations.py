@@ -6,7 +6,7 @@ Each is trained from scratch by `facerf train` on the same baked heads, with the
 number of steps, then measured (1) as the paper does, on pictures of held-out people, each fitted by its own
 landmarks with the face model that the run was trained with (`table1.py --refit`), and (2) on held-out heads
 in the chart of their fits (`synthetic.py`), where a wrong shape costs less, for the truth is seen through
-the same fit. A finished run is not trained again.
+the same fit. What is interrupted goes on; a finished run is not trained again.
 """
 
 import argparse
@@ -99,7 +99,7 @@ def train(folder: Path, bank: Path, options: list[str], given: argparse.Namespac
         *options,
     ]
     words += ["--heads-from", given.heads_from]
-    words += ["--steps", str(given.steps), "--validate-every", str(given.steps), "--jobs", "1"]
+    words += ["--steps", str(given.steps), "--validate-every", str(max(1, given.steps // 3)), "--jobs", "1"]
     if (folder / "state.pt").exists():
         words.append("--resume")
     if subprocess.run(words, stdout=sys.stderr).returncode:

@@ -38,7 +38,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as scratch:
             relight(photos, checkpoint, given.envmap, Path(scratch))
             rows.append([_row(photo, Path(scratch), given.envmap, given.cell) for photo in photos])
-    names = [path.stem if path else "" for path in given.checkpoint or [None]]
+    names = [f"{path.parent.name}/{path.stem}" if path else "" for path in given.checkpoint or [None]]
     sheet = [
         _labelled(row[i], _labels(photo, name, given.envmap), given.cell)
         for i, photo in enumerate(photos)
