@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,11 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import torch
 from bootstrap import average, mean_interval
 from loss_curve import curve, draw_chart, read_log
+from model_card import ablations, speed, synthetic, table1, yale
 from synthetic import Picture, summary, tone_drift_deg, tone_of
 from synthetic import table as held_out_table
+from table1 import Measured
+from table1 import summary as table1_summary
 from yale_table import COLUMNS, results, table
 
 
@@ -139,3 +143,25 @@ def test_the_log_is_read_to_where_it_was_cut_short(tmp_path: Path) -> None:
     np.testing.assert_equal(curve(rows, "root"), [[1, 1.5]])
     assert len(curve(rows, "si_mse")) == 0
     assert draw_chart([curve(rows, "loss")], [curve(rows, "si_mse")], ["a"], ("loss", "si_mse")).width == 1100
+
+
+def test_the_cards_tables_are_rectangular() -> None:
+    whole = results(["a", "b"], [rows(0.002, 0.8), rows(0.003, 0.8)], whole=True)
+    picture = Picture(1, True, 10.0, "tan", 0.001, 0.001, 0.002, -2.0)
+    heads = summary([picture, replace(picture, same_pose=False, tone=None, drift_deg=None)])
+    people = table1_summary([Measured("p", same, 0.003, 0.002, 0.004) for same in (True, False)])
+    runs = {"steps": 9, "ablations": {"full": people, "mean face": people}}
+    rates = {"steps_per_s": 1.0, "bare_steps_per_s": 2.0, "ratio": 0.5, "waiting": 0.1}
+    written = [
+        yale(whole),
+        synthetic(heads),
+        table1(people | {"people": 1}),
+        ablations(runs),
+        speed({"presets": {"tiny": rates}}),
+    ]
+    for lines in written:
+        parts = "\n".join(lines).split("\n\n")
+        for part in parts:
+            assert len({line.count("|") for line in part.splitlines()}) == 1 and part.count("\n") >= 2
+    with pytest.raises(SystemExit, match="a part"):
+        yale(results(["a"], [rows(0.002, 0.8)], whole=False))
