@@ -93,8 +93,12 @@ def train(
         str,
         _data(metavar="NAME|PATH", help="Face model that they are, or the dataset was, fitted with."),
     ] = "builtin",
-    heads: Annotated[int, _data(min=16, help="Synthetic heads to bake.")] = 240,
-    views: Annotated[int, _data(min=1, help="Fitted views of each head.")] = 8,
+    heads: Annotated[
+        int | None, _data(min=2, help="Synthetic heads to bake.", show_default="240; tiny 16")
+    ] = None,
+    views: Annotated[
+        int | None, _data(min=1, help="Fitted views of each head.", show_default="8; tiny 2")
+    ] = None,
     bank: Annotated[
         Path | None, _data(metavar="DIR", help="Where baked heads are kept.", show_default="DIR/bank")
     ] = None,

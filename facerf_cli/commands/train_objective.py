@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from facerf_cli.commands.options import Settings
+from facerf_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from torch import nn
@@ -15,9 +16,27 @@ if TYPE_CHECKING:
 
 Preset = Literal["default", "paper", "tiny"]
 Stage = Literal["reflectance", "geometry", "joint", "light-features"]
-_PICTURES_OF_A_HEAD = 24
-_JOINT_SIDES = {"default": 256, "tiny": 64}  # of crops and textures; the paper has 512
 _TINY_WIDTHS = (8, 12, 16)
+_TINY_LIGHTS = 20  # of the rig that heads are baked under
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """Of what a preset draws."""
+
+    heads: int = 240
+    views: int = 8
+    pictures: int = 24  # of a head, for the Geometry Network
+    joint_side: int = 256  # of the stage joint's crops and textures
+    held_out_heads: int = 12
+    light_width: float = 0.25  # of S_f; 1 is VGG-16's
+
+
+_SIZES: dict[Preset, _Sizes] = {
+    "default": _Sizes(),
+    "paper": _Sizes(joint_side=512, light_width=1.0),
+    "tiny": _Sizes(heads=16, views=2, pictures=2, joint_side=64, held_out_heads=4, light_width=0.05),
+}
 
 
 @dataclass(frozen=True)
@@ -30,8 +49,8 @@ class TrainOptions:
     dataset: Path | None
     heads_from: str
     fit_with: str
-    heads: int
-    views: int
+    heads: int | None
+    views: int | None
     bank: Path | None
     texture_size: int
     photos: Path | None
@@ -42,6 +61,12 @@ class TrainOptions:
     jobs: int
     settings: Settings
     networks: dict[str, "nn.Module"] = field(default_factory=dict)
+
+    @property
+    def sizes(self) -> _Sizes:
+        """The preset's, and what the line says of them."""
+        preset = _SIZES[self.preset]
+        return replace(preset, heads=self.heads or preset.heads, views=self.views or preset.views)
 
 
 def build_objective(options: TrainOptions) -> "Objective":
@@ -61,35 +86,39 @@ def trained_networks(stage: Stage) -> tuple[str, ...]:
 
 
 def _chart(options: TrainOptions) -> "Objective":
-    from facerf_cli.objectives.chart import ChartObjective
+    from facerf_cli.objectives.chart import ChartObjective, ChartSettings
     from facerf_cli.objectives.feature_networks import load_light_features
 
     light = load_light_features(options.light_features) if options.light_features else None
     network = options.networks.get("reflectance") or _reflectance(options)
-    return ChartObjective(_samples(options), network, light)
+    settings = ChartSettings(held_out_heads=options.sizes.held_out_heads)
+    return ChartObjective(_samples(options), network, light, settings)
 
 
 def _light_features(options: TrainOptions) -> "Objective":
     from facerf_cli.network.features import LightNetwork, LightSettings
-    from facerf_cli.objectives.light_features import LightFeaturesObjective
+    from facerf_cli.objectives.light_features import LightFeaturesObjective, LightFeaturesSettings
 
-    width = {"default": LightSettings.width, "tiny": 0.05, "paper": 1.0}[options.preset]
-    network: Any = options.networks.get("light_features") or LightNetwork(LightSettings(width=width))
-    return LightFeaturesObjective(_samples(options), network)
+    network: Any = options.networks.get("light_features")
+    network = network or LightNetwork(LightSettings(width=options.sizes.light_width))
+    settings = LightFeaturesSettings(held_out_heads=options.sizes.held_out_heads)
+    return LightFeaturesObjective(_samples(options), network, settings)
 
 
 def _geometry(options: TrainOptions) -> "Objective":
-    from facerf_cli.objectives.geometry import GeometryObjective
+    from facerf_cli.objectives.geometry import GeometryObjective, GeometryObjectiveSettings
     from facerf_cli.stage.face_pictures import add_pictures
     from facerf_cli.stage.rendered_faces import RenderedFaces
 
     folder = options.bank or options.output / "bank"
-    provenance = _bake(options, folder)
+    provenance, sizes = _bake(options, folder), options.sizes
     pictures = folder / "pictures"
-    add_pictures(folder / "heads", pictures, _PICTURES_OF_A_HEAD, options.jobs, options.settings.seed)
+    add_pictures(folder / "heads", pictures, sizes.pictures, options.jobs, options.settings.seed)
     faces = RenderedFaces(pictures, provenance)
     network: Any = options.networks.get("geometry")
-    return GeometryObjective(faces, network or _geometry_network(options, faces.mean_translation_m()))
+    network = network or _geometry_network(options, faces.mean_translation_m())
+    settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
+    return GeometryObjective(faces, network, settings)
 
 
 def _joint(options: TrainOptions) -> "Objective":
@@ -100,7 +129,7 @@ def _joint(options: TrainOptions) -> "Objective":
 
     assert options.dataset
     vgg = options.vgg_weights is not None or options.preset == "paper"  # which does not go without
-    side = _JOINT_SIDES.get(options.preset, 512)
+    side = options.sizes.joint_side
     objective = JointObjective(
         read_dataset(options.dataset),
         load_face_model(options.fit_with),
@@ -135,7 +164,7 @@ def _reflectance(options: TrainOptions) -> Any:
         return PaperReflectanceNetwork(PaperReflectanceSettings(normals=normals))
     if options.preset == "tiny":
         return ReflectanceNetwork(
-            ReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2, normals=normals)
+            ReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 2, _TINY_LIGHTS, normals)
         )
     return ReflectanceNetwork(ReflectanceSettings(normals=normals))
 
@@ -149,10 +178,12 @@ def _geometry_network(options: TrainOptions, mean_m: tuple[float, float, float] 
 
 def _samples(options: TrainOptions) -> "SampleSource":
     """A dataset's textures, or the bank."""
+    from facerf_cli.light.sphere import RIG_LIGHTS
     from facerf_cli.stage.data.captured import open_captured
 
     if options.dataset:
-        return open_captured(options.dataset, options.fit_with, options.texture_size, options.jobs)
+        rig = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS  # of the mean face's shadows
+        return open_captured(options.dataset, options.fit_with, options.texture_size, options.jobs, rig)
     return _fill_bank(options, options.bank or options.output / "bank")
 
 
@@ -164,7 +195,7 @@ def _fill_bank(options: TrainOptions, folder: Path) -> "Bank":
     fitted_with = _mean_model(options, folder) if options.mean_face else options.fit_with
     fitted = load_face_model(fitted_with)
     views = folder / f"views-{fitted.name}"
-    add_views(folder / "heads", views, fitted_with, options.views, options.jobs, options.settings.seed)
+    add_views(folder / "heads", views, fitted_with, options.sizes.views, options.jobs, options.settings.seed)
     fit = {"fitted_with": f"{fitted.name} ({fitted.licence})", "skin": "procedural (facerf)"}
     return load_bank(folder / "heads", views, provenance | fit)
 
@@ -172,13 +203,19 @@ def _fill_bank(options: TrainOptions, folder: Path) -> "Bank":
 def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     """Bake the heads that are missing; what they are made of."""
     from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.stage.geometries import build_geometries
+    from facerf_cli.light.transport import BakeSettings
+    from facerf_cli.stage.geometries import GeometrySettings, build_geometries
 
+    heads, held_out, bake = options.sizes.heads, options.sizes.held_out_heads, GeometrySettings()
+    if heads < held_out + 2:
+        raise UsageError(f"--heads {heads}: the mean face and {held_out} heads are held out; give more")
+    if options.preset == "tiny":
+        bake = GeometrySettings(32, _TINY_LIGHTS, bake=BakeSettings(lamp_samples=1, bounce_samples=2))
     drawn = load_face_model(options.heads_from)
     load_face_model(options.fit_with)  # a bad one is named before anything is baked
-    build_geometries(folder / "heads", options.heads_from, options.heads, options.jobs, options.settings.seed)
+    build_geometries(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
     return {
-        "heads": f"{options.heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "heads": f"{heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
         "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
 

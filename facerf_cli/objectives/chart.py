@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.errors import InputError
 from facerf_cli.network.features import LightNetwork, feature_distance
 from facerf_cli.network.losses import root_loss, si_mse
 from facerf_cli.network.reflectance import ReflectanceNetwork
@@ -58,7 +59,7 @@ class ChartObjective(Objective):
         super().__init__()
         network = network or ReflectanceNetwork()
         if isinstance(network, ReflectanceNetwork):
-            network.set_mean_face(*source.mean_face())
+            _set_mean_face(network, source)
         self.networks = nn.ModuleDict({"reflectance": network})
         self.chooses_by = "si_mse"
         self.provenance = source.provenance
@@ -129,6 +130,13 @@ class ChartObjective(Objective):
 
     def _network(self) -> Any:
         return self.networks["reflectance"]
+
+
+def _set_mean_face(network: ReflectanceNetwork, source: SampleSource) -> None:
+    try:
+        network.set_mean_face(*source.mean_face())
+    except ValueError as error:
+        raise InputError(f"{error}, as these heads were baked; give --bank or --start-from others") from None
 
 
 def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
