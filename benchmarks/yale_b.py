@@ -33,6 +33,7 @@ from facerf_cli.face.landmarks import find_faces
 from facerf_cli.pipeline import (
     Models,
     crop_face,
+    explain_photo,
     fit_face,
     load_models,
     predict_olat,
@@ -190,7 +191,9 @@ def relight(
     fit = fit_face(models.face, crop, landmarks_px, photo.shape)
     face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE, photo.shape)
     grey_weights = weights[..., None].expand(-1, -1, 3)
-    textures = weigh_batches(predict_olat(models, face, directions), grey_weights).mean(1)  # [M, T, T]
+    textures = weigh_batches(
+        predict_olat(models, face, directions, quotient=explain_photo(models, face)), grey_weights
+    ).mean(1)  # [M, T, T]
     height, width = picture.shape
     centre_px = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
     camera = Camera(CROP_FOCAL_PER_SIDE * crop.side_px, width, height, *centre_px)

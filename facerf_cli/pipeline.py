@@ -1,15 +1,18 @@
 """From one photo to the face under any light, from any head pose: one function an arrow of the method.
 
-photo -> crop_face -> fit_face -> unwrap_face -> predict_olat -> weigh -> render_face -> picture
+photo -> crop_face -> fit_face -> unwrap_face (-> explain_photo) -> predict_olat -> weigh -> render_face
+-> picture
 """
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
@@ -18,6 +21,9 @@ from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
+from facerf_cli.light.estimate import estimate_light
+from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.saved import load_networks
 from facerf_cli.raster.camera import Camera
@@ -26,6 +32,7 @@ from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwra
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 _DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
+_EXPLAINED_SIDE, _EXPLAINING_LIGHTS = 128, 50  # texels and lights for the estimate of a photo's light
 _LIGHTS_ON_CPU = 4  # at a time; more of them leave the processor's cache and are slower
 
 
@@ -120,6 +127,26 @@ def unwrap_face(
     return FaceTexture(inpaint(texture, visible), visible, normals)
 
 
+def explain_photo(models: Models, face: FaceTexture) -> Quotient:
+    """What the field lacks of the face's own photo, for `predict_olat` to give back.
+
+    The photo's light is estimated over a coarse rig, on small textures.
+    """
+    side = (_EXPLAINED_SIDE, _EXPLAINED_SIDE)
+    fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
+    small = F.interpolate(fields, side, mode="area")[0]
+    texture, visible, normals = small[:3], small[3], F.normalize(small[4:], dim=0)
+    olats = torch.cat(list(predict_olat(models, FaceTexture(texture, visible, normals), _coarse_rig())))
+    seen = visible > 0.9
+    weights = estimate_light(olats[..., seen], texture[:, seen])
+    return Quotient.of(texture, weigh(olats, weights[None])[0], visible)
+
+
+@cache
+def _coarse_rig() -> Tensor:
+    return rig_directions(_EXPLAINING_LIGHTS)
+
+
 @torch.no_grad()
 def predict_olat(
     models: Models,
@@ -128,10 +155,12 @@ def predict_olat(
     turn: Tensor | None = None,
     memory_bytes: int = 2 << 30,
     bf16: bool = False,
+    quotient: Quotient | None = None,
 ) -> Iterator[Tensor]:
     """OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T] that fit `memory_bytes`.
 
-    `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s.
+    `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s. `quotient` is
+    what `explain_photo` found; without it they are the network's own.
     """
     device, texels = models.device, face.texture.shape[-1] ** 2
     most = _LIGHTS_ON_CPU if device.type == "cpu" else len(lights)
@@ -145,7 +174,8 @@ def predict_olat(
     for chunk in torch.split(lights, batch):
         with torch.autocast(device.type, torch.bfloat16, enabled=bf16):  # not around a yield: it would leak
             olats = models.network.decode(encoded, normals, chunk[None].to(device))[0]
-        yield olats.float().cpu()
+        olats = olats.float().cpu()
+        yield quotient.corrected(olats) if quotient else olats
 
 
 def weigh(olats: Tensor, weights: Tensor) -> Tensor:

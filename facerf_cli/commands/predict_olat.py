@@ -83,14 +83,15 @@ class _PredictOlat:
         """OLATs in batches [l, 3, H, W], textures or pictures; small pictures [l, h, w, 3] go to `tiles`."""
         from torch.nn.functional import avg_pool2d
 
-        from facerf_cli.pipeline import predict_olat, render_face, turn_to
+        from facerf_cli.pipeline import explain_photo, predict_olat, render_face, turn_to
 
         models = load_models_once(self.photo)
         rotation = parse_pose(self.pose)
         turn = None if rotation is None else turn_to(face.fit, rotation)
-        bf16 = self.precision == "bf16"
+        bf16, quotient = self.precision == "bf16", explain_photo(models, face.texture)
         large, small = self._see(face), self._see(face, 2 * _TILE_PX)
-        for textures in predict_olat(models, face.texture, directions, turn, self.memory_bytes, bf16):
+        olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes, bf16, quotient)
+        for textures in olats:
             tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
             yield render_face(textures, *large) if self.image else textures
 

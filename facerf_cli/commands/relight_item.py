@@ -75,7 +75,7 @@ class Relight:
 
     def _relight_face(self, item: Item, picture: "Picture", face: FittedFace) -> Iterator[tuple[Path, float]]:
         """Write every shot of a face; the EXR's path and the PNG's exposure of each."""
-        from facerf_cli.pipeline import predict_olat, weigh_batches
+        from facerf_cli.pipeline import explain_photo, predict_olat, weigh_batches
 
         models = load_models_once(self.photo)
         size_px = picture.pixels.shape[0], picture.pixels.shape[1]
@@ -84,8 +84,10 @@ class Relight:
         directions, weights = light_photos(self.shots, self.rig, self.sampling)
         canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(picture, size_px))
 
+        quotient = explain_photo(models, face.texture)
+
         def relit(rows: slice) -> "Tensor":
-            olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes)
+            olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes, quotient=quotient)
             return weigh_batches(olats, weights[rows])
 
         metadata = provenance(item, self.photo, models.checkpoint_name)
