@@ -75,6 +75,9 @@ class PaperReflectanceNetwork(nn.Module):
         self._begin_grey()
 
     def _begin_grey(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, a=_SLOPE)
         last: Any = self.light_convolutions[-1]
         nn.init.normal_(last.weight, std=1e-2)
         nn.init.constant_(last.bias, float(torch.tensor(_FIRST_ROOT, device="cpu").expm1().log()))

@@ -113,6 +113,13 @@ class JointObjective(Objective):
             rig_lights = reflectance.settings.rig_lights
             reflectance.set_mean_face(*Captured(dataset, model, 0, {}, {}, rig_lights).mean_face())
 
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """The networks' own functions alone: shapes in the rasterizer depend on what is seen."""
+        called = {"reflectance": ("encode", "decode"), "geometry": ("forward",)}
+        for name, network in (*self.networks.items(), *self.feature_networks.items()):
+            for function in called.get(name, ("layers",)):
+                setattr(network, function, torch.compile(getattr(network, function), *args, **kwargs))
+
     def draw(
         self, count: int, generator_of: Callable[[int], torch.Generator], step: int
     ) -> CropPairs | PhotoCrops:

@@ -18,10 +18,12 @@ from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.paper_losses import slid_contour
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
+from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)
 LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011), sliding ones first
+
+_DEPTH_PX, _DEPTH_PER_PX = 512, 3  # side of the depth map at most, and for small crops in crop pixels
 
 
 @dataclass(frozen=True)
@@ -73,13 +75,13 @@ class Unwrapped:
     normals: Tensor
 
 
-@torch.compiler.disable  # type: ignore[untyped-decorator]  # its shapes depend on what is seen
 def unwrap_pictures(pictures: Tensor, heads: PosedHeads, camera: Camera, side: int) -> Unwrapped:
     """T_s and N_s of pictures [B, 3, S, S] of the heads."""
     triangles = grid_triangles().to(pictures.device)
+    settings = UnwrapSettings(depth_side_px=min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px))
     faces = []
     for picture, vertices in zip(pictures, heads.vertices, strict=True):
-        texture, visible = unwrap(picture, vertices, triangles, camera, side)
+        texture, visible = unwrap(picture, vertices, triangles, camera, side, settings)
         faces.append((inpaint(texture, visible), visible[None], normal_map(vertices, triangles, side)))
     textures, seen, normals = (torch.stack(parts) for parts in zip(*faces, strict=True))
     return Unwrapped(textures, seen, normals)
@@ -91,7 +93,6 @@ def head_normals(heads: PosedHeads, side: int) -> Tensor:
     return torch.stack([normal_map(vertices, triangles, side) for vertices in heads.vertices])
 
 
-@torch.compiler.disable  # type: ignore[untyped-decorator]  # its shapes depend on what is seen
 def render_textures(textures: Tensor, heads: PosedHeads, camera: Camera) -> tuple[Tensor, Tensor]:
     """Pictures [B, C, S, S] of textures [B, C, T, T] on the heads, and M_t [B, 1, S, S] in 0..1."""
     device = textures.device
