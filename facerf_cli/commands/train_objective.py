@@ -125,23 +125,23 @@ def _joint(options: TrainOptions) -> "Objective":
     from facerf_cli.face.morphable import load_face_model
     from facerf_cli.objectives.feature_networks import load_light_features, load_vgg
     from facerf_cli.objectives.joint import JointObjective, JointSettings
+    from facerf_cli.stage.data.crops import mean_translation_m
     from facerf_cli.stage.data.dataset import read_dataset
 
     assert options.dataset
+    dataset = read_dataset(options.dataset)
     vgg = options.vgg_weights is not None or options.preset == "paper"  # which does not go without
     side = options.sizes.joint_side
-    objective = JointObjective(
-        read_dataset(options.dataset),
+    return JointObjective(
+        dataset,
         load_face_model(options.fit_with),
         options.networks.get("reflectance") or _reflectance(options),
-        options.networks.get("geometry") or _geometry_network(options),
+        options.networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
         load_vgg(options.vgg_weights) if vgg else None,
         load_light_features(options.light_features) if options.light_features else None,
         _photos(options, side),
         JointSettings(side, side, mean_face=options.mean_face, seed=options.settings.seed),
     )
-    objective.skips_networks = options.photos is not None
-    return objective
 
 
 def _photos(options: TrainOptions, side: int) -> Any:

@@ -220,7 +220,7 @@ class JointObjective(Objective):
                 relit = self._relit(batch, heads)
                 of_kind.append(si_mse(relit.picture[:, None], batch.target[:, None], relit.mask))
                 distances.append(_landmark_error(heads, batch, self.camera))
-                if index < _SHEET_ROWS // 2:
+                if index % max(1, 2 * len(pairs) // _SHEET_ROWS) == 0:
                     rows.append(_sheet_row(batch, relit, self.camera))
             metrics[f"si_mse_{kind}"] = float(torch.cat(of_kind).mean())
             metrics[f"si_mse_{kind}_std"] = float(torch.cat(of_kind).std(correction=0))

@@ -148,10 +148,9 @@ def _view(path: Path) -> _View:
     )
 
 
-def mean_translation_m(reader: PairReader) -> tuple[float, float, float]:
+def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
     """Where heads stand before the crops' camera by the fits of some subjects: a Geometry Network's start."""
-    dataset = reader.dataset
-    subjects = sorted({pair.subject for pair in reader.pairs})[:_SUBJECTS_ASKED]
+    subjects = dataset.splits["train"][:_SUBJECTS_ASKED] or dataset.subjects[:_SUBJECTS_ASKED]
     paths = [dataset.fit_path(subject, camera) for subject in subjects for camera in dataset.cameras[subject]]
     x, y, z = torch.stack([load_fit(path).translation_m for path in paths]).mean(0).tolist()
     return x, y, z

@@ -113,8 +113,8 @@ def test_a_split_without_pairs_is_named(tmp_path: Path) -> None:
         open_pairs(dataset, "train", 32)
 
 
-def test_heads_stand_where_their_fits_say(dataset: Dataset, reader: PairReader) -> None:
+def test_heads_stand_where_their_fits_say(dataset: Dataset) -> None:
     fits = [load_fit(dataset.fit_path(s, c)) for s in dataset.splits["train"] for c in dataset.cameras[s]]
     expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
-    assert torch.allclose(torch.tensor(mean_translation_m(reader)), expected, atol=1e-6)
+    assert torch.allclose(torch.tensor(mean_translation_m(dataset)), expected, atol=1e-6)
     assert expected[2] < -0.9
