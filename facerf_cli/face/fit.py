@@ -17,7 +17,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks
-from facerf_cli.face.fit_start import FitStart, seeded_state
+from facerf_cli.face.fit_start import FitStart, started
 from facerf_cli.face.gauss_newton import (
     CONTOUR_RAYS,
     INNER_COUNT,
@@ -175,9 +175,14 @@ def problem_of(
 
 
 def better_start(problem: Problem, begin: FitState, start: FitStart) -> FitState:
-    """Of each face the start that costs less: `begin`, or the head closest to `start`."""
-    seeded = seeded_state(problem.basis, start)
-    return seeded.where(total_cost(problem, seeded) < total_cost(problem, begin), begin)  # False for NaN
+    """Of each face the start that costs least: `begin`, the head closest to `start`, or it on the landmarks.
+
+    The landmarks tell the pose better than a network does, and the network the shape.
+    """
+    for state in started(problem, start):
+        cheaper = total_cost(problem, state) < total_cost(problem, begin)  # False for NaN
+        begin = state.where(cheaper & (state.translation_m[:, 2] < 0), begin)
+    return begin
 
 
 def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px: int) -> np.ndarray:

@@ -10,7 +10,8 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from facerf_cli.face.gauss_newton import INNER_COUNT, FitBasis, FitState, fit_points
+from facerf_cli.face.gauss_newton import INNER_COUNT, FitBasis, FitState, Problem, fit_points
+from facerf_cli.face.head_pose import pose_from_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import skew_matrix, so3_exp
 
@@ -31,10 +32,20 @@ class FitStart:
     beta: Tensor  # [B, Ke]
 
 
+def started(problem: Problem, start: FitStart) -> tuple[FitState, FitState]:
+    """A fit's states at the start: as it is, and of its shape with the pose that the inner landmarks give."""
+    state, basis = seeded_state(problem.basis, start), problem.basis
+    offset = state.coordinates @ basis.modes[:INNER_COUNT].flatten(0, 1).mT
+    points = basis.mean[:INNER_COUNT] + offset.reshape(len(offset), INNER_COUNT, 3)
+    inner_px = problem.target_px[:, -INNER_COUNT:]
+    pose = pose_from_landmarks(points, inner_px, problem.camera, state.rotation, state.translation_m)
+    return state, FitState(*pose, state.coordinates)
+
+
 def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
     """The state of a fit, of whatever model, that comes closest to the start."""
     wanted = _points_camera(start).nan_to_num()
-    rotation, translation = start.rotation.double(), start.translation_m.double()
+    rotation, translation = start.rotation.double().nan_to_num(), start.translation_m.double().nan_to_num()
     by_parameters = torch.cat(
         [-skew_matrix(basis.mean), torch.eye(3).expand(len(basis.mean), 3, 3), basis.modes], -1
     )
