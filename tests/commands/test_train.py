@@ -140,7 +140,9 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert "this run was begun with batch 2" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("stage", ["geometry", "light-features", "reflectance"])
+@pytest.mark.parametrize(
+    "stage", [pytest.param("geometry", marks=pytest.mark.slow), "light-features", "reflectance"]
+)
 def test_a_stage_carries_over_the_networks_of_others(run: Path, tmp_path: Path, stage: str) -> None:
     line = ["train", "-o", str(tmp_path / "run"), "--stage", stage, *TINY, "--bank", str(run / "bank")]
     assert main([*line, "--steps", "1", "--start-from", str(run / "last.safetensors")]) == 0
