@@ -1,0 +1,49 @@
+"""The arrow from crop to fit, with and without a Geometry Network."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+from facerf_cli.pipeline import Models, crop_face, fit_face, load_models, see_head
+from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
+
+PHOTO = np.full((300, 300, 3), 0.2, np.float32)
+
+
+@pytest.fixture(scope="module")
+def models() -> Models:
+    return load_models(None, "builtin", torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def landmarks_px() -> np.ndarray:
+    turned = torch.from_numpy(LANDMARKS_M).float() @ pose_to_rotation(20, 5, -4).T
+    return project(turned + torch.tensor([0.0, 0.0, -1.2]), crop_camera(300)).double().numpy()
+
+
+def test_without_the_network_the_fit_starts_from_the_landmarks(models: Models) -> None:
+    assert see_head(replace(models, geometry=None), PHOTO) is None
+
+
+def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: np.ndarray) -> None:
+    torch.manual_seed(0)
+    seeing = replace(models, geometry=GeometryNetwork(GeometrySettings(identity=3, expression=2)).eval())
+    crop, cropped = crop_face(PHOTO, landmarks_px, 128)
+    start = see_head(seeing, cropped)
+    assert start and start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)
+    cold = fit_face(models.face, crop, landmarks_px, PHOTO.shape)
+    warm = fit_face(models.face, crop, landmarks_px, PHOTO.shape, start)
+    assert warm.error_iod == pytest.approx(cold.error_iod, abs=5e-4)
+    moved_m = warm.vertices_camera(models.face) - cold.vertices_camera(models.face)
+    assert moved_m.norm(dim=-1).max() < 2e-3
+
+
+def test_the_default_checkpoint_fits_as_ever(models: Models, landmarks_px: np.ndarray) -> None:
+    crop, _ = crop_face(PHOTO, landmarks_px, 128)
+    one = fit_face(models.face, crop, landmarks_px, PHOTO.shape)
+    same = fit_face(models.face, crop, landmarks_px, PHOTO.shape, None)
+    assert torch.equal(one.beta, same.beta) and one.error_iod < 0.02
