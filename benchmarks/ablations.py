@@ -4,9 +4,9 @@
 
 Each is trained from scratch by `facerf train` on the same baked heads, with the same seed, schedule and
 number of steps, then measured (1) as the paper does, on pictures of held-out people, each fitted by its own
-landmarks with the face model that the run was trained with (`table1.py --refit`), and (2) on held-out heads
-in the chart of their fits (`synthetic.py`), where a wrong shape costs less, for the truth is seen through
-the same fit. What is interrupted goes on; a finished run is not trained again.
+landmarks with the face model that the run was trained with (`table1.py --refit --network-alone`), and (2) on
+held-out heads in the chart of their fits (`synthetic.py`), where a wrong shape costs less, for the truth is
+seen through the same fit. What is interrupted goes on; a finished run is not trained again.
 """
 
 import argparse
@@ -119,7 +119,7 @@ def measure(checkpoint: Path, bank: Path, mean_face: bool, given: argparse.Names
     if given.dataset:
         dataset = read_dataset(given.dataset)
         pairs = table1.pairs_of(dataset, "test")[:: given.every]
-        measured = list(table1.measure(models, dataset, pairs, refit=True))
+        measured = list(table1.measure(models, dataset, pairs, table1.How(refit=True, held_to_photo=False)))
         found |= table1.summary(measured) | {"people": len({m.subject for m in measured})}
     return found
 

@@ -5,7 +5,8 @@
 Every held-out head is drawn DRAWS times: skin, camera, source light and target lights. Intervals are over
 heads. Textures are scaled to a mean albedo of 0.25, which on dark skin lifts highlights far above white, and
 they outweigh the rest; so errors stand there twice, once with the truth clipped at 1. Beside it a naive twin:
-the source's own texture, shaded by Lambert's cosine without shadows.
+the source's own texture, shaded by Lambert's cosine without shadows. This is the network alone, as training
+validates it: what holds the field to its photo (`pipeline.explain_photo`) is left out.
 
 Skin tones are classes of the individual typology angle (ITA: Chardon et al. 1991, Del Bino and Bernerd 2013)
 of the albedo that was drawn, before lips, brows, beard and make-up; faces of random colours have none. Tone

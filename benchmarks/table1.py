@@ -14,7 +14,7 @@ orientation, not as a bar.
 import argparse
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
 from facerf_cli.network.losses import si_mse
-from facerf_cli.pipeline import FaceTexture, Models, load_models, predict_olat, turn_to
+from facerf_cli.pipeline import FaceTexture, Models, explain_photo, load_models, predict_olat, turn_to
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
 from facerf_cli.stage.data.dataset import SPLITS, Dataset, read_dataset
@@ -39,6 +39,14 @@ from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs
 PAPER = {"same pose": (0.00070, 0.00059), "different pose": (0.00084, 0.00088)}  # its Table 1: mean, sd
 _SIDE = 256  # of textures, as the verbs have it
 _INSIDE = 0.9  # of the pixels that a texel shows, the share that must be face
+
+
+@dataclass(frozen=True)
+class How:
+    """What a picture goes through."""
+
+    refit: bool = False  # fitted by its own landmarks alone
+    held_to_photo: bool = True  # `pipeline.explain_photo`, as the verbs have it
 
 
 @dataclass(frozen=True)
@@ -59,11 +67,12 @@ def main() -> None:
     if models.face.name != dataset.face_model and not given.refit:
         raise SystemExit(f"{given.dataset}: fitted with {dataset.face_model}; give --face-model, or --refit")
     pairs = pairs_of(dataset, given.split)
-    measured = list(measure(models, dataset, pairs[:: given.every], given.refit))
+    how = How(given.refit, not given.network_alone)
+    measured = list(measure(models, dataset, pairs[:: given.every], how))
     found = summary(measured) | {
         "checkpoint": str(given.checkpoint or "shipped"),
         "split": given.split,
-        "refit": given.refit,
+        "how": asdict(how),
         "people": len({m.subject for m in measured}),
     }
     print(table(found))
@@ -81,6 +90,7 @@ def _arguments() -> argparse.Namespace:
     add("--checkpoint", type=Path, help="default: the one shipped")
     add("--face-model", default="builtin", help="that the dataset was fitted with")
     add("--refit", action="store_true", help="fit each picture's landmarks alone, not a person's all at once")
+    add("--network-alone", action="store_true", help="do not hold the field to the photo, as the verbs do")
     add("--every", type=int, default=1, help="take every Nth pair only")
     add("--json", type=Path, help="write all figures here")
     return parser.parse_args()
@@ -95,17 +105,21 @@ def pairs_of(dataset: Dataset, split: str) -> list[Pair]:
 
 
 @torch.no_grad()
-def measure(models: Models, dataset: Dataset, pairs: list[Pair], refit: bool) -> Iterator[Measured]:
+def measure(models: Models, dataset: Dataset, pairs: list[Pair], how: How) -> Iterator[Measured]:
     """The errors of pairs."""
     for subject, of_subject in groupby(pairs, lambda pair: pair.subject):
         stacks = {camera: dataset.stack_path(subject, camera) for camera in dataset.cameras[subject]}
-        views = {camera: _view(models, read_olat_header(stack), refit) for camera, stack in stacks.items()}
+        views = {
+            camera: _view(models, read_olat_header(stack), how.refit) for camera, stack in stacks.items()
+        }
         for pair in of_subject:
             path = picture_path(dataset, *pair.key)
-            yield _measure_pair(models, pair, path, stacks[pair.target_camera], views)
+            yield _measure_pair(models, pair, path, stacks[pair.target_camera], views, how)
 
 
-def _measure_pair(models: Models, pair: Pair, path: Path, stack: Path, views: dict[str, "View"]) -> Measured:
+def _measure_pair(
+    models: Models, pair: Pair, path: Path, stack: Path, views: dict[str, "View"], how: How
+) -> Measured:
     """The errors of one pair: `path` is its source, `stack` holds its target."""
     source, target = views[pair.source_camera], views[pair.target_camera]
     fit, face = source.fit, source.texture_of(path)
@@ -113,7 +127,8 @@ def _measure_pair(models: Models, pair: Pair, path: Path, stack: Path, views: di
         target = View.of(models, target.header, replace(target.fit, alpha=fit.alpha, beta=fit.beta))
     light = torch.from_numpy(target.header.directions[pair.target_light]).float()
     turn = turn_to(fit, target.fit.rotation)
-    predicted = next(predict_olat(models, face, light[None], turn))[0]
+    quotient = explain_photo(models, face) if how.held_to_photo else None
+    predicted = next(predict_olat(models, face, light[None], turn, quotient=quotient))[0]
     cosine = torch.einsum("c,dc,dij->ij", light, turn, face.normals).clamp_min(0)
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
     white = truth.clamp(max=1)
