@@ -12,9 +12,9 @@ def draw_light(directions: Tensor, generator: torch.Generator) -> Tensor:
         return low + (high - low) * torch.rand(shape, generator=generator)
 
     kind = torch.rand((), generator=generator)
-    if kind < 0.12:  # a flash near the camera
+    if kind < 0.2:  # a flash near the camera
         axis = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.15 * torch.randn(3, generator=generator), dim=0)
-        return _lamp(directions, axis, 400.0) * torch.ones(3) + 0.003
+        return _lamp(directions, axis, 400.0) * torch.ones(3) + 0.0015
     lamps = 1 + int(torch.randint(3, (), generator=generator))
     weights = torch.zeros(len(directions), 3)
     for lamp in range(lamps):
