@@ -45,7 +45,7 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.saved import load_networks
 from facerf_cli.objectives.geometry import GeometryObjective, GeometryObjectiveSettings
-from facerf_cli.raster.camera import crop_camera
+from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.stage.data.dataset import read_dataset
 from facerf_cli.stage.rendered_faces import RenderedFaces
 
@@ -174,6 +174,18 @@ def milliseconds(network: GeometryNetwork) -> float:
     return 1000 * (time.process_time() - begin) / 20
 
 
+def milliseconds_of_a_step() -> float:
+    model, camera = load_face_model(), crop_camera(CROP_PX)
+    vertices = model.vertices(torch.zeros(1, len(model.identity)), 0.5 * torch.ones(1, len(model.expression)))
+    landmarks_px = project(model.landmarks(vertices) + torch.tensor([0.0, 0.0, -1.0]), camera)
+    spent = []
+    for steps in (1, 1, 41):  # the first one warms up
+        begin = time.process_time()
+        fit_batch(model, landmarks_px, camera, FitSettings(steps=steps))
+        spent.append(time.process_time() - begin)
+    return 1000 * (spent[2] - spent[1]) / 40
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -190,7 +202,8 @@ def main() -> None:
     assert isinstance(network, GeometryNetwork)
     print(f"{sum(p.numel() for p in network.parameters()):,} parameters, "
           f"{milliseconds(network):.1f} ms of processor time a crop on "
-          f"{torch.get_num_threads()} thread(s)")  # fmt: skip
+          f"{torch.get_num_threads()} thread(s); "
+          f"a step of one face's fit {milliseconds_of_a_step():.1f} ms")  # fmt: skip
     if given.pictures:
         report_held_out(network, given.pictures, given.draws)
     if given.dataset:
