@@ -14,6 +14,7 @@ from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
+_LARGEST_SIDE = 4096
 FORMS: dict[tuple[str, str], type[Any]] = {  # by what a network is for, and its form
     ("reflectance", "default"): ReflectanceNetwork,
     ("reflectance", "paper"): PaperReflectanceNetwork,
@@ -47,6 +48,7 @@ def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module]
 
 def _built(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
     form = FORMS[name, described["form"]]
+    _require_sane(described)
     with torch.device("meta"):  # takes no memory, whatever sizes the file asks for
         expected = {key: tensor.shape for key, tensor in form.from_metadata(described).state_dict().items()}
     if expected != {key: tensor.shape for key, tensor in tensors.items()}:
@@ -54,6 +56,13 @@ def _built(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> 
     network: nn.Module = form.from_metadata(described)
     network.load_state_dict(tensors)
     return network
+
+
+def _require_sane(described: dict[str, Any]) -> None:
+    """Raise ValueError for settings that no tensor's shape would betray."""
+    side, normals = described.get("side", 128), described.get("normals", True)
+    if type(side) is not int or not 8 <= side <= _LARGEST_SIDE or type(normals) is not bool:
+        raise ValueError(f"a working side of {side}, normals {normals}")
 
 
 def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -9,7 +9,7 @@ from facerf_cli.files.checkpoints import save_checkpoint
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
 from facerf_cli.network.paper_reflectance import PaperReflectanceSettings
-from facerf_cli.network.reflectance import ReflectanceSettings
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.network.saved import load_networks
 
 DESCRIBED: dict[str, dict[str, Any]] = {
@@ -49,6 +49,24 @@ def test_weights_of_other_sizes_are_refused_in_words(tmp_path: Path) -> None:
     tensors["geometry.regress.bias"] = torch.zeros(3)
     path = tmp_path / "a.safetensors"
     described = {"geometry": network.as_metadata()}
+    save_checkpoint(path, tensors, {"layout_version": 3, "networks": described})
+    with pytest.raises(InputError, match="do not fit this version's network"):
+        load_networks(path, 3)
+
+
+@pytest.mark.parametrize("setting", [{"side": -4}, {"side": 4_000_000}, {"side": 1.5}, {"normals": 1}])
+def test_settings_that_no_tensor_betrays_are_refused_in_words(
+    tmp_path: Path, setting: dict[str, Any]
+) -> None:
+    network = ReflectanceNetwork(
+        ReflectanceSettings(side=16, encoder_widths=(8,), decoder_widths=(8,), rig_lights=4)
+    )
+    path = tmp_path / "a.safetensors"
+    tensors = {f"reflectance.{name}": tensor for name, tensor in network.state_dict().items()}
+    described = {"reflectance": network.as_metadata()}
+    save_checkpoint(path, tensors, {"layout_version": 3, "networks": described})
+    load_networks(path, 3)
+    described["reflectance"] |= setting
     save_checkpoint(path, tensors, {"layout_version": 3, "networks": described})
     with pytest.raises(InputError, match="do not fit this version's network"):
         load_networks(path, 3)
