@@ -22,7 +22,7 @@ from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.stage.rendered_faces import FaceCrops, RenderedFaces
 
 _VALIDATION_SEED = 20211
-_SHEET_ROWS, _SHEET_COLUMNS = 4, 8
+_SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,7 @@ class GeometryObjective(Objective):
 
     def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
         """Held-out crops with true landmarks in green and the estimate's in red."""
-        side, count = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS
-        size = 2 * side
+        side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
         pictures = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
         pictures = pictures / pictures.mean((1, 2, 3), keepdim=True).clamp_min(1e-6) * 0.18
         predicted = self.landmarks_px(estimate, side)[:count].cpu()
@@ -164,8 +163,9 @@ class GeometryObjective(Objective):
             (predicted, (1.0, 0.0, 0.0)),
         ):
             for picture, own in zip(pictures, points, strict=True):
-                column, row = (own * size / side).long().clamp(0, size - 1).unbind(-1)
-                picture[:, row, column] = torch.tensor(colour)[:, None]
+                column, row = (own * size / side).long().clamp(0, size - 2).unbind(-1)
+                for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+                    picture[:, row + y, column + x] = torch.tensor(colour)[:, None]
         rows = [
             torch.cat(list(chunk), 2)
             for chunk in torch.split(pictures, _SHEET_COLUMNS)
