@@ -82,10 +82,13 @@ def costs_by_step(problem: Problem, state: FitState) -> Tensor:
 
 
 def steps_needed(problem: Problem, starts: dict[str, FitState]) -> dict[str, Tensor]:
-    """Steps [B] from each start until the cost is within 1 % of the lowest that any leads to."""
+    """Steps from each start until the cost is within 1 % of the lowest, where all starts end there."""
     costs = {name: costs_by_step(problem, state) for name, state in starts.items()}
-    enough = 1.01 * torch.stack([cost[-1] for cost in costs.values()]).amin(0)
-    return {name: (cost > enough).sum(0) for name, cost in costs.items()}
+    ends = torch.stack([cost[-1] for cost in costs.values()])
+    enough = 1.01 * ends.amin(0)
+    alike = (ends <= enough).all(0)
+    print(f"  left out of the steps, for they end elsewhere from some start: {int((~alike).sum())} crops")
+    return {name: (cost > enough).sum(0)[alike] for name, cost in costs.items()}
 
 
 def report(name: str, network: GeometryNetwork, crops: Tensor, landmarks_px: Tensor) -> None:
