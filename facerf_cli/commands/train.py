@@ -1,5 +1,6 @@
 """`facerf train`: the networks, on synthetic heads baked for them or on a prepared dataset."""
 
+import os
 import re
 from dataclasses import replace
 from functools import partial
@@ -145,13 +146,25 @@ def train(
     mean_face: Annotated[
         bool, _loss("--mean-face", help="Ablation: the mean face for everybody; only poses are fitted.")
     ] = False,
+    learning_rate: Annotated[
+        float | None,
+        _length(
+            min=1e-9,
+            help="Highest step size of the optimiser.",
+            show_default="0.0015; paper 0.05, tiny 0.004",
+        ),
+    ] = None,
     batch: Annotated[
         int | None,
         _speed(min=1, help="Samples a step, of all processes together.", show_default="4; paper 1, tiny 2"),
     ] = None,
     workers: Annotated[
         int | None,
-        _speed(min=0, help="Processes that draw samples ahead.", show_default="0 on a CPU, 4 on a GPU"),
+        _speed(
+            min=0,
+            help="Processes that draw samples ahead.",
+            show_default="1 on a CPU of more than one core, 4 on a GPU",
+        ),
     ] = None,
     bf16: Annotated[
         bool | None,
@@ -180,8 +193,10 @@ def train(
     refuse_what_makes_no_sense(context, stage)
     settings = settings_of(context)
     training = _training(preset, steps, max_time, settings.seed, compile_model)
+    optimizer = training.optimizer
     training = replace(
         training,
+        optimizer=replace(optimizer, learning_rate=learning_rate or optimizer.learning_rate),
         batch=batch or training.batch,
         validate_every=validate_every or training.validate_every,
         bf16=training.bf16 if bf16 is None else bf16,
@@ -222,7 +237,7 @@ def _train(
 
     device, first = torch_device(options.settings), process_rank() == 0
     if workers is None:
-        workers = _WORKERS_ON_GPU if device.type == "cuda" else 0
+        workers = _WORKERS_ON_GPU if device.type == "cuda" else int((os.cpu_count() or 1) > 1)
     training = replace(training, workers=workers)
     trained, start = _start(start_from, options.stage)
     with first_process_first():

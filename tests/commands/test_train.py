@@ -107,7 +107,7 @@ TINY = ["--preset", "tiny", "--heads", "7", "--jobs", "1", "--validate-every", "
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of four steps on a bank of its own."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["train", "-o", str(folder), *TINY, "--steps", "4"]) == 0
+    assert main(["train", "-o", str(folder), *TINY, "--steps", "4", "--learning-rate", "0.002"]) == 0
     return folder
 
 
@@ -122,6 +122,7 @@ def test_a_run_by_the_command(run: Path) -> None:
         metadata["provenance"]["heads"] == "7 synthetic heads drawn from builtin (facerf's own (see LICENSE))"
     )
     assert steps_of(run) == [1, 2, 3, 4] and (run / "validation-0000003.png").exists()
+    assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.002
 
 
 def test_a_run_goes_on_by_the_command_and_is_not_written_over(
