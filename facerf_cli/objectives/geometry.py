@@ -33,7 +33,7 @@ class GeometryObjectiveSettings:
     contour: float = 0.5  # of a contour landmark beside another one
     rotation: float = 2.0  # of the chord between rotations
     depth: float = 2.0  # of the ratio of depths
-    coefficients: float = 0.03  # of squared differences, in units of the fit's priors
+    coefficients: float = 0.08  # of squared differences, in units of the fit's priors
     held_out_heads: int = 12
     held_out_draws: int = 16
 
