@@ -169,12 +169,13 @@ def _landmark_file(item: Item, folder: Path) -> Path:
 def _fit_one(
     item: Item, picture: "Picture", landmarks_px: "np.ndarray", tag: str, options: PhotoOptions
 ) -> FittedFace:
-    from facerf_cli.pipeline import crop_face, fit_face, unwrap_face
+    from facerf_cli.pipeline import crop_face, fit_face, see_head, unwrap_face
 
     model, side = face_model(options), options.texture_side
     try:
         crop, cropped = crop_face(picture.pixels, landmarks_px, side * _CROP_PER_TEXTURE)
-        fit = fit_face(model, crop, landmarks_px, picture.pixels.shape)
+        start = see_head(load_models_once(options), cropped)
+        fit = fit_face(model, crop, landmarks_px, picture.pixels.shape, start)
         texture = unwrap_face(model, fit, cropped, side, picture.pixels.shape)
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None

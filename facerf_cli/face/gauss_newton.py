@@ -21,6 +21,8 @@ RAYS_PER_LANDMARK, POINTS_PER_RAY = 8, 10  # of the contour's band
 CONTOUR_RAYS = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
 _BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _FIRST_DAMPING = 1e-3
+_SETTLED = 1e-7  # share of the cost by which the last step lowered it
+_STUCK = 1e3  # damping at which no step lowers the cost any more
 _WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides at most two landmarks' way along the jaw
 
 
@@ -125,18 +127,25 @@ def descend(
     state: FitState,
     steps: int,
 ) -> FitState:
-    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost [B] falls."""
+    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost [B] falls.
+
+    A face that has settled rests, so that it ends where it would have alone; when all have, so does this.
+    """
     damping = torch.full((len(state.coordinates),), _FIRST_DAMPING, dtype=torch.float64)
     at = residuals_of(state)
     cost = cost_of(state, at)
+    settled = torch.zeros_like(cost, dtype=torch.bool)
     for _ in range(steps):
         trial = moved(state, step_of(state, at, damping))
         trial_at = residuals_of(trial)
         trial_cost = cost_of(trial, trial_at)
-        accept = trial_cost < cost  # False for NaN
+        accept = (trial_cost < cost) & ~settled  # False for NaN
+        settled |= torch.where(accept, cost - trial_cost < _SETTLED * cost, damping > _STUCK)
         state, at = trial.where(accept, state), trial_at.where(accept, at)
         cost = torch.where(accept, trial_cost, cost)
         damping = torch.where(accept, damping / 5, damping * 10).clamp(1e-9, 1e6)
+        if settled.all():
+            break
     return state
 
 
