@@ -1,9 +1,10 @@
 """What every form of the Reflectance Network does with the fields that it is given."""
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+MEAN_RADIANCE = 0.25  # of the visible face after exposure is taken out
 
 
 def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
@@ -23,3 +24,13 @@ def resize(x: Tensor, side: int) -> Tensor:
     if x.shape[-1] > side:
         return F.interpolate(x, (side, side), mode="area")
     return F.interpolate(x, (side, side), mode="bilinear", align_corners=False)
+
+
+def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
+    """head_to_camera [B, 3, 3] that best turn the mean face's normals [3, S, S] to normals [B, 3, T, T]."""
+    small = resize(normals, mean_normals.shape[-1]).cpu().double()  # Apple's GPUs have no doubles
+    moment = torch.einsum("bcij,dij->bcd", small, mean_normals.cpu().double())
+    u, _, vt = torch.linalg.svd(moment)
+    signs = torch.ones(len(moment), 3, dtype=moment.dtype)
+    signs[:, 2] = torch.det(u @ vt)
+    return (u @ torch.diag_embed(signs) @ vt).to(normals)

@@ -13,8 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-MEAN_RADIANCE = 0.25  # of the visible face after exposure is taken out
+from facerf_cli.network.inputs import exposure_of, head_rotation, resize
+
 _MAP_SIDE = 64  # of the mean face's normals and shadows
+_DARKEST = 1e-8  # radiance at which the square root's slope is still finite
 _LIGHT_MAPS = 4
 _LIGHT_FEATURES = 12
 _KERNEL_SHARPNESS = 70.0  # of the interpolation between the shadow maps of neighbouring lights
@@ -98,12 +100,10 @@ class ReflectanceNetwork(nn.Module):
 
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> Encoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
-        luminance = (texture.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
-        exposure = luminance / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) / MEAN_RADIANCE
-        exposure = exposure.clamp_min(1e-6)
-        source_root = (texture / exposure).clamp_min(0).sqrt()
+        exposure = exposure_of(texture, visible)
+        source_root = (texture / exposure).clamp_min(_DARKEST).sqrt()
         side = self.settings.side
-        small = [_resize(x, side) for x in (source_root, visible, self._seen(normals_source))]
+        small = [resize(x, side) for x in (source_root, visible, self._seen(normals_source))]
         template = F.interpolate(self.template[None], (side, side), mode="bilinear", align_corners=False)
         x = torch.cat([*small, template.expand(len(texture), -1, -1, -1)], 1)
         features = []
@@ -124,8 +124,8 @@ class ReflectanceNetwork(nn.Module):
         x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
         for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
             x = up(x, skip, maps, code, count)
-        gain, bias = (_resize(y, encoded.source_root.shape[-1]) for y in self.head(x).float().chunk(2, 1))
-        gain = gain + _resize(base, encoded.source_root.shape[-1])
+        gain, bias = (resize(y, encoded.source_root.shape[-1]) for y in self.head(x).float().chunk(2, 1))
+        gain = gain + resize(base, encoded.source_root.shape[-1])
         root = encoded.source_root.repeat_interleave(count, 0) * gain + bias
         return root.view(faces, count, *root.shape[1:])
 
@@ -134,13 +134,13 @@ class ReflectanceNetwork(nn.Module):
 
     def _light_inputs(self, normals_target: Tensor, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], modulation code [B*L, 96]."""
-        normals = _resize(normals_target, self.settings.side)
-        head_to_camera = self.head_rotation(normals_target)
+        normals = resize(normals_target, self.settings.side)
+        head_to_camera = head_rotation(self.mean_normals, normals_target)
         lights_head = lights @ head_to_camera  # row vectors: R^T w
         half = F.normalize(lights + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
         cosine = torch.einsum("blc,bcij->blij", lights, normals)
         gloss = torch.einsum("blc,bcij->blij", half, normals).clamp_min(0) ** 8
-        shadow = _resize(self._mean_shadow(lights_head), self.settings.side)
+        shadow = resize(self._mean_shadow(lights_head), self.settings.side)
         base = (cosine.clamp_min(0) * shadow + 1e-4).sqrt()
         maps = torch.stack([cosine, gloss, shadow, base], 2).flatten(0, 1)
         products = (lights_head[..., :, None] * lights_head[..., None, :]).flatten(-2)[
@@ -154,15 +154,6 @@ class ReflectanceNetwork(nn.Module):
         weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
         flat = weights @ (self.mean_visibility.to(weights) / 255).flatten(1)
         return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
-
-    def head_rotation(self, normals: Tensor) -> Tensor:
-        """head_to_camera [B, 3, 3], from the mean face's normals to camera-space normals [B, 3, T, T]."""
-        small = _resize(normals, _MAP_SIDE).cpu().double()  # Apple's GPUs have no doubles
-        moment = torch.einsum("bcij,dij->bcd", small, self.mean_normals.cpu().double())
-        u, _, vt = torch.linalg.svd(moment)
-        sign = torch.det(u @ vt)
-        flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], -1))
-        return (u @ flip @ vt).to(normals)
 
 
 class _Down(nn.Module):
@@ -198,18 +189,9 @@ class _Up(nn.Module):
         x = self.enter(x)
         if self.scale == 2:
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-        x = x + self.skip(skip).repeat_interleave(lights, 0) + self.light(_resize(maps, side))
+        x = x + self.skip(skip).repeat_interleave(lights, 0) + self.light(resize(maps, side))
         scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
         x = F.silu(x * (1 + scale) + shift)
         x = x + F.silu(self.inner(x))
         result: Tensor = x + F.silu(self.outer(x))
         return result
-
-
-def _resize(x: Tensor, side: int) -> Tensor:
-    """Resample [..., C, H, W] to a side: averaged when smaller, bilinear when larger."""
-    if x.shape[-1] == side:
-        return x
-    if x.shape[-1] > side:
-        return F.interpolate(x, (side, side), mode="area")
-    return F.interpolate(x, (side, side), mode="bilinear", align_corners=False)

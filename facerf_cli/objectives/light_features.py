@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.features import LightNetwork
+from facerf_cli.network.inputs import head_rotation, resize
 from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
 from facerf_cli.stage.samples import SampleSource
 
@@ -65,7 +65,7 @@ class LightFeaturesObjective(Objective):
         self.source = source
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
-        self.mean_normals = _small(source.mean_face()[0][None])[0]
+        self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
         self._validation: LightTextures | None = None
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> LightTextures:
@@ -114,7 +114,7 @@ class LightFeaturesObjective(Objective):
     def _textures(self, heads: Tensor, generator: torch.Generator) -> LightTextures:
         sample = self.source.draw(heads, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
-        head_to_camera = _rotations(self.mean_normals, _small(sample.normals_target))
+        head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
         return LightTextures(sample.target * seen[:, None], lights_head, heads)
 
@@ -129,19 +129,6 @@ def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
     """Between predicted and true directions [B, L]."""
     predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
     return (predicted * batch.lights_head).sum(-1)
-
-
-def _small(normals: Tensor) -> Tensor:
-    return F.interpolate(normals, (_NORMALS_SIDE, _NORMALS_SIDE), mode="area")
-
-
-def _rotations(mean_normals: Tensor, normals: Tensor) -> Tensor:
-    """head_to_camera [B, 3, 3] that best turn the mean face's normals [3, S, S] to normals [B, 3, S, S]."""
-    moment = torch.einsum("bcij,dij->bcd", normals.double(), mean_normals.double())
-    u, _, vt = torch.linalg.svd(moment)
-    signs = torch.ones(len(moment), 3, dtype=moment.dtype)
-    signs[:, 2] = torch.det(u @ vt)
-    return (u @ torch.diag_embed(signs) @ vt).float()
 
 
 def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.stage.shading import scatter
 
 

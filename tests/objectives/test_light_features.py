@@ -1,7 +1,8 @@
 import torch
 
 from facerf_cli.network.features import LightNetwork, LightSettings
-from facerf_cli.objectives.light_features import LightFeaturesObjective, LightFeaturesSettings, _rotations
+from facerf_cli.network.inputs import head_rotation
+from facerf_cli.objectives.light_features import LightFeaturesObjective, LightFeaturesSettings
 from facerf_cli.objectives.objective import seeded
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.stage.bank import Bank
@@ -64,4 +65,4 @@ def test_the_heads_turn_is_found_from_its_normals() -> None:
     )
     turn = pose_to_rotation(30.0, -10.0, 5.0)
     turned = torch.einsum("dc,cij->dij", turn, mean)
-    assert torch.allclose(_rotations(mean, turned[None])[0], turn, atol=1e-5)
+    assert torch.allclose(head_rotation(mean, turned[None])[0], turn, atol=1e-5)

@@ -201,6 +201,7 @@ def open_captured(
 
 
 def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
+    """What a checkpoint says of a dataset that it was trained on."""
     name = dataset.folder.resolve().name
     return {
         "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",

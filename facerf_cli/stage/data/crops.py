@@ -19,8 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.network.inputs import resize
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.pair_weights import load_pairs
 from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs

@@ -10,7 +10,8 @@ from safetensors import safe_open
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
 from facerf_cli.network.saved import load_networks
 from facerf_cli.objectives.chart import ChartObjective, ChartSettings
 from facerf_cli.raster.texture import unwrap

@@ -7,7 +7,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.stage.data.crops import PairReader, mean_translation_m, open_pairs, spread_pairs
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.map_weights import name_maps
