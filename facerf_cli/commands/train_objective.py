@@ -131,13 +131,19 @@ def _joint(options: TrainOptions) -> "Objective":
     assert options.dataset
     dataset = read_dataset(options.dataset)
     vgg = options.vgg_weights is not None or options.preset == "paper"  # which does not go without
+    appearance = load_vgg(options.vgg_weights) if vgg else None
+    if options.preset == "paper" and options.light_features is None:
+        raise UsageError(
+            "the paper's loss wants S_f: give --light-features FILE, which "
+            "`facerf train --stage light-features` makes, or take another preset"
+        )
     side = options.sizes.joint_side
     return JointObjective(
         dataset,
         load_face_model(options.fit_with),
         options.networks.get("reflectance") or _reflectance(options),
         options.networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
-        load_vgg(options.vgg_weights) if vgg else None,
+        appearance,
         load_light_features(options.light_features) if options.light_features else None,
         _photos(options, side),
         JointSettings(side, side, mean_face=options.mean_face, seed=options.settings.seed),

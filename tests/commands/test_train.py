@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.checkpoints import load_checkpoint, save_checkpoint
 from facerf_cli.main import main
+from facerf_cli.network.features import VggFeatures
 from facerf_cli.network.saved import load_networks
 from tests.stage.data.dataset_fixture import write_small_dataset
 
@@ -98,6 +99,10 @@ def test_the_papers_preset_says_what_it_wants(tmp_path: Path, capsys: pytest.Cap
     line = ["train", "--preset", "paper", "--dataset", str(dataset.folder), "-o", str(tmp_path / "run")]
     assert main(line) == 2
     assert "give --vgg-weights imagenet" in capsys.readouterr().err
+    vgg = tmp_path / "vgg.safetensors"
+    save_file(VggFeatures().state_dict(), vgg)
+    assert main([*line, "--vgg-weights", str(vgg)]) == 2
+    assert "give --light-features FILE" in capsys.readouterr().err
 
 
 TINY = ["--preset", "tiny", "--heads", "7", "--jobs", "1", "--validate-every", "3", "--device", "cpu"]
