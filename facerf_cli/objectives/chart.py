@@ -20,6 +20,7 @@ from facerf_cli.stage.samples import Sample, SampleSource
 
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 5
+_WHITE = 1.0  # where a camera clips; a few glints of the truth would outweigh all faces
 _DARK = 1e-6  # radiance at which the square root's slope is still finite
 
 
@@ -98,7 +99,7 @@ class ChartObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean Si-MSE of held-out heads, of all and by whether the target has the source's pose.
+        """Mean Si-MSE of held-out heads, truth clipped at white; of all, and by whether the pose is the source's.
 
         The sheet has a face in two rows: source and true OLATs, then what is seen of it and the predicted.
         """
@@ -111,7 +112,7 @@ class ChartObjective(Objective):
             there = sample.to(device)
             encoded = network.encode(there.source, there.normals_source, there.visible)
             predicted = network.decode(encoded, there.normals_target, there.lights).cpu()
-            errors.append(si_mse(predicted, sample.target, sample.weight).mean())
+            errors.append(si_mse(predicted, sample.target.clamp(max=_WHITE), sample.weight).mean())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
