@@ -99,7 +99,7 @@ class ChartObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean Si-MSE of held-out heads, truth clipped at white; of all, and by whether the pose is the source's.
+        """Mean Si-MSE of held-out heads, truth clipped at white: of all, and by the target's pose.
 
         The sheet has a face in two rows: source and true OLATs, then what is seen of it and the predicted.
         """
