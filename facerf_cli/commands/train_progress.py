@@ -50,19 +50,20 @@ class TrainProgress:
         text = f"step {row['step']}  {words}  waiting {100 * row['waiting']:.0f} %"
         text += f"  |  {self.validation}" if self.validation else ""
         left_s = self._left_s(row)
-        done = row["seconds"] / (row["seconds"] + left_s) if left_s or row["seconds"] else 0.0
-        self.bar.update(self.task, completed=done, description=text, left=f"{_clock(left_s)} left")
+        done = 0.0 if left_s is None else row["seconds"] / max(row["seconds"] + left_s, 1e-9)
+        left = "" if left_s is None else f"{_clock(left_s)} left"
+        self.bar.update(self.task, completed=done, description=text, left=left)
 
-    def _left_s(self, row: dict[str, Any]) -> float:
-        """By the pace of this leg, or by the clock, whichever ends first."""
+    def _left_s(self, row: dict[str, Any]) -> float | None:
+        """By the pace of this leg, or by the clock, whichever ends first; None while it has no pace yet."""
         self.begun = self.begun or (row["step"], row["seconds"])
+        steps = row["step"] - self.begun[0]
         left = []
         if self.max_seconds:
             left.append(self.max_seconds - row["seconds"])
-        if self.steps:
-            pace = (row["seconds"] - self.begun[1]) / max(row["step"] - self.begun[0], 1)
-            left.append((self.steps - row["step"]) * pace)
-        return max(0.0, min(left)) if left else 0.0
+        if self.steps and steps:
+            left.append((self.steps - row["step"]) * (row["seconds"] - self.begun[1]) / steps)
+        return max(0.0, min(left)) if left else None
 
 
 def _clock(seconds: float) -> str:
