@@ -140,7 +140,7 @@ def _joint(options: TrainOptions) -> "Objective":
     side = options.sizes.joint_side
     return JointObjective(
         dataset,
-        load_face_model(options.fit_with),
+        load_face_model(),  # a Geometry Network's, whatever the dataset was fitted with
         options.networks.get("reflectance") or _reflectance(options),
         options.networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
         appearance,

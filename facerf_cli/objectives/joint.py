@@ -76,7 +76,9 @@ class _Relit:
 class JointObjective(Objective):
     """The paper's loss over a prepared dataset's pairs, and photos.
 
-    `appearance` is V_f, `light` S_f; without one its term is left out. They are frozen, and are not saved.
+    `model` is the one whose coefficients the Geometry Network gives: the built-in one, for whoever takes its
+    heads for a start (`face/fit_start.py`). `appearance` is V_f, `light` S_f; without one its term is left
+    out. They are frozen, and are not saved.
     """
 
     def __init__(

@@ -63,6 +63,10 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
         (["--texture-size", "64"], "--texture-size is for a prepared dataset; give --dataset"),
         (["--preset", "paper"], "the stage joint learns from a prepared dataset; give --dataset"),
         (["--stage", "joint", "--dataset", "d", "--heads", "20"], "--heads means nothing to the stage joint"),
+        (
+            ["--stage", "joint", "--dataset", "d", "--fit-with", "m"],
+            "--fit-with means nothing to the stage joint",
+        ),
         (["--stage", "geometry", "--dataset", "d"], "--dataset means nothing to the stage geometry"),
         (["--vgg-weights", "imagenet"], "--vgg-weights means nothing to the stage reflectance"),
         (["--photos", "p"], "--photos means nothing to the stage reflectance"),
