@@ -27,10 +27,11 @@ from facerf_cli.stage.appearance.pigments import hair_albedo
 from facerf_cli.stage.appearance.skin import Skin, draw_skin
 from facerf_cli.stage.baked_faces import Geometry
 from facerf_cli.stage.bank import geometry_of
+from facerf_cli.stage.head.clothes import draw_clothes
+from facerf_cli.stage.head.glasses import draw_glasses
 from facerf_cli.stage.head.hair import draw_hair
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.stage.head.shell import shell_head
-from facerf_cli.stage.head.worn import draw_clothes, draw_glasses
 from facerf_cli.stage.lights import draw_light
 from facerf_cli.stage.shading import bend, diffuse_irradiance, highlights, scatter, unit
 from facerf_cli.stage.shards import in_shards

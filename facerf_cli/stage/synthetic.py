@@ -32,10 +32,11 @@ from facerf_cli.stage.bake_renderer import StageCamera
 from facerf_cli.stage.data.documents import write_document
 from facerf_cli.stage.data.layouts import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.stage.geometries import GeometrySettings, draw_coefficients
+from facerf_cli.stage.head.clothes import draw_clothes
+from facerf_cli.stage.head.glasses import draw_glasses
 from facerf_cli.stage.head.hair import draw_hair, scalp_cover
 from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
-from facerf_cli.stage.head.worn import draw_clothes, draw_glasses
 
 Renderer = Literal["bake", "mitsuba"]
 # Azimuth and elevation of the cameras as seen from the head, all in front (paper, 'Dataset').

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from facerf_cli.stage.head.vectors import unit
+
 PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame")  # of HeadMesh.part, by index
 
 
@@ -35,4 +37,19 @@ def joined(*meshes: HeadMesh) -> HeadMesh:
         part=np.concatenate([mesh.part for mesh in meshes]),
         uv=np.concatenate([mesh.uv for mesh in meshes]),
         tangents=np.concatenate([mesh.tangents for mesh in meshes]),
+    )
+
+
+def strandless(
+    part: str, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, uv: np.ndarray
+) -> HeadMesh:
+    """One part without strands: vertices and normals [N, 3], of any length, triangles [F, 3], uv [N, 2]."""
+    normals = unit(normals)
+    return HeadMesh(
+        vertices=vertices.astype(np.float32),
+        normals=normals.astype(np.float32),
+        triangles=triangles.astype(np.int64),
+        part=np.full(len(vertices), PARTS.index(part), np.uint8),
+        uv=uv.astype(np.float32),
+        tangents=np.zeros((len(vertices), 3), np.float32),
     )

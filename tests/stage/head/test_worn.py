@@ -6,9 +6,10 @@ import trimesh
 
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.stage.geometries import mean_coefficients
-from facerf_cli.stage.head import worn
+from facerf_cli.stage.head import clothes, glasses
+from facerf_cli.stage.head.clothes import GARMENTS, draw_clothes
+from facerf_cli.stage.head.glasses import GLASSES, draw_glasses
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
-from facerf_cli.stage.head.worn import GARMENTS, GLASSES, draw_clothes, draw_glasses
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,7 @@ def require_sound(mesh: HeadMesh, part: str) -> None:
 def test_glasses_sit_before_the_eyes_and_not_in_the_skin(
     head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worn, "GLASSES", (kind,))
+    monkeypatch.setattr(glasses, "GLASSES", (kind,))
     frame = draw_glasses(head, landmarks, np.random.default_rng(2))
     require_sound(frame, "frame")
     front = frame.vertices[frame.vertices[:, 2] > 0.09]
@@ -58,7 +59,7 @@ def test_glasses_sit_before_the_eyes_and_not_in_the_skin(
 def test_clothes_lie_outside_the_neck_and_reach_the_shoulders(
     head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worn, "GARMENTS", (kind,))
+    monkeypatch.setattr(clothes, "GARMENTS", (kind,))
     cloth = draw_clothes(head, np.random.default_rng(3))
     require_sound(cloth, "cloth")
     assert 0.38 < np.ptp(cloth.vertices[:, 0]) < 0.48
