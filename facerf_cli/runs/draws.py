@@ -47,7 +47,10 @@ def drawn_batches(
 class _Draws(Dataset[Batch | FacerfError]):
     def __init__(self, objective: Objective, count: int, first_index: int, seed: int) -> None:
         self.objective = copy.copy(objective)
-        self.objective.__dict__["_modules"] = {}  # drawing needs no networks: none go to the workers
+        self.objective.__dict__ |= {
+            "_modules": {},
+            "_buffers": {},
+        }  # drawing needs neither: none go to workers
         self.count, self.first_index, self.seed = count, first_index, seed
 
     def __getitem__(self, step: int) -> Batch | FacerfError:
