@@ -29,6 +29,7 @@ from facerf_cli.network.paper_losses import (
     regularisation,
 )
 from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.objectives.feature_networks import VGG16_LICENCE
 from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
 from facerf_cli.objectives.posed_heads import (
     LANDMARKS,
@@ -273,6 +274,6 @@ def _provenance(
     dataset: Dataset, model: MorphableModel, photos: Photos | None, appearance: bool, light: bool
 ) -> dict[str, Any]:
     """The dataset's, and what else the networks learnt from."""
-    terms = [name for name, there in (("V_f", appearance), ("S_f", light)) if there]
+    terms = [name for name, there in ((f"V_f, {VGG16_LICENCE}", appearance), ("S_f", light)) if there]
     found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
     return provenance_of(dataset, model) | found

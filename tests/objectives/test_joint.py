@@ -251,3 +251,8 @@ def test_validation_tells_poses_apart(objective: JointObjective) -> None:
     assert first.metrics["si_mse"] == pytest.approx(both) and first.metrics["si_mse"] > 0
     assert first.sheet is not None and first.sheet.shape == (4 * CROP_PX, 4 * CROP_PX, 3)
     assert objective.chooses_by in first.metrics
+
+
+def test_a_checkpoint_says_what_its_losses_learnt_from(objective: JointObjective) -> None:
+    vgg, light = objective.provenance["feature_losses"]
+    assert "ImageNet" in vgg and light == "S_f" and objective.provenance["photos"] == 1
