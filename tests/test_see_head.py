@@ -42,8 +42,9 @@ def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: 
     assert moved_m.norm(dim=-1).max() < 2e-3
 
 
-def test_the_default_checkpoint_fits_as_ever(models: Models, landmarks_px: np.ndarray) -> None:
-    crop, _ = crop_face(PHOTO, landmarks_px, 128)
-    one = fit_face(models.face, crop, landmarks_px, PHOTO.shape)
-    same = fit_face(models.face, crop, landmarks_px, PHOTO.shape, None)
-    assert torch.equal(one.beta, same.beta) and one.error_iod < 0.02
+def test_what_the_default_checkpoint_sees_in_a_blank_photo_spoils_no_fit(
+    models: Models, landmarks_px: np.ndarray
+) -> None:
+    crop, cropped = crop_face(PHOTO, landmarks_px, 128)
+    fit = fit_face(models.face, crop, landmarks_px, PHOTO.shape, see_head(models, cropped))
+    assert fit.error_iod < 0.02

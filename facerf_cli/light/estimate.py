@@ -23,6 +23,8 @@ def estimate_light(olats: Tensor, picture: Tensor) -> Tensor:
 
 def _weights(olats: Tensor, picture: Tensor) -> np.ndarray:
     lights, target = olats.double().T.numpy(), picture.double().numpy()  # [N, L], [N]
+    if not len(target):  # nothing is seen well enough
+        return np.zeros(lights.shape[1])
     ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
     trust = np.ones(len(target))
     for _ in range(_ROUNDS):

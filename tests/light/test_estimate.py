@@ -1,3 +1,4 @@
+import pytest
 import torch
 
 from facerf_cli.light.estimate import estimate_light
@@ -39,3 +40,9 @@ def test_a_clipped_and_covered_picture_gives_the_same_light() -> None:
 def test_a_black_picture_has_no_light() -> None:
     olats = _shaded_ball()
     assert estimate_light(olats, torch.zeros(3, olats.shape[-1])).abs().max() == 0
+
+
+@pytest.mark.filterwarnings("error")
+def test_where_nothing_is_seen_there_is_no_light() -> None:
+    found = estimate_light(torch.zeros(24, 3, 0), torch.zeros(3, 0))
+    assert found.shape == (24, 3) and (found == 0).all()
