@@ -32,7 +32,7 @@ from torch import Tensor
 
 from facerf_cli.colour import luminance
 from facerf_cli.face.regions import region_mask
-from facerf_cli.network.losses import si_mse
+from facerf_cli.network.losses import clipped_si_mse, si_mse
 from facerf_cli.objectives.objective import seeded
 from facerf_cli.pipeline import load_models
 from facerf_cli.stage.appearance import skin as appearance
@@ -136,8 +136,12 @@ def _recorded() -> Iterator[list[People]]:
 def _pictures(head: int, sample: Sample, predicted: Tensor, person: People) -> Iterator[Picture]:
     cosine = torch.einsum("blc,bcij->blij", sample.lights, sample.normals_target).clamp_min(0)
     lambert = sample.source[:, None] * cosine[:, :, None]
-    pairs = (predicted, sample.target), (predicted, sample.target.clamp(max=1)), (lambert, sample.target)
-    errors = torch.cat([si_mse(*pair, sample.weight) for pair in pairs]).T.tolist()  # [L, 3]
+    measured = (
+        si_mse(predicted, sample.target, sample.weight),
+        clipped_si_mse(predicted, sample.target, sample.weight),
+        si_mse(lambert, sample.target, sample.weight),
+    )
+    errors = torch.cat(measured).T.tolist()  # [L, 3]
     same = bool((sample.normals_source - sample.normals_target).abs().amax() < 1e-3)
     albedo = None if person.random_texture[0] else appearance.bare_skin(person)[0].numpy()
     tone = None if albedo is None else tone_of(float(ita_deg(albedo)))

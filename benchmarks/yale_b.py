@@ -38,6 +38,7 @@ from facerf_cli.pipeline import (
     load_models,
     predict_olat,
     see_face,
+    see_head,
     unwrap_face,
     weigh_batches,
 )
@@ -188,7 +189,7 @@ def relight(
     """Pictures [M, H, W] of a grey source [H, W] under M sums, weights [M, L], of lights [L, 3]."""
     photo = np.repeat(picture[..., None], 3, -1).astype(np.float32)
     crop, cropped = crop_face(photo, landmarks_px, CROP_PX)
-    fit = fit_face(models.face, crop, landmarks_px, photo.shape)
+    fit = fit_face(models.face, crop, landmarks_px, photo.shape, see_head(models, cropped))
     face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE, photo.shape)
     grey_weights = weights[..., None].expand(-1, -1, 3)
     textures = weigh_batches(

@@ -5,6 +5,17 @@ import torch.nn.functional as F
 from torch import Tensor
 
 MEAN_RADIANCE = 0.25  # of the visible face after exposure is taken out
+_LIT = 0.02  # keeps the root's slope finite in the dark
+
+
+def to_root(radiance: Tensor) -> Tensor:
+    """What the default form predicts and its loss compares: nearly the square root, 0 at 0."""
+    return (radiance + _LIT**2).sqrt() - _LIT
+
+
+def from_root(root: Tensor) -> Tensor:
+    """The radiance of a root; none below 0."""
+    return root.clamp_min(0) * (root + 2 * _LIT)
 
 
 def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:

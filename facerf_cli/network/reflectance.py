@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import exposure_of, head_rotation, resize
+from facerf_cli.network.inputs import exposure_of, from_root, head_rotation, resize
 
 _MAP_SIDE = 64  # of the mean face's normals and shadows
 _DARKEST = 1e-8  # radiance at which the square root's slope is still finite
@@ -115,10 +115,10 @@ class ReflectanceNetwork(nn.Module):
     def decode(self, encoded: Encoded, normals_target: Tensor, lights: Tensor) -> Tensor:
         """OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3] and normals [B, 3, T, T]."""
         root = self.decode_root(encoded, normals_target, lights)
-        return root.clamp_min(0) ** 2 * encoded.exposure[:, None]
+        return from_root(root) * encoded.exposure[:, None]
 
     def decode_root(self, encoded: Encoded, normals_target: Tensor, lights: Tensor) -> Tensor:
-        """Square roots [B, L, 3, T, T] of the textures at the normalised exposure; may dip below zero."""
+        """Roots [B, L, 3, T, T] of the textures at the normalised exposure (`to_root`); may be negative."""
         faces, count, _ = lights.shape
         maps, base, code = self._light_inputs(self._seen(normals_target), lights)
         x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)

@@ -13,15 +13,14 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.features import LightNetwork, feature_distance
-from facerf_cli.network.losses import root_loss, si_mse
+from facerf_cli.network.inputs import from_root, to_root
+from facerf_cli.network.losses import clipped_si_mse, root_loss
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
 from facerf_cli.stage.samples import Sample, SampleSource
 
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 5
-_WHITE = 1.0  # where a camera clips; a few glints of the truth would outweigh all faces
-_DARK = 1e-6  # radiance at which the square root's slope is still finite
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ class ChartObjective(Objective):
         terms = {"root": root_loss(root, target, sample.weight)}
         if self.light is not None:
             seen = (sample.weight > 0).float()[:, None]
-            textures = ((x * seen).flatten(0, 1) for x in (root.clamp_min(0) ** 2, target))
+            textures = ((x * seen).flatten(0, 1) for x in (from_root(root), target))
             with self.mixed_precision():
                 distance = feature_distance(self.light, *textures).mean()
             terms["light_features"] = self.settings.light_features * distance
@@ -99,7 +98,7 @@ class ChartObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean Si-MSE of held-out heads, truth clipped at white: of all, and by the target's pose.
+        """Mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
 
         The sheet has a face in two rows: source and true OLATs, then what is seen of it and the predicted.
         """
@@ -112,7 +111,7 @@ class ChartObjective(Objective):
             there = sample.to(device)
             encoded = network.encode(there.source, there.normals_source, there.visible)
             predicted = network.decode(encoded, there.normals_target, there.lights).cpu()
-            errors.append(si_mse(predicted, sample.target.clamp(max=_WHITE), sample.weight).mean())
+            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
@@ -141,11 +140,11 @@ def _set_mean_face(network: ReflectanceNetwork, source: SampleSource) -> None:
 
 
 def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
-    """Square roots [B, L, 3, T, T] at the normalised exposure, of either form."""
+    """Roots [B, L, 3, T, T] at the normalised exposure, of either form."""
     if isinstance(network, ReflectanceNetwork):
         return network.decode_root(encoded, sample.normals_target, sample.lights)
     linear: Tensor = network.decode(encoded, sample.normals_target, sample.lights)
-    return (linear.float() / encoded.exposure[:, None]).clamp_min(_DARK).sqrt()
+    return to_root(linear.float() / encoded.exposure[:, None])
 
 
 def _by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:

@@ -18,7 +18,7 @@ from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.features import Layered
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import resize
-from facerf_cli.network.losses import si_mse
+from facerf_cli.network.losses import clipped_si_mse
 from facerf_cli.network.paper_losses import (
     PaperWeights,
     Seen,
@@ -206,7 +206,7 @@ class JointObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Si-MSE in the image (paper, 'Reflectance'), for the source's own pose and another, and landmarks.
+        """Si-MSE in the image, clipped at white, for the source's own pose and another; and landmarks.
 
         `landmarks_iod` is the mean distance of the 66 over that of the outer eye corners.
         """
@@ -221,7 +221,7 @@ class JointObjective(Objective):
                 batch = pair.to(device)
                 _, heads = self._heads(torch.cat([batch.source, batch.target]))
                 relit = self._relit(batch, heads)
-                of_kind.append(si_mse(relit.picture[:, None], batch.target[:, None], relit.mask))
+                of_kind.append(clipped_si_mse(relit.picture[:, None], batch.target[:, None], relit.mask))
                 distances.append(_landmark_error(heads, batch, self.camera))
                 if index % max(1, 2 * len(pairs) // _SHEET_ROWS) == 0:
                     rows.append(_sheet_row(batch, relit, self.camera))
