@@ -19,7 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
-from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
 from facerf_cli.light.estimate import estimate_light
 from facerf_cli.light.quotient import Quotient
@@ -66,6 +66,7 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
     networks, metadata = load_networks(path, LAYOUT_VERSION)
     if "reflectance" not in networks:
         raise InputError(f"{path}: holds no Reflectance Network; give one by `facerf train`")
+    _require_builtin_coefficients(path, networks.get("geometry"))
     on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
     return Models(
         face=load_face_model(face_model),
@@ -75,6 +76,15 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
         metadata=metadata,
         device=device,
     )
+
+
+def _require_builtin_coefficients(path: Path, geometry: Any) -> None:
+    """InputError where a Geometry Network regresses more coefficients than the built-in model has."""
+    if geometry is None:
+        return
+    model, settings = load_face_model(BUILTIN), geometry.settings
+    if settings.identity > len(model.identity) or settings.expression > len(model.expression):
+        raise InputError(f"{path}: its Geometry Network is of another built-in face model; train it again")
 
 
 def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tuple[Crop, np.ndarray]:

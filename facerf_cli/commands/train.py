@@ -148,7 +148,7 @@ def train(
     ] = False,
     learning_rate: Annotated[
         float | None,
-        _length(
+        _run(
             min=1e-9,
             help="Highest step size of the optimiser.",
             show_default="0.0015; paper 0.05, tiny 0.004",

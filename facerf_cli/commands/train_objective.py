@@ -220,8 +220,9 @@ def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     drawn = load_face_model(options.heads_from)
     load_face_model(options.fit_with)  # a bad one is named before anything is baked
     build_geometries(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
+    found = len(list((folder / "heads").glob("*.safetensors")))
     return {
-        "heads": f"{heads} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "heads": f"{found} synthetic heads drawn from {drawn.name} ({drawn.licence})",
         "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
 

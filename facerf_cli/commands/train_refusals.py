@@ -17,7 +17,7 @@ _STAGES = {  # that an option means something to
     "views": ("reflectance", "light-features"),
     "texture_size": ("reflectance", "light-features"),
     "dataset": ("reflectance", "light-features", "joint"),
-    "fit_with": ("reflectance", "light-features", "geometry"),
+    "fit_with": ("reflectance", "light-features"),
     "heads_from": ("reflectance", "light-features", "geometry"),
     "heads": ("reflectance", "light-features", "geometry"),
     "bank": ("reflectance", "light-features", "geometry"),

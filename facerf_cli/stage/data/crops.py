@@ -25,7 +25,7 @@ from facerf_cli.stage.data.pair_weights import load_pairs
 from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs
 from facerf_cli.stage.data.relighting import relit_pictures
 
-_VIEWS_KEPT = 2048  # of cameras and subjects; a few KiB each
+_VIEWS_KEPT = 2048  # of cameras and subjects; at most 32 KiB each at 512 pixels
 _SUBJECTS_ASKED = 16  # for where heads stand
 _DARKEST = 1e-4  # mean radiance that is told from none
 
@@ -151,5 +151,7 @@ def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
     """Where heads stand before the crops' camera by the fits of some subjects: a Geometry Network's start."""
     subjects = dataset.splits["train"][:_SUBJECTS_ASKED] or dataset.subjects[:_SUBJECTS_ASKED]
     paths = [dataset.fit_path(subject, camera) for subject in subjects for camera in dataset.cameras[subject]]
+    if not paths:
+        raise InputError(f"{dataset.folder}: no subject has a fit; run prepare-dataset again")
     x, y, z = torch.stack([load_fit(path).translation_m for path in paths]).mean(0).tolist()
     return x, y, z
