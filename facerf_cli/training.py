@@ -67,7 +67,7 @@ def train(
     objective.to(device)
     objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     objective.bf16 = settings.bf16
-    state = begin(objective.networks, settings, start.metadata)
+    state = begin(objective.networks, settings, start.metadata, objective.provenance)
     if resume and (folder / "state.pt").exists():
         load_state(folder / "state.pt", state, settings)
         saved, _ = load_networks(folder / "last.safetensors", LAYOUT_VERSION)

@@ -30,13 +30,16 @@ class State:
     seconds: float = 0.0  # that they took, in all legs
     best: float = math.inf  # of the metric that chooses
     start: dict[str, Any] = field(default_factory=dict)  # metadata of the checkpoint it began from, if any
+    provenance: dict[str, Any] = field(default_factory=dict)  # of what it learns from
 
 
-def begin(networks: nn.ModuleDict, settings: TrainSettings, start: dict[str, Any]) -> State:
+def begin(
+    networks: nn.ModuleDict, settings: TrainSettings, start: dict[str, Any], provenance: dict[str, Any]
+) -> State:
     """The state before the first step."""
     optimizer = settings.optimizer.build(networks.parameters())
     average = [tensor.clone() for tensor in _floats(networks)] if settings.ema_decay else []
-    return State(networks, optimizer, average, start=start)
+    return State(networks, optimizer, average, start=start, provenance=provenance)
 
 
 @torch.no_grad()
@@ -69,6 +72,7 @@ def save_state(path: Path, state: State, settings: TrainSettings) -> None:
         "seconds": state.seconds,
         "best": state.best,
         "start": json.dumps(state.start),
+        "provenance": json.dumps(state.provenance),
         "settings": json.dumps(asdict(settings)),
     }
     with atomic_path(path) as temporary:
@@ -76,12 +80,14 @@ def save_state(path: Path, state: State, settings: TrainSettings) -> None:
 
 
 def load_state(path: Path, state: State, settings: TrainSettings) -> None:
-    """Take up what `save_state` wrote; UsageError where the run was begun with other settings."""
+    """Take up what `save_state` wrote; UsageError where the run was begun with other settings or data."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         if content["format"] != _FORMAT:
             raise ValueError("written by another version")
         _refuse_other_settings(path, json.loads(content["settings"]), settings)
+        if json.loads(content["provenance"]) != json.loads(json.dumps(state.provenance)):
+            raise UsageError(f"{path.parent}: this run was begun on other data; resume it with the same options")
         state.networks.load_state_dict(content["networks"])
         state.optimizer.load_state_dict(content["optimizer"])
         _take(state.average, content["average"])

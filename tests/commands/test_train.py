@@ -148,6 +148,8 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert "holds a run already; give --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--batch", "3"]) == 2
     assert "this run was begun with batch 2" in capsys.readouterr().err
+    assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
+    assert "this run was begun on other data" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
