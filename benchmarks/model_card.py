@@ -58,7 +58,7 @@ def yale(found: Table) -> list[str]:
 
 def synthetic(found: Table) -> list[str]:
     """Held-out heads: by pose and angle, then by skin tone."""
-    head = "| n | Si-MSE | its median | sd | Lambert | Si-MSE, truth clipped at 1 |"
+    head = "| n | Si-MSE | its median | sd | Lambert | Si-MSE, both clipped at 1 |"
     lines = [f"| held-out heads {head}", "|---" * 7 + "|"]
     lines += [_row([name, *_errors(row)]) for name, row in found["rows"].items() if row["si_mse"]]
     lines += ["", f"| skin {head} tone drift, degrees of ITA | its size |", "|---" * 9 + "|"]

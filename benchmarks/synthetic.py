@@ -4,7 +4,7 @@
 
 Every held-out head is drawn DRAWS times: skin, camera, source light and target lights. Intervals are over
 heads. Textures are scaled to a mean albedo of 0.25, which on dark skin lifts highlights far above white, and
-they outweigh the rest; so errors stand there twice, once with the truth clipped at 1. Beside it a naive twin:
+they outweigh the rest; so errors stand there twice, once with both clipped at 1. Beside it a naive twin:
 the source's own texture, shaded by Lambert's cosine without shadows. This is the network alone, as training
 validates it: what holds the field to its photo (`pipeline.explain_photo`) is left out.
 
@@ -64,7 +64,7 @@ class Picture:
     angle_deg: float
     tone: str | None
     si_mse: float
-    clipped: float  # the same, of a truth that is clipped at 1
+    clipped: float  # the same, of both clipped at 1
     lambert: float
     drift_deg: float | None
 
