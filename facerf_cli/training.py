@@ -198,7 +198,7 @@ def _validate(run: _Run, step: int) -> dict[str, float]:
 def _metadata(run: _Run, row: Row) -> dict[str, Any]:
     """Of the checkpoint; what it began from is part of its past."""
     start, provenance = run.state.start, dict(run.objective.provenance)
-    licences = [*start.get("licence", "").split("; "), *provenance["licence"].split("; ")]
+    licences = [*provenance["licence"].split("; "), *start.get("licence", "").split("; ")]
     if "provenance" in start:
         provenance["started_from"] = start["provenance"]
     leg = {

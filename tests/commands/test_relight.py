@@ -74,11 +74,11 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     monkeypatch.setattr(
         facerf_cli.pipeline,
         "predict_olat",
-        lambda *given, **named: predicted.append(1) or predict(*given, **named),
+        lambda *given, **named: predicted.append("quotient" in named) or predict(*given, **named),
     )
     line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0", "--ball"]
     assert relight(given, tmp_path, *line) == 0
-    assert len(predicted) == 1
+    assert predicted == [False, True]  # to estimate the photo's own light, and for all that is asked
     names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
     names.append("astronaut_light_40_10+-40_0_1_0_0")
     pictures = sorted(name + suffix for name in names for suffix in (".exr", ".png"))
@@ -89,7 +89,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     assert row["exposure_ev"][names[0]] == row["exposure_ev"][names[1]]  # a turning sky does not pump
     assert len(capsys.readouterr().out.splitlines()) == 10
     assert relight(given, tmp_path, *line) == 0
-    assert len(predicted) == 1  # finished already
+    assert len(predicted) == 2  # finished already
 
 
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
