@@ -31,7 +31,7 @@ class ChartSettings:
     held_out_heads: int = 12
     held_out_draws: int = 4
     held_out_lights: int = 6
-    light_features: float = 1.0  # weight of L_L
+    light_features: float = 0.25  # weight of L_L, whose gradient is then a third of the rest's
 
 
 @dataclass(frozen=True)
