@@ -4,6 +4,7 @@ import math
 import zipfile
 import zlib
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +73,16 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
 
 
 def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
-    """The built-in model, or one written by `facerf face-model import`."""
-    path = BUILTIN_PATH if str(name_or_path) == BUILTIN else Path(name_or_path)
+    """The built-in model, read once a process, or one written by `facerf face-model import`."""
+    return _builtin() if str(name_or_path) == BUILTIN else _read(Path(name_or_path))
+
+
+@cache
+def _builtin() -> MorphableModel:
+    return _read(BUILTIN_PATH)
+
+
+def _read(path: Path) -> MorphableModel:
     if not path.is_file():
         raise InputError(
             f"{path}: no such face model; give '{BUILTIN}' or a file that `facerf face-model import` wrote"

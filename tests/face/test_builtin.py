@@ -51,6 +51,10 @@ def test_the_asset_is_what_the_recipe_builds(model):
     assert (spread - rebuilt).abs().max() < 3e-5
 
 
+def test_it_is_read_once_a_process():
+    assert load_face_model() is load_face_model("builtin")
+
+
 def test_the_mean_is_symmetric_to_the_last_bit(model):
     assert torch.equal(model.mean, mirrored(model.mean))
 
