@@ -26,12 +26,12 @@ from unittest.mock import patch
 
 import numpy as np
 import torch
-from bootstrap import Interval, mean_interval
 from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.colour import luminance
 from facerf_cli.face.regions import region_mask
+from facerf_cli.intervals import Interval, mean_interval
 from facerf_cli.network.losses import clipped_si_mse, si_mse
 from facerf_cli.objectives.objective import seeded
 from facerf_cli.pipeline import load_models

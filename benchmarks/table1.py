@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from bootstrap import mean_interval
 from torch import Tensor
 
 from facerf_cli.face.fit import FaceFit, fit_from_arrays, fit_landmarks
@@ -29,6 +28,7 @@ from facerf_cli.face.interior import interior_mask
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
+from facerf_cli.intervals import mean_interval
 from facerf_cli.network.losses import si_mse
 from facerf_cli.pipeline import FaceTexture, Models, explain_photo, load_models, predict_olat, turn_to
 from facerf_cli.raster.rasterize import interpolate, rasterize

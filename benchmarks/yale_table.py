@@ -6,7 +6,7 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-from bootstrap import average, mean_interval
+from facerf_cli.intervals import average, mean_interval
 
 Row = dict[str, Any]  # a picture: subject, task, source, light, angle_deg, and score.py's measures
 

@@ -23,6 +23,7 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
 from facerf_cli.light.estimate import estimate_light
 from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.saved import load_networks
@@ -142,14 +143,29 @@ def explain_photo(models: Models, face: FaceTexture) -> Quotient:
 
     The photo's light is estimated over a coarse rig, on small textures.
     """
+    small = _shrunk(face)
+    olats = torch.cat(list(predict_olat(models, small, _coarse_rig())))
+    light = _light_of(small, _coarse_rig(), olats)
+    return Quotient.of(small.texture, weigh(olats, light.weights[None])[0], small.visible)
+
+
+def estimate_photo_light(models: Models, face: FaceTexture, rig: Tensor) -> RigLight:
+    """The light of the face's photo over lights [L, 3] (paper, 'Light Estimation')."""
+    small = _shrunk(face)
+    return _light_of(small, rig, torch.cat(list(predict_olat(models, small, rig))))
+
+
+def _shrunk(face: FaceTexture) -> FaceTexture:
+    """The texture at the side at which light is estimated."""
     side = (_EXPLAINED_SIDE, _EXPLAINED_SIDE)
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
     small = F.interpolate(fields, side, mode="area")[0]
-    texture, visible, normals = small[:3], small[3], F.normalize(small[4:], dim=0)
-    olats = torch.cat(list(predict_olat(models, FaceTexture(texture, visible, normals), _coarse_rig())))
-    seen = visible > 0.9
-    weights = estimate_light(olats[..., seen], texture[:, seen])
-    return Quotient.of(texture, weigh(olats, weights[None])[0], visible)
+    return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
+
+
+def _light_of(face: FaceTexture, rig: Tensor, olats: Tensor) -> RigLight:
+    seen = face.visible > 0.9
+    return RigLight(rig, estimate_light(olats[..., seen], face.texture[:, seen]))
 
 
 @cache

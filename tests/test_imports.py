@@ -11,12 +11,12 @@ LEVELS = (
     ("main",),
     ("commands",),
     ("training",),
-    ("objectives", "runs"),
+    ("objectives", "runs", "evaluation"),
     ("pipeline", "stage", "baselines", "report"),
     ("network", "face", "metrics"),
     ("raster", "light"),
     ("files",),
-    ("records", "colour", "errors"),
+    ("records", "colour", "errors", "intervals"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 STRANGERS = (("network", "face"), ("raster", "light"))  # what one needs of the other is handed in

@@ -12,7 +12,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import torch
-from bootstrap import average, mean_interval
 from loss_curve import curve, draw_chart, read_log
 from model_card import ablations, speed, synthetic, table1, yale
 from synthetic import Picture, summary, tone_drift_deg, tone_of
@@ -20,6 +19,8 @@ from synthetic import table as held_out_table
 from table1 import Measured
 from table1 import summary as table1_summary
 from yale_table import COLUMNS, results, table
+
+from facerf_cli.intervals import average, mean_interval
 
 
 def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
