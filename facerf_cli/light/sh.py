@@ -1,0 +1,124 @@
+"""Real spherical harmonics of any order: light as coefficients, and back; one convention, stated here.
+
+`CONVENTION` goes into every file that holds coefficients. Coefficients [K, C], K = (order + 1)^2, are
+c_lm = integral of L(d) Y_lm(d) over the sphere: radiance times steradian. A light of a rig of weight w
+(`light/envmap.py`: it gives a white surface that faces it radiance 1) is a point of radiance times solid
+angle pi w, so a rig and the map that it was weighed from have about the same coefficients.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.sphere import latlong_directions
+
+CONVENTION = (
+    "real, orthonormal over the sphere, no Condon-Shortley phase, index l*l+l+m; camera axes "
+    "(x right, y up, z toward the camera), polar axis +z, azimuth from +x to +y: degree 1 is sqrt(3/4pi) "
+    "(y, z, x)"
+)
+MOST_ORDER = 20
+
+
+def sh_basis(directions: Tensor, order: int) -> Tensor:
+    """Y_lm [..., (order + 1)^2] along unit directions [..., 3], in their own precision; differentiable.
+
+    Polynomials in x, y, z, so that nothing breaks at the poles: the associated Legendre functions over
+    sin^m theta by their recurrence in l (Sloan, *Stupid Spherical Harmonics Tricks*, 2008, appendix A1),
+    times the real and imaginary part of (x + i y)^m.
+    """
+    if not 0 <= order <= MOST_ORDER:
+        raise InputError(f"spherical harmonics of order {order}: orders from 0 to {MOST_ORDER} can be had")
+    x, y, z = directions.unbind(-1)
+    basis: list[Tensor] = [z] * (order + 1) ** 2
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # of m times the azimuth, times sin^m theta
+    for m in range(order + 1):
+        for degree, legendre in enumerate(_legendre(z, m, order), start=m):
+            middle = degree * degree + degree
+            scale = math.sqrt(2) if m else 1.0
+            basis[middle - m] = scale * legendre * sine
+            basis[middle + m] = scale * legendre * cosine
+        cosine, sine = x * cosine - y * sine, x * sine + y * cosine
+    return torch.stack(basis, -1)
+
+
+def _legendre(z: Tensor, m: int, order: int) -> list[Tensor]:
+    """P_lm(z) / sin^m theta for l = m .. order, normalised so that the harmonics are orthonormal."""
+    start = math.prod(math.sqrt((2 * k + 1) / (2 * k)) for k in range(1, m + 1)) / math.sqrt(4 * math.pi)
+    values = [torch.full_like(z, start)]
+    if order > m:
+        values.append(math.sqrt(2 * m + 3) * z * values[0])
+    for degree in range(m + 2, order + 1):
+        a = math.sqrt((4 * degree**2 - 1) / (degree**2 - m**2))
+        b = math.sqrt(((degree - 1) ** 2 - m**2) / (4 * (degree - 1) ** 2 - 1))
+        values.append(a * (z * values[-1] - b * values[-2]))
+    return values
+
+
+def order_of(coefficients: Tensor) -> int:
+    """The order of coefficients [K, ...]; K must be a square."""
+    order = math.isqrt(len(coefficients)) - 1
+    if order < 0 or (order + 1) ** 2 != len(coefficients):
+        raise InputError(f"{len(coefficients)} spherical-harmonic coefficients; there are 1, 4, 9, 16, ...")
+    return order
+
+
+def rig_coefficients(light: RigLight, order: int) -> Tensor:
+    """Coefficients [K, 3] of a rig's light: pi times the sum of w_l Y(d_l)."""
+    basis = sh_basis(light.directions.double(), order)
+    return (math.pi * basis.T @ light.weights.double()).float()
+
+
+def coefficients_to_rig(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """The least weights [L, 3] of lights at `directions` [L, 3] that have these coefficients [K, 3].
+
+    Signed, by the pseudo-inverse: `rig_coefficients` gives the coefficients back exactly for a rig of enough
+    lights that are spread over the sphere (150 are enough up to order 11), else the nearest that can be had.
+    """
+    basis = sh_basis(directions.double(), order_of(coefficients))
+    return (torch.linalg.pinv(math.pi * basis.T) @ coefficients.double()).float()
+
+
+def radiance(coefficients: Tensor, directions: Tensor) -> Tensor:
+    """Radiance [..., 3] from unit directions [..., 3] of a light of coefficients [K, 3]."""
+    return sh_basis(directions, order_of(coefficients)) @ coefficients.to(directions)
+
+
+def irradiance(normals: Tensor, coefficients: Tensor) -> Tensor:
+    """Irradiance [..., 3] on surfaces of unit normals [..., 3]; over pi it is a white surface's radiance.
+
+    Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment Maps*, 2001, Eq. 7.
+    It may be slightly negative, as a cut series is.
+    """
+    order = order_of(coefficients)
+    lobe = torch.cat(
+        [coefficients.new_full((2 * degree + 1, 1), cosine_lobe(degree)) for degree in range(order + 1)]
+    )
+    return radiance(coefficients * lobe, normals)
+
+
+def cosine_lobe(degree: int) -> float:
+    """A_l, the clamped cosine's factor at degree l (ibid., Eq. 8): pi, 2 pi / 3, pi / 4, 0, -pi / 24, ..."""
+    if degree == 1:
+        return 2 * math.pi / 3
+    if degree % 2:
+        return 0.0
+    sign = -1 if degree % 4 == 0 else 1
+    half = math.factorial(degree // 2)
+    share = math.factorial(degree) / (2**degree * half * half)
+    return 2 * math.pi * sign * share / ((degree + 2) * (degree - 1))
+
+
+def rotated(coefficients: Tensor, turn: Tensor) -> Tensor:
+    """Coefficients [K, 3] of the light after the rotation `turn` [3, 3], which takes d to turn @ d.
+
+    Solved for at more directions than there are coefficients; exact, as each degree is closed under rotation.
+    """
+    order = order_of(coefficients)
+    directions = latlong_directions(order + 2, 2 * order + 4, torch.float64).reshape(-1, 3)
+    came_from = directions @ turn.double().cpu()  # row by row: the inverse of the rotation
+    turned = sh_basis(came_from, order) @ coefficients.double().cpu()
+    return torch.linalg.lstsq(sh_basis(directions, order), turned, driver="gelsd").solution.to(coefficients)
