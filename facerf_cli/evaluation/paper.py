@@ -1,0 +1,61 @@
+"""The figures of the paper's Tables 1 to 4 (paper, 'Results'): shown beside ours, measured on other data."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published figure: mean and standard deviation over pictures of one metric of one method.
+
+    `group` names the fact and value of ours that it stands beside ('pose', 'same pose'); None is all
+    pictures. `source` and `data` say where it stands and what it was measured on.
+    """
+
+    method: str
+    metric: str
+    mean: float
+    sd: float | None = None
+    group: tuple[str, str] | None = None
+    source: str = "the paper"
+    data: str = "other data than ours"
+
+
+_LIGHT_STAGE = "people in a light stage; other data than ours"
+_CELEBA = "130 pictures of CelebA-HQ; other data than ours"
+_TEST_SET = "86 light-stage pictures in natural light; other data than ours"
+_METHODS = ("the paper's", "Smith et al.", "Schneider et al.", "Tewari et al.")
+
+TABLE_1 = (
+    Published("the paper's", "si_mse", 0.00070, 0.00059, ("pose", "same pose"), "Table 1", _LIGHT_STAGE),
+    Published("the paper's", "si_mse", 0.00084, 0.00088, ("pose", "different pose"), "Table 1", _LIGHT_STAGE),
+)
+
+
+def _table_2(metric: str, data: str, figures: tuple[tuple[float, float], ...]) -> tuple[Published, ...]:
+    """A row of Table 2, in the order of `_METHODS`."""
+    return tuple(
+        Published(method, metric, mean, sd, None, "Table 2", data)
+        for method, (mean, sd) in zip(_METHODS, figures, strict=True)
+    )
+
+
+TABLE_2_RECONSTRUCTION = (
+    *_table_2("si_mse", _CELEBA, ((0.004, 0.002), (0.017, 0.015), (0.010, 0.008), (0.007, 0.003))),
+    *_table_2("face_dis", _CELEBA, ((0.550, 0.080), (0.650, 0.076), (0.685, 0.067), (0.762, 0.075))),
+)
+TABLE_2_TRANSFER = (
+    *_table_2("si_mse", _TEST_SET, ((0.002, 0.001), (0.018, 0.011), (0.007, 0.005), (0.003, 0.001))),
+    *_table_2("face_dis", _TEST_SET, ((0.482, 0.084), (0.605, 0.092), (0.644, 0.077), (0.689, 0.076))),
+)
+TABLE_3 = (
+    Published("without normals", "si_mse", 0.00113, 0.00093, ("pose", "same pose"), "Table 3", _LIGHT_STAGE),
+    Published(
+        "without normals", "si_mse", 0.00126, 0.00116, ("pose", "different pose"), "Table 3", _LIGHT_STAGE
+    ),
+)
+TABLE_4 = (
+    Published("all components", "si_mse", 0.004, 0.002, None, "Table 4", _CELEBA),
+    Published("mean face", "si_mse", 0.011, 0.005, None, "Table 4", _CELEBA),
+    Published("all components", "face_dis", 0.550, 0.080, None, "Table 4", _CELEBA),
+    Published("mean face", "face_dis", 0.550, 0.073, None, "Table 4", _CELEBA),
+)
