@@ -5,13 +5,12 @@ what one model reads off a photo can be handed to another.
 """
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Protocol
 
 from torch import Tensor
 
+from facerf_cli.baselines.kinds import Kind as Kind
 from facerf_cli.light.rig_light import RigLight
-
-Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]
 
 
 class Reflectance(Protocol):

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from facerf_cli.baselines.kinds import Kind
 from facerf_cli.commands.batch import BatchOptions, run_batch
 from facerf_cli.commands.options import (
     DryRunOption,
@@ -74,6 +75,13 @@ def relight(
             show_default="the photo's",
         ),
     ] = None,
+    reflectance: Annotated[
+        Kind,
+        typer.Option(
+            help="What the face is taken to be: the field of the network, or, to compare, diffuse under "
+            "spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
+        ),
+    ] = "field",
     exposure: Annotated[
         str,
         typer.Option(
@@ -155,6 +163,7 @@ def relight(
         exposure_ev=exposure_ev,
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
+        reflectance=reflectance,
     )
     if not dry_run:
         load_models_once(photo)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from facerf_cli.baselines.kinds import Kind
 from facerf_cli.commands.batch import Outcome
 from facerf_cli.commands.canvas import Backdrop, Canvas, ImageCanvas, read_matte
 from facerf_cli.commands.inputs import Item
@@ -25,9 +26,11 @@ from facerf_cli.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from facerf_cli.baselines.reflectance import Reflectance
     from facerf_cli.face.fit import FaceFit
     from facerf_cli.files.images import Picture
     from facerf_cli.files.olat_stack import OlatStack
+    from facerf_cli.pipeline import Models
 
 Composite = Literal["photo", "face"]
 _HELD = 4  # relit textures are held this many times over while light is added to them
@@ -49,6 +52,7 @@ class Relight:
     exposure_ev: float | None  # None: auto
     memory_bytes: int
     asked_for_photo: bool  # --composite photo, in so many words
+    reflectance: Kind = "field"
 
     def outputs_of(self, item: Item) -> list[Path]:
         """An EXR and a PNG a shot."""
@@ -75,23 +79,31 @@ class Relight:
 
     def _relight_face(self, item: Item, picture: "Picture", face: FittedFace) -> Iterator[tuple[Path, float]]:
         """Write every shot of a face; the EXR's path and the PNG's exposure of each."""
-        from facerf_cli.pipeline import explain_photo, predict_olat, weigh_batches
-
         models = load_models_once(self.photo)
         size_px = picture.pixels.shape[0], picture.pixels.shape[1]
         fit, turn = self._turned(face.fit)
         vertices = fit.vertices_camera(models.face)
         directions, weights = light_photos(self.shots, self.rig, self.sampling)
         canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(picture, size_px))
-
-        quotient = explain_photo(models, face.texture)
+        reflectance = self._reflectance_of(models, face)
 
         def relit(rows: slice) -> "Tensor":
-            olats = predict_olat(models, face.texture, directions, turn, self.memory_bytes, quotient=quotient)
-            return weigh_batches(olats, weights[rows])
+            return reflectance.relit(directions, weights[rows], turn)
 
         metadata = provenance(item, self.photo, models.checkpoint_name)
+        if self.reflectance != "field":
+            metadata["facerf:reflectance"] = self.reflectance
         yield from self._write_shots(item, face.tag, canvas, relit, metadata)
+
+    def _reflectance_of(self, models: "Models", face: FittedFace) -> "Reflectance":
+        """The face's reflectance; the field is held to the photo, for which no light need be known."""
+        from facerf_cli.baselines.explain import explain
+        from facerf_cli.baselines.field import Field
+        from facerf_cli.pipeline import explain_photo
+
+        if self.reflectance == "field":
+            return Field(models, face.texture, explain_photo(models, face.texture), self.memory_bytes)
+        return explain(self.reflectance, models, face.fit, face.texture).reflectance
 
     def _turned(self, fit: "FaceFit") -> "tuple[FaceFit, Tensor | None]":
         """The fit in the target's pose, and the turn [3, 3] that brings it there, if there is one."""
@@ -114,6 +126,10 @@ class Relight:
 
         if self.pose is not None or self.asked_for_photo:
             raise InputError(f"{item.input_path}: a stack is one pose of a face without its photo")
+        if self.reflectance != "field":
+            raise InputError(
+                f"{item.input_path}: a stack is of the field; for {self.reflectance} give its photo"
+            )
         stack = read_olat_stack(item.input_path)
         canvas, facts = self._stack_canvas(item, stack)
         weights = light_stack(self.shots, torch.from_numpy(stack.header.directions).float(), self.sampling)
