@@ -52,7 +52,8 @@ def train(
         Stage | None,
         _run(
             help="reflectance: that network, in the chart; geometry: that network, on rendered heads; joint: "
-            "both, through the rasterizer; light-features: what --light-features takes.",
+            "both, through the rasterizer; light-features: what --light-features takes; diffuse-sh: the "
+            "network of that baseline.",
             show_default="joint with --preset paper, else reflectance",
         ),
     ] = None,

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from facerf_cli.stage.samples import SampleSource
 
 Preset = Literal["default", "paper", "tiny"]
-Stage = Literal["reflectance", "geometry", "joint", "light-features"]
+Stage = Literal["reflectance", "geometry", "joint", "light-features", "diffuse-sh"]
 _TINY_WIDTHS = (8, 12, 16)
 _TINY_LIGHTS = 20  # of the rig that heads are baked under
 
@@ -76,6 +76,7 @@ def build_objective(options: TrainOptions) -> "Objective":
         "geometry": _geometry,
         "light-features": _light_features,
         "joint": _joint,
+        "diffuse-sh": _diffuse_sh,
     }
     return builders[options.stage](options)
 
@@ -103,6 +104,18 @@ def _light_features(options: TrainOptions) -> "Objective":
     network = network or LightNetwork(LightSettings(width=options.sizes.light_width))
     settings = LightFeaturesSettings(held_out_heads=options.sizes.held_out_heads)
     return LightFeaturesObjective(_samples(options), network, settings)
+
+
+def _diffuse_sh(options: TrainOptions) -> "Objective":
+    from facerf_cli.network.diffuse import DiffuseNetwork, DiffuseSettings
+    from facerf_cli.objectives.diffuse import DiffuseObjective, SumSettings
+
+    sizes = DiffuseSettings()
+    if options.preset == "tiny":
+        sizes = DiffuseSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 4, 4, 16)
+    network: Any = options.networks.get("diffuse_sh") or DiffuseNetwork(sizes)
+    settings = SumSettings(held_out_heads=options.sizes.held_out_heads)
+    return DiffuseObjective(_samples(options), network, settings)
 
 
 def _geometry(options: TrainOptions) -> "Objective":

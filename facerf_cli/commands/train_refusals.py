@@ -8,19 +8,20 @@ if TYPE_CHECKING:
     import typer
 
 _BAKED = ("heads_from", "heads", "bank")
+_IN_CHART = ("reflectance", "light-features", "diffuse-sh")  # stages that learn from textures alone
 _STAGES = {  # that an option means something to
     "vgg_weights": ("joint",),
     "photos": ("joint",),
     "light_features": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),
     "mean_face": ("joint", "reflectance"),
-    "views": ("reflectance", "light-features"),
-    "texture_size": ("reflectance", "light-features"),
-    "dataset": ("reflectance", "light-features", "joint"),
-    "fit_with": ("reflectance", "light-features"),
-    "heads_from": ("reflectance", "light-features", "geometry"),
-    "heads": ("reflectance", "light-features", "geometry"),
-    "bank": ("reflectance", "light-features", "geometry"),
+    "views": _IN_CHART,
+    "texture_size": _IN_CHART,
+    "dataset": (*_IN_CHART, "joint"),
+    "fit_with": _IN_CHART,
+    "heads_from": (*_IN_CHART, "geometry"),
+    "heads": (*_IN_CHART, "geometry"),
+    "bank": (*_IN_CHART, "geometry"),
 }
 
 

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.checkpoints import load_checkpoint, save_checkpoint
+from facerf_cli.network.diffuse import DiffuseNetwork
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork
@@ -21,6 +22,7 @@ FORMS: dict[tuple[str, str], type[Any]] = {  # by what a network is for, and its
     ("geometry", "default"): GeometryNetwork,
     ("geometry", "paper"): GeometryNetwork,
     ("light_features", "vgg"): LightNetwork,
+    ("diffuse_sh", "default"): DiffuseNetwork,
 }
 
 

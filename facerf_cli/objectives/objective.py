@@ -31,7 +31,7 @@ class Objective(nn.Module):
     `super().__init__()` and implement `draw`, `forward` and `validate`.
     """
 
-    networks: nn.ModuleDict  # trained, averaged, saved: among 'reflectance', 'geometry', 'light_features'
+    networks: nn.ModuleDict  # trained, averaged, saved: by the names of network.saved.FORMS
     chooses_by: str  # the metric of `validate`, lower is better, that chooses best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; its 'licence' is the words for the whole
     skips_networks: bool = False  # whether a batch may leave some of their weights without a gradient
