@@ -19,12 +19,17 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
+from facerf_cli.face.interior import interior_texture
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
+from facerf_cli.face.regions import region_mask
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
-from facerf_cli.light.estimate import estimate_light
+from facerf_cli.light.estimate import LightEvidence, estimate_light
 from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.refine import RefinedLight, refine_light
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.network.features import Layered
+from facerf_cli.network.inputs import exposure_of
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.saved import load_networks
 from facerf_cli.raster.camera import Camera
@@ -34,6 +39,7 @@ from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwra
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 _DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
 _EXPLAINED_SIDE, _EXPLAINING_LIGHTS = 128, 50  # texels and lights for the estimate of a photo's light
+_SEEN_WELL = 0.9  # of a small texel: the photo says what colour it is
 _LIGHTS_ON_CPU = 4  # at a time; more of them leave the processor's cache and are slower
 
 
@@ -145,14 +151,43 @@ def explain_photo(models: Models, face: FaceTexture) -> Quotient:
     """
     small = _shrunk(face)
     olats = torch.cat(list(predict_olat(models, small, _coarse_rig())))
-    light = _light_of(small, _coarse_rig(), olats)
-    return Quotient.of(small.texture, weigh(olats, light.weights[None])[0], small.visible)
+    seen = small.visible > _SEEN_WELL
+    weights = estimate_light(olats[..., seen], small.texture[:, seen])
+    return Quotient.of(small.texture, weigh(olats, weights[None])[0], small.visible)
 
 
-def estimate_photo_light(models: Models, face: FaceTexture, rig: Tensor) -> RigLight:
-    """The light of the face's photo over lights [L, 3] (paper, 'Light Estimation')."""
+def estimate_photo_light(
+    models: Models, face: FaceTexture, rig: Tensor, non_negative: bool = True, keep_eyes: bool = False
+) -> RigLight:
+    """The light of the face's photo over lights [L, 3] (paper, Eq. leastsq).
+
+    Not `non_negative`: the paper's plain least squares. InputError where there is no face to read it from.
+    """
+    evidence = light_evidence(models, face, rig, keep_eyes)
+    return RigLight(rig, evidence.least_squares(non_negative))
+
+
+def light_evidence(models: Models, face: FaceTexture, rig: Tensor, keep_eyes: bool = False) -> LightEvidence:
+    """What the light of the face's photo is read from, over lights [L, 3], on small textures.
+
+    The mask is the interior of the face where the photo shows it well. Without `keep_eyes` the eyes are left
+    out, for the field of open eyes is not learnt (paper, 'Results').
+    """
     small = _shrunk(face)
-    return _light_of(small, rig, torch.cat(list(predict_olat(models, small, rig))))
+    mask = (small.visible > _SEEN_WELL) & (interior_texture(_EXPLAINED_SIDE)[0] > 0.5)
+    if not keep_eyes:
+        mask &= region_mask("eyes", _EXPLAINED_SIDE) < 0.5
+    nothing = torch.zeros(0, 3, *mask.shape)
+    LightEvidence(rig, nothing, small.texture, mask).require_a_face()  # before the field is predicted
+    return LightEvidence(rig, torch.cat(list(predict_olat(models, small, rig))), small.texture, mask)
+
+
+def refine_photo_light(
+    evidence: LightEvidence, start: Tensor, network: Layered, non_negative: bool = True
+) -> RefinedLight:
+    """`refine_light` from weights [L, 3] by V_f or S_f, at the exposure at which these are trained."""
+    exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())
+    return refine_light(evidence, start, lambda linear: network.layers(linear / exposure), non_negative)
 
 
 def _shrunk(face: FaceTexture) -> FaceTexture:
@@ -161,11 +196,6 @@ def _shrunk(face: FaceTexture) -> FaceTexture:
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
     small = F.interpolate(fields, side, mode="area")[0]
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
-
-
-def _light_of(face: FaceTexture, rig: Tensor, olats: Tensor) -> RigLight:
-    seen = face.visible > 0.9
-    return RigLight(rig, estimate_light(olats[..., seen], face.texture[:, seen]))
 
 
 @cache
