@@ -29,28 +29,19 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from facerf_cli.colour import luminance
 from facerf_cli.face.regions import region_mask
 from facerf_cli.intervals import Interval, mean_interval
+from facerf_cli.metrics import TONES, ita_deg, tone_drift_deg, tone_of
 from facerf_cli.network.losses import clipped_si_mse, si_mse
 from facerf_cli.objectives.objective import seeded
 from facerf_cli.pipeline import load_models
 from facerf_cli.stage.appearance import skin as appearance
 from facerf_cli.stage.appearance.people import People, draw_people
-from facerf_cli.stage.appearance.pigments import ita_deg
 from facerf_cli.stage.bank import Bank, geometry_of
 from facerf_cli.stage.samples import Sample
 
 HELD_OUT = 12  # as `facerf train` holds out
 ANGLES_DEG = (0, 30, 60, 90, 180)  # between the light and the camera
-TONES = {  # lowest ITA in degrees
-    "very light": 55.0,
-    "light": 41.0,
-    "intermediate": 28.0,
-    "tan": 10.0,
-    "brown": -30.0,
-    "dark": -91.0,
-}
 _NEAR_AXIS = float(np.cos(np.radians(25)))
 _SEED = 2021
 
@@ -148,31 +139,18 @@ def _pictures(head: int, sample: Sample, predicted: Tensor, person: People) -> I
     for light, direction in enumerate(sample.lights[0]):
         drift_deg = None
         if albedo is not None and direction[2] > _NEAR_AXIS:
-            drift_deg = tone_drift_deg(
-                predicted[0, light], sample.target[0, light], sample.weight[0, 0], albedo
-            )
+            drift_deg = drift_of(predicted[0, light], sample.target[0, light], sample.weight[0, 0], albedo)
         angle_deg = float(torch.rad2deg(direction[2].clamp(-1, 1).acos()))
         whole, clipped, naive = errors[light]
         yield Picture(head, same, angle_deg, tone, whole, clipped, naive, drift_deg)
 
 
-def tone_of(ita: float) -> str:
-    """The class of an ITA in degrees."""
-    return next(name for name, lowest in TONES.items() if ita > lowest)
-
-
-def tone_drift_deg(predicted: Tensor, truth: Tensor, weight: Tensor, albedo: np.ndarray) -> float | None:
-    """ITA of a relit skin less the truth's: textures [3, T, T], weight [T, T], the skin's albedo [3].
-
-    None for a grey picture.
-    """
+def drift_of(predicted: Tensor, truth: Tensor, weight: Tensor, albedo: np.ndarray) -> float | None:
+    """`metrics.tone_drift_deg` of a relit skin: textures [3, T, T], weight [T, T], the skin's albedo [3]."""
     side = truth.shape[-1]
-    skin = (region_mask("skin", side) * region_mask("face", side) * weight) > 0.5
-    ours, true = (picture[:, skin].median(1).values.numpy() for picture in (predicted, truth))
-    if np.ptp(true) < 1e-6:
-        return None
-    exposure = luminance(albedo) / luminance(true)
-    return float(ita_deg(ours * exposure) - ita_deg(true * exposure))
+    skin = region_mask("skin", side) * region_mask("face", side) * weight
+    ours, true = (picture.permute(1, 2, 0).numpy() for picture in (predicted, truth))
+    return tone_drift_deg(ours, true, skin.numpy(), albedo)
 
 
 def summary(pictures: list[Picture]) -> dict[str, Any]:

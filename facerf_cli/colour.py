@@ -174,6 +174,15 @@ def luminance(linear: np.ndarray) -> np.ndarray:
     return linear @ rgb_to_xyz(REC709_CHROMATICITIES)[1].astype(linear.dtype)
 
 
+def lab_d65(linear: np.ndarray) -> np.ndarray:
+    """CIE L*a*b* under D65 [..., 3] of linear Rec.709 [..., 3]."""
+    matrix = rgb_to_xyz(REC709_CHROMATICITIES)
+    relative = linear @ matrix.T / matrix.sum(1)
+    root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
+    x, y, z = np.moveaxis(root, -1, 0)
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
 def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:
     """The exposure that puts the 99th percentile of the luminance at 0.8, in EV to a hundredth.
 

@@ -210,9 +210,14 @@ def _predictor() -> Any:
 
 
 def predictor_path() -> Path:
-    """The 68-point model's file; the package that holds it is not imported, for it needs pkg_resources."""
+    """The 68-point model's file."""
+    return bundled_model(_PREDICTOR_FILE)
+
+
+def bundled_model(name: str) -> Path:
+    """A file of `face_recognition_models`; the package itself is not imported, for it needs pkg_resources."""
     spec = find_spec(_MODELS_PACKAGE)
-    path = Path(spec.origin).parent / "models" / _PREDICTOR_FILE if spec and spec.origin else None
+    path = Path(spec.origin).parent / "models" / name if spec and spec.origin else None
     if path is None or not path.is_file():
-        raise FacerfError(f"the landmark model is missing; install the package {_MODELS_PACKAGE}")
+        raise FacerfError(f"the model {name} is missing; install the package {_MODELS_PACKAGE}")
     return path

@@ -17,10 +17,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-# The trunk up to conv3_3: each convolution's place in torchvision's `features`, and its channels.
-CONVOLUTIONS = ((0, 64), (2, 64), (5, 128), (7, 128), (10, 256), (12, 256), (14, 256))
-FEATURE_LAYERS = {"conv1_2": 3, "conv2_2": 8, "conv3_3": 15}  # where the ReLU of each stands
-_POOLS = (4, 9)
+# Each convolution's place in torchvision's `features`, and its channels.
+CONVOLUTIONS = (
+    *((0, 64), (2, 64), (5, 128), (7, 128), (10, 256), (12, 256), (14, 256)),
+    *((17, 512), (19, 512), (21, 512), (24, 512), (26, 512), (28, 512)),
+)
+_POOLS = (4, 9, 16, 23)
+FEATURE_LAYERS = {"conv1_2": 3, "conv2_2": 8, "conv3_3": 15}  # where the ReLU of each stands; V_f's and S_f's
+LPIPS_LAYERS = FEATURE_LAYERS | {"conv4_3": 22, "conv5_3": 29}  # what LPIPS sees
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)  # of encoded RGB in 0..1, as torchvision's weights were trained
 IMAGENET_DEVIATION = (0.229, 0.224, 0.225)
@@ -47,37 +51,42 @@ def feature_distance(net: Layered, prediction: Tensor, target: Tensor) -> Tensor
 
 
 class VggFeatures(nn.Module):
-    """VGG-16 up to conv3_3; its tensors have torchvision's names (`features.N.weight`, `features.N.bias`)."""
+    """VGG-16 up to conv3_3, or deeper; its tensors have torchvision's names, `features.N.weight` `.bias`."""
 
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, width: float = 1.0) -> None:
-        """`width` scales the channels of every layer, up to 4 times; 1 is VGG-16."""
+    def __init__(self, width: float = 1.0, wanted: Mapping[str, int] = FEATURE_LAYERS) -> None:
+        """`width` scales the channels of every layer, up to 4 times; 1 is VGG-16. `wanted`: what is given."""
         super().__init__()
         if not 0 < width <= 4:
             raise ValueError(f"a width of {width}")
         channels = {place: max(1, round(count * width)) for place, count in CONVOLUTIONS}
-        self.out_channels = channels[CONVOLUTIONS[-1][0]]
         modules: list[nn.Module] = []
         entering = 3
-        for place in range(FEATURE_LAYERS["conv3_3"] + 1):
+        for place in range(max(wanted.values()) + 1):
             if place in channels:
                 modules.append(_convolution(entering, channels[place]))
                 entering = channels[place]
             else:
                 modules.append(nn.MaxPool2d(2) if place in _POOLS else nn.ReLU(inplace=True))
         self.features = nn.Sequential(*modules)
+        self.out_channels = entering
+        self._wanted = {place: channels[place - 1] for place in sorted(wanted.values())}
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(3, 1, 1), persistent=False)
         self.register_buffer("deviation", torch.tensor(IMAGENET_DEVIATION).view(3, 1, 1), persistent=False)
 
+    def layer_channels(self) -> list[int]:
+        """The channels of each layer that is given."""
+        return list(self._wanted.values())
+
     def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features [B, C, H / s, W / s], s = 1, 2, 4, of linear pictures [B, 3, H, W]: `FEATURE_LAYERS`."""
+        """Features [B, C, H / s, W / s], s = 1, 2, 4 .., of linear pictures [B, 3, H, W]: those wanted."""
         x = (encode_display(linear.float()) - self.mean) / self.deviation
         found = []
         for place, module in enumerate(self.features):
             x = module(x)
-            if place in FEATURE_LAYERS.values():
+            if place in self._wanted:
                 found.append(x)
         return found
 

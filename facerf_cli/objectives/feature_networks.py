@@ -26,8 +26,10 @@ VGG16_LICENCE = (
 _LARGEST_FILE = 2**30
 
 
-def load_vgg(choice: str | Path | None) -> VggFeatures:
+def load_vgg(choice: str | Path | None, network: VggFeatures | None = None) -> VggFeatures:
     """V_f, frozen, from what `--vgg-weights` was given: 'imagenet', or a .pth or .safetensors of VGG-16.
+
+    `network` is filled instead of V_f where it is given.
 
     'imagenet' is fetched once and verified; a path is taken as it is, with torchvision's names. Pickles are
     read with `weights_only`. None stops with words that help: a feature loss was asked for without weights.
@@ -38,9 +40,9 @@ def load_vgg(choice: str | Path | None) -> VggFeatures:
             "528 MiB once), or --vgg-weights PATH of torchvision's vgg16-397923af.pth"
         )
     path = fetch(VGG16, "--vgg-weights PATH") if str(choice) == "imagenet" else Path(choice)
-    network = VggFeatures()
+    network = VggFeatures() if network is None else network
     try:
-        network.load_published(_read_tensors(path))
+        network.load_published(read_tensors(path, "--vgg-weights takes 'imagenet' or a .pth or .safetensors"))
     except ValueError as error:
         raise InputError(f"{path}: no weights of VGG-16 by torchvision's names: {error}") from None
     network.eval().requires_grad_(False)
@@ -56,10 +58,13 @@ def load_light_features(path: Path) -> LightNetwork:
     return network
 
 
-def _read_tensors(path: Path) -> Mapping[str, Any]:
-    """What a .pth or .safetensors holds, by name; ValueError in words where it is neither."""
+def read_tensors(path: Path, advice: str) -> Mapping[str, Any]:
+    """What a .pth or .safetensors holds, by name; ValueError in words where it is neither.
+
+    No such file is an InputError that ends with the advice.
+    """
     if not path.is_file():
-        raise InputError(f"{path}: no such file; --vgg-weights takes 'imagenet' or a .pth or .safetensors")
+        raise InputError(f"{path}: no such file; {advice}")
     if _unpacked_size(path) > _LARGEST_FILE:
         raise ValueError(f"larger than {_LARGEST_FILE / 2**20:.0f} MiB")
     try:

@@ -14,13 +14,14 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import torch
 from loss_curve import curve, draw_chart, read_log
 from model_card import ablations, speed, synthetic, table1, yale
-from synthetic import Picture, summary, tone_drift_deg, tone_of
+from synthetic import Picture, drift_of, summary
 from synthetic import table as held_out_table
 from table1 import Measured
 from table1 import summary as table1_summary
 from yale_table import COLUMNS, results, table
 
 from facerf_cli.intervals import average, mean_interval
+from facerf_cli.metrics import tone_of
 
 
 def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
@@ -109,14 +110,12 @@ def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
     truth = torch.from_numpy(albedo).float().view(3, 1, 1).expand(3, 32, 32)
     weight = torch.ones(32, 32)
     for exposure in (0.2, 1.0, 5.0):  # a picture's own says nothing of the skin
-        assert tone_drift_deg(exposure * truth, exposure * truth, weight, albedo) == pytest.approx(
-            0, abs=1e-3
-        )
-    darker = tone_drift_deg(0.6 * truth, truth, weight, albedo)
-    redder = tone_drift_deg(truth * torch.tensor([1.1, 0.95, 1.0]).view(3, 1, 1), truth, weight, albedo)
+        assert drift_of(exposure * truth, exposure * truth, weight, albedo) == pytest.approx(0, abs=1e-3)
+    darker = drift_of(0.6 * truth, truth, weight, albedo)
+    redder = drift_of(truth * torch.tensor([1.1, 0.95, 1.0]).view(3, 1, 1), truth, weight, albedo)
     assert darker is not None and darker < -5
     assert redder is not None and abs(redder) < 5  # the angle is of lightness and blue to yellow
-    assert tone_drift_deg(truth, truth.mean(0, keepdim=True).expand(3, -1, -1), weight, albedo) is None
+    assert drift_of(truth, truth.mean(0, keepdim=True).expand(3, -1, -1), weight, albedo) is None
 
 
 def test_rows_of_held_out_heads() -> None:

@@ -6,11 +6,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.metrics import ita_deg
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.appearance.eyes import eyeball
 from facerf_cli.stage.appearance.noise import plain_noise
 from facerf_cli.stage.appearance.people import People, draw_people, named
-from facerf_cli.stage.appearance.pigments import hair_albedo, ita_deg
+from facerf_cli.stage.appearance.pigments import hair_albedo
 from facerf_cli.stage.appearance.skin import bare_skin, paint_skin, scattering_mm
 from facerf_cli.stage.appearance.window import CANVAS_SPAN, Window
 from facerf_cli.stage.head.mesh import PARTS

@@ -125,18 +125,3 @@ def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
     pigmented = torch.exp(-5.89 * absorbed.sqrt()) + torch.tensor([0.011, 0.0095, 0.0085])
     white = torch.tensor([0.44, 0.41, 0.36])
     return pigmented + grey[..., None] * (white - pigmented)
-
-
-def lab_d65(linear: np.ndarray) -> np.ndarray:
-    """CIE L*a*b* under D65 [..., 3] of linear Rec.709 [..., 3]."""
-    matrix = rgb_to_xyz(REC709_CHROMATICITIES)
-    relative = linear @ matrix.T / matrix.sum(1)
-    root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
-    x, y, z = np.moveaxis(root, -1, 0)
-    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
-
-
-def ita_deg(linear: np.ndarray) -> np.ndarray:
-    """Individual typology angle [...] of linear Rec.709 [..., 3] (Chardon et al. 1991)."""
-    lab = lab_d65(linear)
-    return np.degrees(np.arctan2(lab[..., 0] - 50, lab[..., 2]))

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.colour import lab_d65
 from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.metrics import ita_deg
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.stage.appearance.noise import blurred, noise, slopes, splat
 from facerf_cli.stage.appearance.people import RANDOM_TEXTURES, People, draw_people
 from facerf_cli.stage.appearance.pigments import (
     WAVELENGTHS_NM,
     hair_albedo,
-    ita_deg,
-    lab_d65,
     observer_weights,
     skin_albedo,
     skin_reflectance,

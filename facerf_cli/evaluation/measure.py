@@ -1,0 +1,127 @@
+"""From a picture's comparison to rows of figures, one a method: the metrics that every protocol shares."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.cases import Comparison
+from facerf_cli.evaluation.perceptual import perceptual_metric
+from facerf_cli.face.recognition import face_distance
+from facerf_cli.metrics import mse, psnr_of, si_mse, si_mse_clipped, ssim
+
+Space = Literal["linear", "display"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a figure is shown: its title, whether less is better, and its digits after the point."""
+
+    title: str
+    lower_is_better: bool = True
+    digits: int = 5
+
+
+METRICS: Mapping[str, Metric] = {  # by name, in the order of tables; a row has those that it could have
+    "si_mse": Metric("Si-MSE"),
+    "si_mse_clipped": Metric("Si-MSE, truth clipped at white"),
+    "mse": Metric("MSE"),
+    "psnr": Metric("PSNR, dB", lower_is_better=False, digits=2),
+    "ssim": Metric("SSIM", lower_is_better=False, digits=4),
+    "dssim": Metric("DSSIM", digits=4),
+    "lpips": Metric("LPIPS (VGG, v0.1)", digits=4),
+    "face_distance": Metric("Face dis", digits=3),
+    "light_error_deg": Metric("light direction, degrees", digits=1),
+    "tone_drift_deg": Metric("skin tone drift, degrees of ITA", digits=1),  # of its size
+}
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Which metrics, of which values; picklable, for workers.
+
+    `space` is of the pixel metrics: 'display' encodes pictures by sRGB first. LPIPS is measured where
+    VGG-16's weights are given (`vgg_weights`: 'imagenet' or a file); its own heads come from `lpips`, or from
+    the package of that name.
+    """
+
+    space: Space = "linear"
+    lpips: Path | None = None
+    vgg_weights: str | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One method's figures on one picture: `values` by metric; `facts` are the case's."""
+
+    case: str
+    person: str
+    method: str
+    facts: Mapping[str, str | float]
+    values: Mapping[str, float]
+
+
+def measure(comparison: Comparison, how: Measures) -> list[Row]:
+    """The rows of a picture, methods in their order.
+
+    Face dis and LPIPS see both pictures as `shown` has them, whatever `how.space` says. Raises InputError
+    where a prediction has another size than the truth or values that are not finite, or the mask is empty.
+    """
+    _check(comparison)
+    case = comparison.case
+    return [
+        Row(case.name, case.person, method, case.facts, _values(comparison, method, how))
+        for method in comparison.predictions
+    ]
+
+
+def shown(picture: np.ndarray, comparison: Comparison) -> np.ndarray:
+    """A picture [H, W, 3] as a viewer sees it: masked, at the truth's exposure, sRGB in 0..1."""
+    ev = auto_exposure_ev(comparison.truth, comparison.mask)
+    exposed = np.clip(picture * np.float32(2.0**ev), 0, 1)
+    return linear_to_srgb(exposed) * comparison.mask[..., None].astype(np.float32)
+
+
+def _values(comparison: Comparison, method: str, how: Measures) -> dict[str, float]:
+    prediction, truth, mask = comparison.predictions[method], comparison.truth, comparison.mask
+    p, t = (linear_to_srgb(x) if how.space == "display" else x for x in (prediction, truth))
+    squared, alike = mse(p, t, mask), ssim(p, t, mask)
+    values = {
+        "si_mse": si_mse(p, t, mask),
+        "si_mse_clipped": si_mse_clipped(p, t, mask),
+        "mse": squared,
+        "psnr": psnr_of(squared),
+        "ssim": alike,
+        "dssim": (1 - alike) / 2,
+    }
+    ours, true = shown(prediction, comparison), shown(truth, comparison)
+    if how.vgg_weights is not None:
+        values["lpips"] = perceptual_metric(how.lpips, how.vgg_weights)(ours, true)
+    if comparison.landmarks_px is not None:
+        values["face_distance"] = face_distance(ours, true, comparison.landmarks_px)
+    return values | dict(comparison.extra.get(method, {}))
+
+
+def _check(comparison: Comparison) -> None:
+    """Raise InputError in words where pictures cannot be compared."""
+    name, truth, mask = comparison.case.name, comparison.truth, comparison.mask
+    if mask.shape != truth.shape[:2]:
+        raise InputError(f"{name}: the mask has {_size(mask)} pixels, the truth {_size(truth)}")
+    if not (mask > 0).any():
+        raise InputError(f"{name}: nothing of the face is left in the mask; leave this picture out")
+    for method, prediction in comparison.predictions.items():
+        if prediction.shape != truth.shape:
+            raise InputError(
+                f"{name}: {method} has {_size(prediction)} pixels, the truth {_size(truth)}; predictions are "
+                "to have the truth's frame"
+            )
+        if not np.isfinite(prediction).all():
+            raise InputError(f"{name}: {method} holds values that are not finite")
+
+
+def _size(picture: np.ndarray) -> str:
+    return f"{picture.shape[1]} x {picture.shape[0]}"
