@@ -162,11 +162,11 @@ def _inside(
 def _box(mask: np.ndarray, margin_px: int) -> tuple[slice, slice]:
     """The mask's bounding box and a margin around it, in the picture."""
 
-    def span(inside: np.ndarray) -> slice:
-        at = np.flatnonzero(inside)
+    def span(sums: np.ndarray) -> slice:
+        at = np.flatnonzero(sums > 0)
         return slice(max(0, at[0] - margin_px), at[-1] + 1 + margin_px)
 
-    return span(mask.any(1)), span(mask.any(0))
+    return span(mask.sum(1)), span(mask.sum(0))
 
 
 def _ssim_map(p: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -51,7 +51,17 @@ class Measures:
 
     space: Space = "linear"
     lpips: Path | None = None
-    vgg_weights: str | None = None
+    vgg_weights: str | Path | None = None
+
+    def check(self) -> None:
+        """Load what is asked for, once a process: raises UsageError or InputError where it is not at hand."""
+        if self.asks_for_lpips:
+            perceptual_metric(self.lpips, self.vgg_weights)
+
+    @property
+    def asks_for_lpips(self) -> bool:
+        """Whether rows will have it."""
+        return self.lpips is not None or self.vgg_weights is not None
 
 
 @dataclass(frozen=True)
@@ -99,7 +109,7 @@ def _values(comparison: Comparison, method: str, how: Measures) -> dict[str, flo
         "dssim": (1 - alike) / 2,
     }
     ours, true = shown(prediction, comparison), shown(truth, comparison)
-    if how.vgg_weights is not None:
+    if how.asks_for_lpips:
         values["lpips"] = perceptual_metric(how.lpips, how.vgg_weights)(ours, true)
     if comparison.landmarks_px is not None:
         values["face_distance"] = face_distance(ours, true, comparison.landmarks_px)

@@ -23,7 +23,7 @@ _DIGEST = "9153a2043dccf3b525d4f13db916e93ef040548ea923b6f2100de5ebac141a78"
 
 @cache
 def perceptual_metric(
-    heads: Path | None, vgg_weights: str | None
+    heads: Path | None, vgg_weights: str | Path | None
 ) -> Callable[[np.ndarray, np.ndarray], float]:
     """LPIPS of two sRGB pictures [H, W, 3] in 0..1, loaded once a process.
 
