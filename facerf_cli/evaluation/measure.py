@@ -11,7 +11,7 @@ from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.cases import Comparison
 from facerf_cli.evaluation.perceptual import perceptual_metric
-from facerf_cli.face.recognition import face_distance
+from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.metrics import mse, psnr_of, si_mse, si_mse_clipped, ssim
 
 Space = Literal["linear", "display"]
@@ -82,11 +82,20 @@ def measure(comparison: Comparison, how: Measures) -> list[Row]:
     where a prediction has another size than the truth or values that are not finite, or the mask is empty.
     """
     _check(comparison)
-    case = comparison.case
-    return [
-        Row(case.name, case.person, method, case.facts, _values(comparison, method, how))
-        for method in comparison.predictions
-    ]
+    case, landmarks_px = comparison.case, comparison.landmarks_px
+    true = shown(comparison.truth, comparison)
+    descriptor = None if landmarks_px is None else face_descriptor(true, landmarks_px)
+    rows = []
+    for method, prediction in comparison.predictions.items():
+        values = _pixel_values(prediction, comparison, how.space)
+        ours = shown(prediction, comparison)
+        if how.asks_for_lpips:
+            values["lpips"] = perceptual_metric(how.lpips, how.vgg_weights)(ours, true)
+        if descriptor is not None and landmarks_px is not None:
+            values["face_distance"] = descriptor_distance(face_descriptor(ours, landmarks_px), descriptor)
+        values |= comparison.extra.get(method, {})
+        rows.append(Row(case.name, case.person, method, case.facts, values))
+    return rows
 
 
 def shown(picture: np.ndarray, comparison: Comparison) -> np.ndarray:
@@ -96,11 +105,12 @@ def shown(picture: np.ndarray, comparison: Comparison) -> np.ndarray:
     return linear_to_srgb(exposed) * comparison.mask[..., None].astype(np.float32)
 
 
-def _values(comparison: Comparison, method: str, how: Measures) -> dict[str, float]:
-    prediction, truth, mask = comparison.predictions[method], comparison.truth, comparison.mask
-    p, t = (linear_to_srgb(x) if how.space == "display" else x for x in (prediction, truth))
+def _pixel_values(prediction: np.ndarray, comparison: Comparison, space: Space) -> dict[str, float]:
+    pictures = prediction, comparison.truth
+    p, t = map(linear_to_srgb, pictures) if space == "display" else pictures
+    mask = comparison.mask
     squared, alike = mse(p, t, mask), ssim(p, t, mask)
-    values = {
+    return {
         "si_mse": si_mse(p, t, mask),
         "si_mse_clipped": si_mse_clipped(p, t, mask),
         "mse": squared,
@@ -108,12 +118,6 @@ def _values(comparison: Comparison, method: str, how: Measures) -> dict[str, flo
         "ssim": alike,
         "dssim": (1 - alike) / 2,
     }
-    ours, true = shown(prediction, comparison), shown(truth, comparison)
-    if how.asks_for_lpips:
-        values["lpips"] = perceptual_metric(how.lpips, how.vgg_weights)(ours, true)
-    if comparison.landmarks_px is not None:
-        values["face_distance"] = face_distance(ours, true, comparison.landmarks_px)
-    return values | dict(comparison.extra.get(method, {}))
 
 
 def _check(comparison: Comparison) -> None:

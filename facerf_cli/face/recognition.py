@@ -30,14 +30,13 @@ def face_descriptor(picture_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.nd
     return np.array(_network().compute_face_descriptor(np.ascontiguousarray(picture), shape))
 
 
-def face_distance(prediction_srgb: np.ndarray, truth_srgb: np.ndarray, landmarks_px: np.ndarray) -> float:
-    """Face dis: the Euclidean distance of the descriptors of two sRGB pictures [H, W, 3] of one frame.
+def descriptor_distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Face dis: the Euclidean distance of two descriptors [128].
 
-    The truth's landmarks [68, 2] serve both, so that a prediction is not helped by being found elsewhere;
-    mask both alike before.
+    Take both by the truth's landmarks, so that a prediction is not helped by being found elsewhere, and of
+    pictures that are masked alike.
     """
-    ours, true = (face_descriptor(picture, landmarks_px) for picture in (prediction_srgb, truth_srgb))
-    return float(np.linalg.norm(ours - true))
+    return float(np.linalg.norm(first - second))
 
 
 @cache
