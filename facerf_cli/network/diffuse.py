@@ -22,6 +22,8 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, exposure_of, head_rotation,
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2
 _DARKEST = 1e-8  # radiance at which the square root's slope is still finite
+_DARK = 0.01  # from black and white, where the logit of a radiance ends
+_GAIN = 0.5  # of an untaught network
 _MAP_SIDE = 64  # of the mean face's normals
 _TURNED_LIGHTS = 36  # directions in which a light is turned: four a coefficient
 _CONSTANT = math.sqrt(4 * math.pi)  # the coefficient of a constant map of radiance 1
@@ -43,7 +45,7 @@ class DiffuseSettings:
 class DiffuseEstimate(NamedTuple):
     """B faces of albedo A under light c: radiance is A exposure E(n) / pi, E of `light.sh.irradiance`."""
 
-    albedo: Tensor  # [B, 3, T', T'] in 0..1, of a mean near `MEAN_RADIANCE`, at the network's side
+    albedo: Tensor  # [B, 3, T, T] in 0..1, of a mean near `MEAN_RADIANCE`
     coefficients: Tensor  # [B, 9, 3] in camera space, by light.sh.CONVENTION
     exposure: Tensor  # [B, 1, 1, 1] what the texture was divided by, that its visible mean be MEAN_RADIANCE
 
@@ -64,7 +66,7 @@ class DiffuseNetwork(nn.Module):
         )
         coarser = (*dec[1:], enc[-1])
         self.up = nn.ModuleList(_Up(coarser[i], dec[i], enc[i]) for i in range(len(dec)))
-        self.albedo = nn.Conv2d(dec[0], 3, 3, padding=1)
+        self.albedo = nn.Conv2d(dec[0], 6, 3, padding=1)
         self.light = nn.Sequential(
             nn.AdaptiveAvgPool2d(settings.light_grid),
             nn.Conv2d(enc[-1], settings.light_channels, 1),
@@ -112,10 +114,21 @@ class DiffuseNetwork(nn.Module):
         light = self.light(x).float().unflatten(1, (COEFFICIENTS, 3))
         for up, skip in zip(reversed(self.up), reversed(features), strict=True):
             x = up(x, skip)
-        # Where both heads say 0, a face of the mean albedo stands in a constant map that shows it as it is.
-        raw = self.albedo(x).float() + math.log(MEAN_RADIANCE / (1 - MEAN_RADIANCE))
+        # Where the head says 0, the face stands in a constant map, which shows it as it is.
         ambient = _CONSTANT * F.one_hot(torch.zeros((), dtype=torch.long), COEFFICIENTS).to(light)
-        return DiffuseEstimate(raw.sigmoid(), self._turned(light + ambient[:, None], normals), exposure)
+        light = self._turned(light + ambient[:, None], normals)
+        return DiffuseEstimate(self._albedo(x, texture / exposure), light, exposure)
+
+    def _albedo(self, features: Tensor, radiance: Tensor) -> Tensor:
+        """Albedo at the texture's own side, off radiance [B, 3, T, T] at the network's exposure.
+
+        Gain and bias of the radiance's logit, which is its logarithm but near 1: a gain of 1 divides by a
+        shading, a gain of 0 paints over what is clipped or in the dark.
+        """
+        gain, bias = (resize(y, radiance.shape[-1]) for y in self.albedo(features).float().chunk(2, 1))
+        mean = math.log(MEAN_RADIANCE / (1 - MEAN_RADIANCE))
+        away = radiance.clamp(_DARK, 1 - _DARK).logit() - mean
+        return torch.sigmoid(mean + (_GAIN + gain) * away + bias)
 
     def _turned(self, coefficients: Tensor, normals: Tensor) -> Tensor:
         """Light [B, 9, 3] of the head's own frame, in which the chart sees it, in the camera's."""

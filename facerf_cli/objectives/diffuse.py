@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.network.diffuse import ORDER, DiffuseEstimate, DiffuseNetwork, shading
-from facerf_cli.network.inputs import resize, to_root
+from facerf_cli.network.inputs import to_root
 from facerf_cli.network.losses import clipped_si_mse, root_loss
 from facerf_cli.objectives.objective import Objective, Validation, concatenate, seeded
 from facerf_cli.stage.samples import Sample, SampleSource
@@ -170,7 +170,7 @@ def summed(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
 
 def explained(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Tensor, Tensor]:
     """Sources [B, 1, 3, T, T] in their own light and targets [B, M, 3, T, T], at the network's exposure."""
-    albedo = resize(estimate.albedo, batch.source.shape[-1])[:, None]
+    albedo = estimate.albedo[:, None]
     own = shading(batch.normals_source, estimate.coefficients[:, None])
     return albedo * own, albedo * shading(batch.normals_target, batch.coefficients)
 
@@ -184,9 +184,9 @@ def _metrics(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
 
 def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
     """Two rows of pictures [2T, (M + 3) T, 3] of one face."""
-    exposure, side = estimate.exposure[0].cpu(), batch.source.shape[-1]
+    exposure = estimate.exposure[0].cpu()
     seen, mask = batch.visible[0], (batch.weight[0] > 0).float()
-    albedo = resize(estimate.albedo, side)[0].cpu()
+    albedo = estimate.albedo[0].cpu()
     lit = shading(batch.normals_source, estimate.coefficients[:, None].cpu())[0, 0]
     truth = [batch.source[0] / exposure, *(batch.targets[0] / exposure * mask)]
     guess = [own[0, 0] * seen, *(relit[0] * mask)]

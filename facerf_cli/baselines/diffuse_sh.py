@@ -1,0 +1,65 @@
+"""A face that is diffuse, under light of order 2: what the paper's comparison with Tewari et al. assumes.
+
+Albedo and light are regressed by one network (`network/diffuse.py`, after MoFA, ICCV 2017); a face is lit by
+their product alone, so it has no highlights and casts no shadows on itself.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.network.diffuse import ORDER, DiffuseNetwork, shading
+from facerf_cli.network.saved import load_networks
+from facerf_cli.pipeline import FaceTexture, Models
+
+CHECKPOINT = Path(__file__).parents[1] / "assets" / "diffuse_sh.safetensors"
+
+
+@dataclass(frozen=True, eq=False)
+class Diffuse:
+    """Albedo [3, T, T] at the photo's exposure, and the normals [3, T, T] of the photo's pose."""
+
+    albedo: Tensor
+    normals: Tensor
+
+    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
+        """See `Reflectance`; of a light its order 2 alone counts, and what that makes negative is black."""
+        normals = self.normals if turn is None else torch.einsum("dc,cij->dij", turn, self.normals)
+        coefficients = [rig_coefficients(RigLight(directions, w), ORDER) for w in weights]
+        return self.albedo * shading(normals[None], torch.stack(coefficients)[None])[0]
+
+
+@torch.no_grad()
+def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
+    """Albedo and light of a face's photo; the light as signed weights over the paper's 150 lights.
+
+    The albedo has the network's 128 texels a side: what is finer is not brought in from the photo, for that
+    would put the photo's own shadows and highlights into every picture (and its error there to nothing).
+    """
+    network = load_diffuse_network(CHECKPOINT).to(models.device)
+    inputs = (face.texture[None], face.normals[None], face.visible[None, None])
+    estimate = network(*(tensor.to(models.device) for tensor in inputs))
+    albedo = (estimate.albedo * estimate.exposure)[0].cpu()
+    rig = rig_directions()
+    light = RigLight(rig, coefficients_to_rig(estimate.coefficients[0].cpu(), rig))
+    return Explained(Diffuse(albedo, face.normals), light)
+
+
+@cache
+def load_diffuse_network(path: Path) -> DiffuseNetwork:
+    """The network of a checkpoint of `facerf train --stage diffuse-sh`; read once a process."""
+    network: Any = load_networks(path, LAYOUT_VERSION)[0].get("diffuse_sh")
+    if not isinstance(network, DiffuseNetwork):
+        raise InputError(f"{path}: holds no diffuse network; give one by `facerf train --stage diffuse-sh`")
+    return network.eval()

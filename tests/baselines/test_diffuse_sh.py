@@ -1,0 +1,55 @@
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from facerf_cli.baselines.diffuse_sh import CHECKPOINT, Diffuse, load_diffuse_network
+from facerf_cli.errors import InputError
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.pipeline import DEFAULT_CHECKPOINT
+from facerf_cli.raster.camera import pose_to_rotation
+
+
+def ball(side: int = 9) -> torch.Tensor:
+    """Normals [3, T, T] that face every way but backwards."""
+    axis = torch.linspace(-0.7, 0.7, side)
+    y, x = torch.meshgrid(-axis, axis, indexing="ij")
+    return F.normalize(torch.stack([x, y, (1 - x**2 - y**2).clamp_min(0.02).sqrt()]), dim=0)
+
+
+def test_a_light_at_the_right_lights_the_right() -> None:
+    white = Diffuse(torch.ones(3, 9, 9), ball())
+    (lit,) = white.relit(azel_to_direction(90.0, 0.0)[None], torch.ones(1, 1, 3))
+    assert lit[:, 4, 8].min() > 3 * lit[:, 4, 0].max()
+    assert lit.min() >= 0
+
+
+def test_a_dome_shows_the_albedo_and_relighting_is_linear_in_it() -> None:
+    rig = rig_directions()
+    albedo = torch.rand(3, 9, 9)
+    dome = (
+        4 * torch.ones(2, len(rig), 3) / len(rig)
+    )  # a constant map of radiance 1: cells of 4 pi / L over pi
+    dome[1] *= 3
+    lit = Diffuse(albedo, ball()).relit(rig, dome)
+    assert torch.allclose(lit[0], albedo, rtol=0.01)
+    assert torch.allclose(lit[1], 3 * lit[0], rtol=1e-4)
+
+
+def test_turned_with_its_lights_a_face_looks_the_same() -> None:
+    """`turn` is the head's; lights stay with the camera."""
+    rig, turn = rig_directions(40), pose_to_rotation(30.0, 10.0, -5.0)
+    weights = torch.rand(1, 40, 3)
+    face = Diffuse(torch.rand(3, 9, 9), ball())
+    straight, turned = face.relit(rig, weights), face.relit(rig @ turn.T, weights, turn)
+    assert torch.allclose(straight, turned, atol=1e-4)
+    assert not torch.allclose(straight, face.relit(rig, weights, turn), atol=1e-2)
+
+
+def test_a_checkpoint_without_the_network_is_named() -> None:
+    with pytest.raises(InputError, match="give one by `facerf train --stage diffuse-sh`"):
+        load_diffuse_network(DEFAULT_CHECKPOINT)
+    with pytest.raises(InputError, match="no such checkpoint"):
+        load_diffuse_network(Path("nobody.safetensors"))
+    assert CHECKPOINT.parent == DEFAULT_CHECKPOINT.parent
