@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.interior import interior_mask
 from facerf_cli.face.morphable import MorphableModel
@@ -42,7 +43,10 @@ class View:
         mask = interior_mask(vertices, fragments, uv, TEXTURE_SIDE)[0]
         if not keep_eyes:
             mask = mask * (1 - sample_texture(region_mask("eyes", TEXTURE_SIDE)[None], uv)[..., 0])
-        return View(fit, vertices, uv, mask.numpy() * seen, seen)
+        inside = mask.numpy() * seen
+        if not inside.max() > 0:
+            raise InputError("nothing of the fitted face is seen in the picture; there is nothing to compare")
+        return View(fit, vertices, uv, inside, seen)
 
     def texture_of(self, picture: np.ndarray) -> FaceTexture:
         """A picture of the crop [S, S, 3] in the chart, as `pipeline.unwrap_face` has a photo."""
@@ -51,6 +55,10 @@ class View:
         visible = visible * (unwrapped[3] > _INSIDE)
         normals = normal_map(self.vertices, grid_triangles(), TEXTURE_SIDE)
         return FaceTexture(inpaint(unwrapped[:3], visible), visible, normals)
+
+    def region(self, name: str) -> np.ndarray:
+        """Where the crop shows a named region of the face [S, S], 0..1 (`face/regions.py`)."""
+        return sample_texture(region_mask(name, TEXTURE_SIDE)[None], self.uv)[..., 0].numpy()
 
     def picture(self, texture: Tensor) -> np.ndarray:
         """A texture [3, T, T] on the face, seen in the crop [S, S, 3]; beyond the mesh it means nothing."""

@@ -49,6 +49,17 @@ class MorphableModel:
         corners, weights = landmark_weights()
         return (vertices[:, corners] * weights[..., None].to(vertices)).sum(2)
 
+    def pose_only(self) -> "MorphableModel":
+        """The same model with shapes that do nothing: its fit is a pose (paper, 'Ablative Study')."""
+        return replace(
+            self,
+            name=f"{self.name}-mean",
+            identity=self.identity[:1] * 0,
+            expression=self.expression[:1] * 0,
+            expression_names=self.expression_names[:1],
+            head=None,
+        )
+
     def to(self, device: torch.device | str) -> "MorphableModel":
         """The same model with its arrays on `device`."""
         mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))

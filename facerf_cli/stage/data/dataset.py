@@ -10,7 +10,8 @@ Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward
 capture has it; each stack holds its lights in its own crop's camera space.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,7 @@ class Dataset:
     cameras: dict[str, tuple[str, ...]]  # of each subject, split or not
     normalisation: dict[str, Any]  # colour space from and to, black level, gain of each light
     provenance: dict[str, Any]
+    traits: dict[str, dict[str, Any]] = field(default_factory=dict)  # of a subject, where the capture has any
 
     @property
     def subjects(self) -> tuple[str, ...]:
@@ -104,6 +106,7 @@ def read_dataset(folder: Path) -> Dataset:
         cameras=cameras,
         normalisation=root["normalisation"].table(),
         provenance=root["provenance"].table(),
+        traits=_read_traits(root, cameras),
     )
     for subject, ids in cameras.items():
         for camera in ids:
@@ -111,6 +114,13 @@ def read_dataset(folder: Path) -> Dataset:
                 if not path.is_file():
                     raise InputError(f"{path}: missing from the dataset; run prepare-dataset again")
     return dataset
+
+
+def _read_traits(root: Node, subjects: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """What the capture says of subjects, as it stands."""
+    nodes = root["subjects"].entries(MOST_SUBJECTS)
+    found = {subject: nodes[subject].get("traits") for subject in subjects}
+    return {subject: traits.table() if traits else {} for subject, traits in found.items()}
 
 
 def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:

@@ -1,0 +1,191 @@
+"""`facerf evaluate transfer`: the reflectances of two pictures exchanged (the paper's Table 2)."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from facerf_cli.commands.evaluation_items import (
+    EveryOption,
+    MethodOptions,
+    RefitOption,
+    SplitOption,
+    load_methods,
+    no_part_of_preset,
+    only_dataset,
+    people_items,
+    read_split,
+    require_enough,
+)
+from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.evaluation_photos import portraits
+from facerf_cli.commands.evaluation_run import run_protocol
+from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.commands.options import FaceModelOption, InputColourspaceOption, settings_of
+from facerf_cli.commands.photo import LandmarksOption, PhotoOptions
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from facerf_cli.evaluation.cases import Comparison
+    from facerf_cli.stage.data.dataset import Dataset
+    from facerf_cli.stage.data.recipes import Pair
+
+_PAPER_PICTURES = 86  # paper, Table 2
+
+Couples = dict[str, "list[tuple[Pair, Pair]]"]
+
+
+def transfer(
+    context: typer.Context,
+    inputs: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="DATASET|PHOTO...",
+            help="Folder by `facerf prepare-dataset`; or with --photos, pictures of a person two by two "
+            "(A B A B ...), or folders with a person's pictures each.",
+            show_default=False,
+        ),
+    ],
+    options: EvaluateOptions,
+    photos: Annotated[
+        bool, typer.Option("--photos", help="What is given are photos, two by two or in folders.")
+    ] = False,
+    split: SplitOption = "test",
+    every: EveryOption = 1,
+    refit: RefitOption = False,
+    landmarks: LandmarksOption = None,
+    input_colourspace: InputColourspaceOption = None,
+    face_model: FaceModelOption = "builtin",
+) -> int:
+    """Exchange the reflectances of two pictures of a person (the paper's Table 2).
+
+    Picture A is put together from the reflectance that was read off B, turned to A's pose, under A's light;
+    then B from A's. The light is the one that the same method finds in the picture with its own reflectance.
+    Of a DATASET, couples are sources of one person with different cameras and different maps.
+    """
+    from facerf_cli.evaluation.paper import TABLE_2_TRANSFER
+    from facerf_cli.evaluation.summary import Layout
+
+    settings = settings_of(context)
+    no_part_of_preset(options, every)
+    photo = PhotoOptions(settings, input_colourspace, face_model, landmarks=landmarks)
+    photo.check()
+    methods = MethodOptions.of(photo, options)
+    work: _OfPhotos | _OfPeople
+    if photos:
+        couples = _photo_couples(inputs, options.output)
+        _require_enough_photos(couples, options)
+        items = list(couples)
+        work = _OfPhotos(methods, couples, options.keep_eyes)
+    else:
+        folder = only_dataset(inputs)
+        if folder is None:
+            raise UsageError(f"{inputs[0]}: no prepared dataset; give --photos for pictures of people")
+        dataset, pairs = read_split(folder, split, face_model, refit)
+        chosen = _chosen_couples(folder, pairs, options, every)
+        items = people_items(folder, list(chosen), options.output)
+        work = _OfPeople(methods, dataset, chosen, options.keep_eyes, refit)
+    layout = Layout(
+        name="transfer",
+        title="Reflectances of two pictures of a person exchanged",
+        metrics=("si_mse", "face_dis", "ssim"),
+        by=() if photos else ("tone",),
+        published=TABLE_2_TRANSFER,
+        notes=("The field is the network's own, not held to a photo.",),
+    )
+    return run_protocol(layout, items, work, options, settings)
+
+
+def _chosen_couples(
+    folder: Path, pairs: "Mapping[str, list[Pair]]", options: EvaluateOptions, every: int
+) -> Couples:
+    """Every Nth couple of a person, or the preset's number evenly over people."""
+    from facerf_cli.evaluation.people import evenly
+    from facerf_cli.evaluation.transfer import couples_of
+
+    couples = {name: couples_of(members) for name, members in pairs.items()}
+    if options.preset:
+        most = _PAPER_PICTURES // 2
+        found = 2 * sum(map(len, couples.values()))
+        require_enough(found, 2 * most, "pictures in couples", folder, 2 * most / len(pairs))
+        return evenly(couples, most)
+    chosen = {name: members[::every] for name, members in couples.items()}
+    if not any(chosen.values()):
+        raise UsageError(f"{folder}: no two sources of one person with different cameras and maps")
+    return {name: members for name, members in chosen.items() if members}
+
+
+def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, tuple[Item, Item]]:
+    """An item a couple: files two by two as they are named, folders' files two by two in their order."""
+    files = [name for name in inputs if not os.path.isdir(name)]
+    if len(files) % 2:
+        raise UsageError(f"{len(files)} photos: give two of each person, A B A B ..., or folders of a person")
+    found = collect_items(inputs, output, PHOTO_SUFFIXES)
+    by_path = {os.path.abspath(item.input_path): item for item in found}
+    named = [by_path[os.path.abspath(name)] for name in files]
+    groups: dict[Path, list[Item]] = {}
+    for item in found:
+        if item not in named:
+            groups.setdefault(item.input_path.parent, []).append(item)
+    couples = list(zip(named[::2], named[1::2], strict=True))
+    for folder, members in groups.items():
+        if len(members) < 2:
+            raise UsageError(f"{folder}: one photo; give two of a person at least")
+        couples += zip(members[::2], members[1::2], strict=False)
+    return {_couple_item(*couple): couple for couple in couples}
+
+
+def _couple_item(first: Item, second: Item) -> Item:
+    """The couple under the first one's place, both in its name."""
+    tail = f"--{Path(second.name).name}"
+    return Item(first.input_path, Path(f"{first.output_base}{tail}"), f"{first.name}{tail}")
+
+
+def _require_enough_photos(couples: Mapping[Item, object], options: EvaluateOptions) -> None:
+    if options.preset and 2 * len(couples) < _PAPER_PICTURES:
+        raise UsageError(
+            f"{2 * len(couples)} photos in couples, --preset paper measures {_PAPER_PICTURES}; give more"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _OfPhotos:
+    """Exchanges the reflectances of two photos."""
+
+    methods: MethodOptions
+    couples: Mapping[Item, tuple[Item, Item]]
+    keep_eyes: bool
+
+    def __call__(self, item: Item) -> "Iterator[Comparison]":
+        from facerf_cli.evaluation.cases import Case
+        from facerf_cli.evaluation.transfer import Side, transfer
+
+        methods, sides = load_methods(self.methods), []
+        couple = self.couples[item]
+        for own, other in (couple, couple[::-1]):
+            case = Case(f"{own.name}_by_{Path(other.name).name}", couple[0].name)
+            portrait = next(portraits(own, self.methods.photo, self.keep_eyes))[1]
+            sides.append(Side(case, portrait.view, portrait.picture, portrait.face))
+        yield from transfer((sides[0], sides[1]), methods)
+
+
+@dataclass(frozen=True, eq=False)
+class _OfPeople:
+    """Exchanges the reflectances of one person's couples."""
+
+    methods: MethodOptions
+    dataset: "Dataset"
+    couples: "Mapping[str, list[tuple[Pair, Pair]]]"
+    keep_eyes: bool
+    refit: bool
+
+    def __call__(self, item: Item) -> "Iterator[Comparison]":
+        from facerf_cli.evaluation.people import Person
+        from facerf_cli.evaluation.transfer import transfer_person
+
+        methods = load_methods(self.methods)
+        person = Person(methods[0].models.face, self.dataset, item.name, self.keep_eyes, self.refit)
+        return transfer_person(person, self.couples[item.name], methods)

@@ -1,0 +1,151 @@
+"""What the protocols of `facerf evaluate` measure on, a dataset's people or photos, and with what methods."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from facerf_cli.commands.evaluation_options import EvaluateOptions, KindName
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.photo import PhotoOptions, load_models_once
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from facerf_cli.evaluation.methods import Method
+    from facerf_cli.stage.data.dataset import Dataset
+    from facerf_cli.stage.data.recipes import Pair
+
+DatasetArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="DATASET",
+        help="Folder by `facerf prepare-dataset`, with pairs by `facerf relight-dataset`.",
+        show_default=False,
+    ),
+]
+PhotosOrDatasetArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PHOTO...|DATASET",
+        help="Pictures, folders, - for a list on standard input; or a folder by `facerf prepare-dataset`.",
+        show_default=False,
+    ),
+]
+SplitOption = Annotated[
+    Literal["train", "validation", "test", "all"],
+    typer.Option("--split", help="Of DATASET; all: where nobody in it was trained on."),
+]
+EveryOption = Annotated[
+    int, typer.Option("--every", min=1, metavar="N", help="Every Nth pair of DATASET's split only.")
+]
+RefitOption = Annotated[
+    bool,
+    typer.Option(
+        "--refit", help="Fit each of DATASET's pictures by its own landmarks, not a person's all at once."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class MethodOptions:
+    """Which methods are compared; settings only, so that it can be sent to other processes."""
+
+    photo: PhotoOptions
+    reflectance: tuple[KindName, ...]
+    against: tuple[Path, ...]
+
+    @staticmethod
+    def of(photo: PhotoOptions, options: EvaluateOptions) -> "MethodOptions":
+        """What the shared options name."""
+        return MethodOptions(photo, options.reflectance, options.against)
+
+
+@cache
+def load_methods(options: MethodOptions) -> "tuple[Method, ...]":
+    """The methods, in the order of their names, once a process."""
+    from facerf_cli.evaluation.methods import Method
+    from facerf_cli.pipeline import load_models
+
+    models = load_models_once(options.photo)
+    against = (load_models(path, options.photo.face_model, models.device) for path in options.against)
+    return (
+        *(Method(kind, kind, models) for kind in options.reflectance),
+        *(Method(path.stem, "field", other) for path, other in zip(options.against, against, strict=True)),
+    )
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether a folder is a prepared dataset."""
+    return (path / "dataset.json").is_file()
+
+
+def only_dataset(inputs: Sequence[str]) -> Path | None:
+    """The dataset that the inputs name, or None where they are photos; UsageError for both."""
+    datasets = [path for path in map(Path, inputs) if is_dataset(path)]
+    if datasets and len(inputs) > 1:
+        raise UsageError(f"{datasets[0]}: give one dataset alone, or photos")
+    return datasets[0] if datasets else None
+
+
+def read_split(
+    folder: Path, split: str, face_model: str, refit: bool
+) -> "tuple[Dataset, dict[str, list[Pair]]]":
+    """A dataset and the pairs of a split's people; UsageError for none, or fits of another face model."""
+    from facerf_cli.face.morphable import load_face_model
+    from facerf_cli.stage.data.dataset import read_dataset
+    from facerf_cli.stage.data.recipes import read_pairs
+
+    dataset = read_dataset(folder)
+    if not refit and load_face_model(face_model).name != dataset.face_model:
+        raise UsageError(f"{folder}: fitted with {dataset.face_model}; give that --face-model, or --refit")
+    pairs: dict[str, list[Pair]] = {}
+    for pair in read_pairs(dataset):
+        if split in ("all", pair.split):
+            pairs.setdefault(pair.subject, []).append(pair)
+    if not pairs:
+        raise UsageError(f"{folder}: no pairs in the split {split}; run facerf relight-dataset, or --split")
+    return dataset, pairs
+
+
+def every_nth(pairs: "Mapping[str, Sequence[Pair]]", step: int) -> "dict[str, list[Pair]]":
+    """Every Nth of all pairs in their order, by subject."""
+    flat = [pair for of_subject in pairs.values() for pair in of_subject][::step]
+    return {name: kept for name in pairs if (kept := [pair for pair in flat if pair.subject == name])}
+
+
+def chosen_sources(
+    folder: Path, pairs: "Mapping[str, Sequence[Pair]]", options: EvaluateOptions, every: int, preset: int
+) -> "dict[str, list[Pair]]":
+    """The pairs whose sources are reconstructed: every Nth, or a preset's number evenly over people."""
+    from facerf_cli.evaluation.people import evenly
+
+    if not options.preset:
+        return every_nth(pairs, every)
+    require_enough(sum(map(len, pairs.values())), preset, "sources", folder, preset / len(pairs))
+    return evenly(pairs, preset)
+
+
+def no_part_of_preset(options: EvaluateOptions, every: int) -> None:
+    """UsageError where `--every` would take a part of a preset."""
+    if options.preset and every > 1:
+        raise UsageError("--preset and --every exclude each other: a preset says how many pictures")
+
+
+def require_enough(found: int, needed: int, what: str, dataset: Path, per_subject: float) -> None:
+    """UsageError where a preset needs more than a dataset's split has; `per_subject` pairs would do."""
+    if found >= needed:
+        return
+    raise UsageError(
+        f"{dataset}: the split has {found} {what}, --preset paper measures {needed}; run facerf "
+        f"relight-dataset {dataset} --envmaps procedural:160 --per-subject {math.ceil(1.1 * per_subject)} "
+        "--overwrite, or prepare more people"
+    )
+
+
+def people_items(dataset: Path, subjects: Sequence[str], output: Path) -> list[Item]:
+    """An item a person."""
+    return [Item(dataset / "olat" / name, output / "cases" / name, name) for name in sorted(subjects)]

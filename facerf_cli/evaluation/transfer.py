@@ -1,0 +1,86 @@
+"""Two pictures of one person in different poses and lights, reflectances exchanged (paper, Table 2).
+
+Picture A is made of B's reflectance, turned to A's pose, on A's fitted mesh under A's light; the light is
+that which the same method finds with A's own reflectance. So what is measured is a reflectance where it was
+not read off.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.evaluation.cases import Case, Comparison
+from facerf_cli.evaluation.methods import Method, relit_by
+from facerf_cli.evaluation.people import Person
+from facerf_cli.evaluation.views import View
+from facerf_cli.pipeline import FaceTexture, turn_to
+from facerf_cli.stage.data.recipes import Pair
+
+Sides = tuple["Side", "Side"]
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of two pictures [S, S, 3], its view and its texture, and what its comparison is called."""
+
+    case: Case
+    view: View
+    picture: np.ndarray
+    face: FaceTexture
+
+
+@torch.no_grad()
+def transfer(sides: Sides, methods: Sequence[Method]) -> Iterator[Comparison]:
+    """Both pictures, each by the other's reflectance."""
+    explained = [
+        {method.name: method.explained(side.view.fit, side.face) for method in methods} for side in sides
+    ]
+    for side, own, other, others in zip(sides, explained, sides[::-1], explained[::-1], strict=True):
+        yield _made_of(side, own, other, others)
+
+
+def _made_of(
+    side: Side, own: Mapping[str, Explained], other: Side, others: Mapping[str, Explained]
+) -> Comparison:
+    """A picture by its own light and the other's reflectance."""
+    view = side.view
+    turn = turn_to(other.view.fit, view.fit.rotation)
+    predictions = {
+        name: view.picture(relit_by(others[name].reflectance, explained, turn))
+        for name, explained in own.items()
+    }
+    landmarks_px = view.fit.landmarks_px.numpy()
+    return Comparison(side.case, side.picture, view.mask, predictions, other.picture, landmarks_px)
+
+
+def transfer_person(
+    person: Person, couples: Iterable[tuple[Pair, Pair]], methods: Sequence[Method]
+) -> Iterator[Comparison]:
+    """Couples of the sources of a person's pairs."""
+    for first, second in couples:
+        yield from transfer((_side(person, first, second), _side(person, second, first)), methods)
+
+
+def _side(person: Person, pair: Pair, other: Pair) -> Side:
+    picture, face = person.source(pair)
+    name = f"{pair.subject}/{pair.index:05d}_by_{other.index:05d}"
+    facts = person.facts | {"map": pair.envmap}
+    return Side(Case(name, pair.subject, facts), person.shot(pair.source_camera).view, picture, face)
+
+
+def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
+    """A person's pairs two by two, each once: sources of different cameras and different maps, in order."""
+    couples: list[tuple[Pair, Pair]] = []
+    waiting: list[Pair] = []
+    for pair in pairs:
+        fits = (p for p in waiting if p.source_camera != pair.source_camera and p.envmap != pair.envmap)
+        first = next(fits, None)
+        if first is None:
+            waiting.append(pair)
+        else:
+            waiting.remove(first)
+            couples.append((first, pair))
+    return couples
