@@ -1,7 +1,7 @@
 """The options that every protocol of `facerf evaluate` has beside its own, named and explained once."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -63,9 +63,12 @@ LpipsOption = Annotated[
     ),
 ]
 VggWeightsOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
-        "--vgg-weights", metavar="FILE", help="VGG-16's weights, which LPIPS needs.", show_default="no LPIPS"
+        "--vgg-weights",
+        metavar="imagenet|PATH",
+        help="Measure LPIPS too, by VGG-16: imagenet fetches it; or a file.",
+        show_default="no LPIPS",
     ),
 ]
 PresetOption = Annotated[
@@ -86,7 +89,7 @@ class EvaluateOptions:
     keep_eyes: bool = False
     space: Literal["linear", "display"] = "linear"
     lpips: Path | None = None
-    vgg_weights: Path | None = None
+    vgg_weights: str | None = None
     preset: Literal["paper"] | None = None
     jobs: int = 1
     overwrite: bool = False
@@ -109,6 +112,8 @@ class EvaluateOptions:
         for folder in self.compare:
             if not folder.is_dir():
                 raise UsageError(f"--compare {folder}: no such folder")
+        if self.lpips is not None and self.vgg_weights is None:
+            raise UsageError("--lpips is measured with --vgg-weights imagenet, or a file of VGG-16's weights")
 
     def measures(self) -> "Measures":
         """How pictures are measured."""
@@ -147,23 +152,40 @@ def _evaluate_options(
     return replace(given, preset=preset, jobs=jobs, overwrite=overwrite, dry_run=dry_run)
 
 
-def with_evaluate_options(command: Callable[..., int]) -> Callable[..., None]:
-    """A protocol's command with the shared options after its own.
+def evaluate_options(
+    leave_out: Sequence[str] = (),
+) -> Callable[[Callable[..., int]], Callable[..., None]]:
+    """Give a protocol's command the shared options after its own, but those that mean nothing to it.
 
-    `command` takes its own parameters and `options: EvaluateOptions`, and gives the exit code. typer reads
+    The command takes its own parameters and `options: EvaluateOptions`, and gives the exit code. typer reads
     signatures, so the function that it gets has one that lists them all.
     """
-    own = [p for name, p in inspect.signature(command).parameters.items() if name != "options"]
-    shared = list(inspect.signature(_evaluate_options).parameters.values())
+    shared = {
+        name: parameter
+        for name, parameter in inspect.signature(_evaluate_options).parameters.items()
+        if name not in leave_out
+    }
 
-    def run(**values: Any) -> None:
-        options = _evaluate_options(**{parameter.name: values.pop(parameter.name) for parameter in shared})
-        options.check()
-        raise typer.Exit(command(**values, options=options))
+    def decorated(command: Callable[..., int]) -> Callable[..., None]:
+        own = [p for name, p in inspect.signature(command).parameters.items() if name != "options"]
 
-    parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in [*own, *shared]]
-    as_typer_reads_it: Any = run
-    as_typer_reads_it.__signature__ = inspect.Signature(parameters)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__name__, run.__doc__ = command.__name__, command.__doc__
-    return run
+        def run(**values: Any) -> None:
+            options = _evaluate_options(**{name: values.pop(name) for name in shared})
+            if "reflectance" in leave_out:
+                options = replace(options, reflectance=())
+            options.check()
+            raise typer.Exit(command(**values, options=options))
+
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in [*own, *shared.values()]]
+        as_typer_reads_it: Any = run
+        as_typer_reads_it.__signature__ = inspect.Signature(parameters)
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+        run.__name__, run.__doc__ = command.__name__, command.__doc__
+        return run
+
+    return decorated
+
+
+def with_evaluate_options(command: Callable[..., int]) -> Callable[..., None]:
+    """A protocol's command with all of the shared options."""
+    return evaluate_options()(command)

@@ -1,15 +1,29 @@
 """What all protocols of `facerf evaluate` do alike: walk the items, measure, keep rows, sum them up."""
 
-from collections.abc import Callable, Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
+from facerf_cli.commands.evaluation_key import evaluation_key, networks_of
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
+    from facerf_cli.evaluation.case_files import ItemFigures
     from facerf_cli.evaluation.cases import Comparison
-    from facerf_cli.evaluation.summary import Layout
+    from facerf_cli.evaluation.measure import Row
+    from facerf_cli.evaluation.page import About
+    from facerf_cli.evaluation.summary import Layout, Summary
+
+CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
+log = logging.getLogger(LOGGER_NAME)
 
 
 def run_protocol(
@@ -26,4 +40,180 @@ def run_protocol(
     goes on. When all are there: DIR/summary.json, DIR/images.csv, DIR/report.html, and a table on stdout.
     Where an item failed or a prediction is missing, each is named and no summary is written.
     """
-    raise NotImplementedError
+    if not items:
+        raise UsageError(f"evaluate {protocol.name}: nothing to evaluate")
+    key = evaluation_key(protocol.name, compare, options, settings)
+    work = _Measure(protocol.metrics[0], compare, options, settings, key)
+    _check_earlier(items, work)
+    batch = BatchOptions(options.output, options.overwrite, options.dry_run, options.jobs)
+    if not options.dry_run:
+        _load_what_measures_need(options)
+        for name in (SUMMARY, IMAGES, PAGE):  # they speak of a run that is about to change
+            (options.output / name).unlink(missing_ok=True)
+    code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
+    if code:
+        log.error("no summary is written while pictures are missing; finished ones are kept, so run it again")
+    elif not options.dry_run:
+        _finish(protocol, items, work)
+    return code
+
+
+def _check_earlier(items: Sequence[Item], work: "_Measure") -> None:
+    """Raise where finished items were evaluated otherwise: one table is of one kind."""
+    from facerf_cli.evaluation.case_files import read_figures
+
+    if work.options.overwrite:
+        return
+    paths = [path for item in items if (path := work.path_of(item)).exists()]
+    other = [path for path in paths if read_figures(path).key != work.key]
+    if other:
+        raise UsageError(
+            f"{work.options.output}: {len(other)} items ({other[0].stem}, ...) were evaluated with other "
+            "options, another checkpoint or another version; give --overwrite, or another folder"
+        )
+
+
+def _load_what_measures_need(options: EvaluateOptions) -> None:
+    """Name what is wrong with the weights of a metric before anything is measured."""
+    if options.vgg_weights is not None:
+        from facerf_cli.evaluation.perceptual import perceptual_metric
+
+        perceptual_metric(options.lpips, options.vgg_weights)
+
+
+@dataclass(frozen=True)
+class _Measure:
+    """Measures an item; settings only."""
+
+    metric: str  # by which the worst pictures are found
+    compare: Callable[[Item], "Iterable[Comparison]"]
+    options: EvaluateOptions
+    settings: Settings
+    key: str
+
+    def path_of(self, item: Item) -> Path:
+        """The item's figures."""
+        return self.options.output / CASES / f"{item.name}.json"
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """What a finished item has."""
+        return [self.path_of(item)]
+
+    def __call__(self, item: Item) -> Outcome:
+        """Measure an item's pictures one after another; its figures are written when all are measured."""
+        from facerf_cli.commands.evaluation_pictures import keep_pictures, keep_strips
+        from facerf_cli.evaluation.case_files import ItemFigures, write_figures
+        from facerf_cli.evaluation.keeper import StripKeeper
+        from facerf_cli.evaluation.measure import Row, measure
+        from facerf_cli.evaluation.strips import strip_of
+
+        rows: list[Row] = []
+        wrong: list[str] = []
+        keeper, measures = StripKeeper(self.metric), self.options.measures()
+        for own in self.compare(item):
+            if self.options.pictures:
+                keep_pictures(own, self.options.output, self.settings)
+            comparison = _with_others(own, self.options.compare, wrong)
+            if wrong:
+                continue  # all that is missing is to be named, at once
+            measured = measure(comparison, measures)
+            keeper.offer(measured, partial(strip_of, comparison, self.metric.startswith("si_")))
+            rows += measured
+        _require_whole(item, rows, wrong)
+        strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings)
+        write_figures(self.path_of(item), ItemFigures(self.key, tuple(rows), strips))
+        return Outcome([], {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)})
+
+
+def _with_others(own: "Comparison", folders: Sequence[Path], wrong: list[str]) -> "Comparison":
+    """The comparison with other methods' predictions; what is missing or unfit is added to `wrong`."""
+    from facerf_cli.evaluation.others import Others
+
+    try:
+        others = Others(tuple(folders)).predictions(own.case.name, own.truth.shape)
+    except InputError as error:
+        wrong.append(str(error))
+        return own
+    return replace(own, predictions={**own.predictions, **others})
+
+
+def _require_whole(item: Item, rows: Sequence[object], wrong: Sequence[str]) -> None:
+    """Raise InputError where pictures are missing, each named in a line of its own."""
+    for line in wrong[1:]:
+        log.error("%s", line)
+    if wrong:
+        more = f" (and {len(wrong) - 1} more of {item.name}, above)" if len(wrong) > 1 else ""
+        raise InputError(f"{wrong[0]}{more}")
+    if not rows:
+        raise InputError(f"{item.input_path}: has no picture that can be measured")
+
+
+def _finish(protocol: "Layout", items: Sequence[Item], work: _Measure) -> None:
+    """Write and print the tables of finished items."""
+    from facerf_cli.commands.evaluation_table import print_tables
+    from facerf_cli.evaluation.case_files import images_csv, read_figures
+    from facerf_cli.evaluation.summary import summarise
+    from facerf_cli.files.atomic import atomic_path
+
+    found = {item.name: read_figures(work.path_of(item)) for item in items}
+    rows = [row for figures in found.values() for row in figures.rows]
+    _require_every_method(found)
+    summary = summarise(protocol, rows)
+    folder = work.options.output
+    with atomic_path(folder / IMAGES) as temporary:
+        temporary.write_text(images_csv(rows), encoding="utf-8", errors="backslashreplace")
+    _write_documents(summary, rows, found, work)
+    print_tables(summary)
+    log.info("%s has the pictures, worst cases first; %s a row for each", folder / PAGE, folder / IMAGES)
+
+
+def _require_every_method(found: "Mapping[str, ItemFigures]") -> None:
+    """Raise InputError where a picture lacks a method that others have: a mean would leave it out."""
+    rows = [row for figures in found.values() for row in figures.rows]
+    methods = list(dict.fromkeys(row.method for row in rows))
+    of_case: dict[str, set[str]] = {}
+    for row in rows:
+        of_case.setdefault(row.case, set()).add(row.method)
+    missing = [f"{case} by {name}" for case, have in of_case.items() for name in methods if name not in have]
+    for line in missing:
+        log.error("%s is missing", line)
+    if missing:
+        raise InputError(f"{len(missing)} predictions are missing, so no summary is written")
+
+
+def _write_documents(
+    summary: "Summary", rows: "Sequence[Row]", found: "Mapping[str, ItemFigures]", work: _Measure
+) -> None:
+    """Write the summary and the page."""
+    import json
+
+    from facerf_cli.evaluation.page import page
+    from facerf_cli.evaluation.page_cases import choose
+    from facerf_cli.files.atomic import atomic_path
+    from facerf_cli.records import json_line
+
+    folder, about = work.options.output, _about(work)
+    chosen = choose(summary, rows, [strip for figures in found.values() for strip in figures.strips])
+    jpegs = {case.strip.case: (folder / case.strip.file).read_bytes() for case in chosen.all()}
+    content = {"facerf": about.version, "command": about.command, **about.facts, **summary.as_dict()}
+    texts = {PAGE: page(summary, about, chosen, jpegs)}
+    texts[SUMMARY] = json.dumps(json.loads(json_line(content)), ensure_ascii=False, indent=1) + "\n"
+    for name, text in texts.items():
+        with atomic_path(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def _about(work: _Measure) -> "About":
+    """What was run, without the hour: equal runs give equal files."""
+    import shlex
+    import sys
+
+    from facerf_cli import __version__
+    from facerf_cli.evaluation.page import About
+
+    networks = networks_of(work.options, work.settings)
+    facts = {f"checkpoint {name}": f"SHA-256 {digest}" for name, digest in networks.items()}
+    facts["values compared"] = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}[
+        work.options.space
+    ]
+    return About(shlex.join(["facerf", *sys.argv[1:]]), __version__, facts)

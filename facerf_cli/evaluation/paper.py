@@ -41,11 +41,11 @@ def _table_2(metric: str, data: str, figures: tuple[tuple[float, float], ...]) -
 
 TABLE_2_RECONSTRUCTION = (
     *_table_2("si_mse", _CELEBA, ((0.004, 0.002), (0.017, 0.015), (0.010, 0.008), (0.007, 0.003))),
-    *_table_2("face_dis", _CELEBA, ((0.550, 0.080), (0.650, 0.076), (0.685, 0.067), (0.762, 0.075))),
+    *_table_2("face_distance", _CELEBA, ((0.550, 0.080), (0.650, 0.076), (0.685, 0.067), (0.762, 0.075))),
 )
 TABLE_2_TRANSFER = (
     *_table_2("si_mse", _TEST_SET, ((0.002, 0.001), (0.018, 0.011), (0.007, 0.005), (0.003, 0.001))),
-    *_table_2("face_dis", _TEST_SET, ((0.482, 0.084), (0.605, 0.092), (0.644, 0.077), (0.689, 0.076))),
+    *_table_2("face_distance", _TEST_SET, ((0.482, 0.084), (0.605, 0.092), (0.644, 0.077), (0.689, 0.076))),
 )
 TABLE_3 = (
     Published("without normals", "si_mse", 0.00113, 0.00093, ("pose", "same pose"), "Table 3", _LIGHT_STAGE),
@@ -56,6 +56,6 @@ TABLE_3 = (
 TABLE_4 = (
     Published("all components", "si_mse", 0.004, 0.002, None, "Table 4", _CELEBA),
     Published("mean face", "si_mse", 0.011, 0.005, None, "Table 4", _CELEBA),
-    Published("all components", "face_dis", 0.550, 0.080, None, "Table 4", _CELEBA),
-    Published("mean face", "face_dis", 0.550, 0.073, None, "Table 4", _CELEBA),
+    Published("all components", "face_distance", 0.550, 0.080, None, "Table 4", _CELEBA),
+    Published("mean face", "face_distance", 0.550, 0.073, None, "Table 4", _CELEBA),
 )

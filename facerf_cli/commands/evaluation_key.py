@@ -1,0 +1,68 @@
+"""What an evaluation depends on, told apart by a key: one table never mixes two ways of measuring."""
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from facerf_cli import __version__
+from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.options import Settings
+from facerf_cli.errors import InputError
+from facerf_cli.records import json_line
+
+# Settings that change no figure, wherever they stand.
+_WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
+
+
+def evaluation_key(
+    protocol: str, compare: Callable[..., Any], options: EvaluateOptions, settings: Settings
+) -> str:
+    """16 digits that differ where figures may: by version, protocol, its settings, options and networks."""
+    facts = {
+        "version": __version__,
+        "protocol": protocol,
+        "compare": _plain(compare),
+        "options": _plain(options),
+        "networks": networks_of(options, settings),
+    }
+    return hashlib.sha256(json_line(facts).encode("utf-8", "backslashreplace")).hexdigest()[:16]
+
+
+def networks_of(options: EvaluateOptions, settings: Settings) -> dict[str, str]:
+    """SHA-256 of the checkpoints by their names; none where no reflectance model is asked for."""
+    if not options.reflectance:
+        return {}
+    from facerf_cli.pipeline import DEFAULT_CHECKPOINT
+
+    paths = [settings.checkpoint or DEFAULT_CHECKPOINT, *options.against]
+    return {path.stem: _sha256(path) for path in paths}
+
+
+@cache
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _plain(value: Any) -> Any:
+    """Settings as JSON can have them; what is no setting is told by its type alone."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name for field in dataclasses.fields(value)} - _WITHOUT_EFFECT
+        return {"type": type(value).__name__} | {
+            name: _plain(getattr(value, name)) for name in sorted(fields)
+        }
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (set, frozenset)):
+        return sorted(map(str, value))
+    if isinstance(value, (str, int, float, bool, Path)) or value is None:
+        return value
+    return value.tolist() if hasattr(value, "tolist") else type(value).__name__

@@ -1,0 +1,84 @@
+"""An item's figures on disk, so that an evaluation can be cut off and go on; and all pictures' as CSV."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.measure import Row
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.records import json_line
+
+FORMAT = "facerf-evaluation-1"
+
+
+@dataclass(frozen=True)
+class KeptStrip:
+    """A strip (`strips.Strip`) as a JPEG; `file` is relative to the evaluation's folder."""
+
+    case: str
+    file: str
+    methods: tuple[str, ...]
+    ev: float
+    scales: tuple[float, ...]
+    has_source: bool
+    size_px: tuple[int, int]  # width, height
+
+
+@dataclass(frozen=True)
+class ItemFigures:
+    """What an item left: the key of how it was evaluated, its rows, its strips."""
+
+    key: str
+    rows: tuple[Row, ...]
+    strips: tuple[KeptStrip, ...]
+
+
+def write_figures(path: Path, figures: ItemFigures) -> None:
+    """Write an item's figures as one line of JSON, whole or not at all; NaN and infinity become null."""
+    content = {"format": FORMAT, "key": figures.key}
+    content |= {"rows": [asdict(row) for row in figures.rows]}  # type: ignore[dict-item]
+    content |= {"strips": [asdict(strip) for strip in figures.strips]}  # type: ignore[dict-item]
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_line(content) + "\n", encoding="utf-8", errors="backslashreplace")
+
+
+def read_figures(path: Path) -> ItemFigures:
+    """Read them back; null is NaN."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT:
+            raise ValueError(f"its format is {content['format']!r}")
+        rows = tuple(_row(entry) for entry in content["rows"])
+        return ItemFigures(content["key"], rows, tuple(_strip(entry) for entry in content["strips"]))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        advice = "remove it, or give --overwrite"
+        raise InputError(f"{path}: no figures of an evaluation ({error}); {advice}") from None
+
+
+def _row(entry: Mapping[str, Any]) -> Row:
+    values = {name: math.nan if value is None else float(value) for name, value in entry["values"].items()}
+    return Row(**{**entry, "values": values})
+
+
+def _strip(entry: Mapping[str, Any]) -> KeptStrip:
+    lists = {name: tuple(entry[name]) for name in ("methods", "scales", "size_px")}
+    return KeptStrip(**{**entry, **lists})
+
+
+def images_csv(rows: Sequence[Row]) -> str:
+    """A line a picture and method: its names, its facts, its figures; empty where there is none."""
+    facts = dict.fromkeys(name for row in rows for name in row.facts)
+    values = dict.fromkeys(name for row in rows for name in row.values)
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(["case", "person", "method", *facts, *values])
+    for row in rows:
+        figures = [f"{row.values[name]:.9g}" if name in row.values else "" for name in values]
+        writer.writerow([row.case, row.person, row.method, *(row.facts.get(n, "") for n in facts), *figures])
+    return stream.getvalue()

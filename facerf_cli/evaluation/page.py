@@ -1,0 +1,123 @@
+"""The report of an evaluation: one HTML file that needs nothing else, no network and no script."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from html import escape
+
+from facerf_cli.evaluation.page_cases import CasePicture, Chosen, case_article
+from facerf_cli.evaluation.page_style import STYLE
+from facerf_cli.evaluation.page_tables import metric_table, other_metrics
+from facerf_cli.evaluation.strips import ERROR_HIGHEST
+from facerf_cli.evaluation.summary import Group, Summary, shown_as
+
+
+@dataclass(frozen=True)
+class About:
+    """What was run: the command line, facerf's version, and facts such as the checkpoints' digests."""
+
+    command: str
+    version: str
+    facts: Mapping[str, str]
+
+
+def page(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, bytes]) -> str:
+    """The report; `jpegs` are the chosen cases' strips by case. Equal figures give equal bytes."""
+    return "\n".join(_lines(summary, about, chosen, jpegs)) + "\n"
+
+
+def _lines(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, bytes]) -> Iterator[str]:
+    title = escape(summary.layout.title)
+    yield '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
+    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
+    yield f"<title>{title} · facerf</title>\n<style>{STYLE}</style>\n</head>\n<body>"
+    yield from _head(summary, about, title)
+    yield '<main>\n<h2 id="result">Result</h2>'
+    yield from _results(summary)
+    yield from _groups(summary)
+    yield '<h2 id="metrics">All metrics</h2>'
+    yield from other_metrics(summary)
+    yield from _pictures(summary, chosen, jpegs)
+    yield "</main>\n</body>\n</html>"
+
+
+def _head(summary: Summary, about: About, title: str) -> Iterator[str]:
+    people = "person" if summary.persons == 1 else "people"
+    pictures = "picture" if summary.pictures == 1 else "pictures"
+    methods = ", ".join(map(escape, summary.methods))
+    yield f"<header>\n<h1>{title}</h1>"
+    yield (
+        f'<p class="lead">{summary.pictures} {pictures} of {summary.persons} {people}; '
+        f"{'methods' if len(summary.methods) > 1 else 'method'}: {methods}.</p>"
+    )
+    yield f"<pre>{escape(about.command)}</pre>\n<dl>"
+    for name, value in {"facerf": about.version, **about.facts}.items():
+        yield f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>"
+    yield "</dl>"
+    for note in summary.layout.notes:
+        yield f"<p>{escape(note)}</p>"
+    links = {"result": "Result", **{f"by-{i}": f"By {f}" for i, f in enumerate(_facts(summary))}}
+    links |= {"metrics": "All metrics", "worst": "Worst cases"}
+    entries = "".join(f'<li><a href="#{at}">{escape(words)}</a></li>' for at, words in links.items())
+    yield f'<nav aria-label="Contents"><ul>{entries}</ul></nav>\n</header>'
+
+
+def _results(summary: Summary) -> Iterator[str]:
+    """Every metric of the layout over all pictures."""
+    yield (
+        '<p class="soft">Intervals are of the mean, by drawing people anew with all of their pictures '
+        "(bootstrap, 10 000 draws). "
+        + (
+            f"“Less the first” is a method's value less that of {escape(summary.methods[0])} on the same "
+            "pictures; “won” is the share of pictures on which it is the better one."
+            if len(summary.methods) > 1
+            else ""
+        )
+        + "</p>"
+    )
+    for metric in summary.layout.metrics:
+        if metric in summary.metrics:
+            yield from metric_table(summary, metric, [summary.groups[0]])
+
+
+def _facts(summary: Summary) -> list[str]:
+    return [fact for fact in summary.layout.by if any(group.fact == fact for group in summary.groups)]
+
+
+def _groups(summary: Summary) -> Iterator[str]:
+    """The tables by each fact: the first metric open, others folded."""
+    first, *others = [name for name in summary.layout.metrics if name in summary.metrics]
+    for index, fact in enumerate(_facts(summary)):
+        groups: list[Group] = [group for group in summary.groups if group.fact == fact]
+        yield f'<h2 id="by-{index}">By {escape(fact)}</h2>'
+        yield from metric_table(summary, first, groups)
+        for metric in others:
+            yield f"<details><summary>{escape(shown_as(metric).title)} by {escape(fact)}</summary>"
+            yield from metric_table(summary, metric, groups)
+            yield "</details>"
+
+
+def _pictures(summary: Summary, chosen: Chosen, jpegs: Mapping[str, bytes]) -> Iterator[str]:
+    how, first = shown_as(summary.metrics[0]), escape(summary.methods[0])
+    yield '<h2 id="worst">Worst cases</h2>'
+    if not chosen.worst:
+        yield "<p>No pictures were kept.</p>"
+        return
+    yield (
+        f"<p>By {escape(how.title)} of {first}, the worst first. All pictures of a case are at the truth's "
+        "exposure, and a method's at the scale of its comparison where Si-MSE is what is compared; grey is "
+        "left out of the comparison. Predictions are synthetic. images.csv has every picture's figures.</p>"
+    )
+    yield (
+        '<p class="scale"><span>Error</span> 0 <i></i> '
+        f"{ERROR_HIGHEST} or more, of display values 0 to 1, mean of the channels</p>"
+    )
+    yield from _articles(summary, chosen.worst, jpegs)
+    for cases, title in ((chosen.typical, "Typical cases"), (chosen.best, "Best cases")):
+        if cases:
+            yield f"<h2>{title}</h2>"
+            yield from _articles(summary, cases, jpegs)
+
+
+def _articles(summary: Summary, cases: tuple[CasePicture, ...], jpegs: Mapping[str, bytes]) -> Iterator[str]:
+    for case in cases:
+        yield from case_article(summary, case, jpegs[case.strip.case])
