@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli import __version__
-from facerf_cli.commands import face_model
+from facerf_cli.commands import evaluate, face_model
 from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.envmap import envmap
 from facerf_cli.commands.fit_geometry import fit_geometry
@@ -42,7 +42,8 @@ VERBS: tuple[Callable[..., Any], ...] = (
     envmap,
     doctor,
 )
-GROUPS: dict[str, typer.Typer] = {"face-model": face_model.app}  # verbs that have verbs of their own
+# Verbs that have verbs of their own.
+GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}

@@ -4,10 +4,27 @@ from collections.abc import Callable
 
 import typer
 
-app = typer.Typer(help="Measure on prepared data, photos or other methods' pictures.")
+from facerf_cli.commands.evaluate_geometry import geometry
+from facerf_cli.commands.evaluate_olat import olat
+from facerf_cli.commands.evaluate_pairs import WITHOUT as NOT_OF_PAIRS
+from facerf_cli.commands.evaluate_pairs import pairs
+from facerf_cli.commands.evaluate_reconstruction import reconstruction
+from facerf_cli.commands.evaluate_transfer import transfer
+from facerf_cli.commands.evaluation_options import with_shared_options
 
-# Each takes the shared options of `evaluation_options.py` and ends in `evaluation_run.run_protocol`.
-PROTOCOLS: tuple[Callable[..., None], ...] = ()
+app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' pictures.")
 
-for _protocol in PROTOCOLS:
-    app.command(epilog="Global options (see 'facerf --help') may stand before or after the verb.")(_protocol)
+# Each protocol's function, which takes `options: EvaluateOptions`, and the shared options that it has no use
+# for; all end in `evaluation_run.run_protocol`.
+PROTOCOLS: tuple[tuple[Callable[..., int], tuple[str, ...]], ...] = (
+    (olat, ()),
+    (reconstruction, ()),
+    (transfer, ()),
+    (geometry, ()),
+    (pairs, NOT_OF_PAIRS),
+)
+_EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
+
+for _function, _left_out in PROTOCOLS:
+    _command = with_shared_options(_function, _left_out)
+    app.command(epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})(_command)

@@ -26,11 +26,12 @@ PredictionsOption = Annotated[
     ),
 ]
 ReflectanceOption = Annotated[
-    list[KindName] | None,
+    list[str] | None,  # typer has no lists of choices
     typer.Option(
         "--reflectance",
-        metavar="|".join(get_args(KindName)),
-        help="Reflectance model; may be given several times, the first is what the others are held against.",
+        metavar="KIND",
+        help="Reflectance model: field, diffuse-sh, specular-sh or prt. May be given several times; the first "
+        "is what the others are held against.",
         show_default="field",
     ),
 ]
@@ -140,7 +141,7 @@ def _evaluate_options(
     """The shared options from the command line; a command's signature ends with these parameters."""
     given = EvaluateOptions(
         output,
-        tuple(reflectance or ("field",)),
+        _kinds(reflectance or ["field"]),
         tuple(against or ()),
         tuple(compare or ()),
         pictures=pictures,
@@ -152,40 +153,36 @@ def _evaluate_options(
     return replace(given, preset=preset, jobs=jobs, overwrite=overwrite, dry_run=dry_run)
 
 
-def evaluate_options(
-    leave_out: Sequence[str] = (),
-) -> Callable[[Callable[..., int]], Callable[..., None]]:
-    """Give a protocol's command the shared options after its own, but those that mean nothing to it.
+def _kinds(given: Sequence[str]) -> tuple[KindName, ...]:
+    found = []
+    for name in given:
+        kind = next((kind for kind in get_args(KindName) if kind == name), None)
+        if kind is None:
+            raise UsageError(f"--reflectance {name}: give {', '.join(get_args(KindName))}")
+        found.append(kind)
+    return tuple(found)
+
+
+def with_shared_options(command: Callable[..., int], left_out: Sequence[str] = ()) -> Callable[..., None]:
+    """A protocol's command with the shared options after its own, but those that mean nothing to it.
 
     The command takes its own parameters and `options: EvaluateOptions`, and gives the exit code. typer reads
     signatures, so the function that it gets has one that lists them all.
     """
-    shared = {
-        name: parameter
-        for name, parameter in inspect.signature(_evaluate_options).parameters.items()
-        if name not in leave_out
-    }
+    own = [p for name, p in inspect.signature(command).parameters.items() if name != "options"]
+    of_all = inspect.signature(_evaluate_options).parameters
+    shared = [parameter for name, parameter in of_all.items() if name not in left_out]
 
-    def decorated(command: Callable[..., int]) -> Callable[..., None]:
-        own = [p for name, p in inspect.signature(command).parameters.items() if name != "options"]
+    def run(**values: Any) -> None:
+        options = _evaluate_options(**{parameter.name: values.pop(parameter.name) for parameter in shared})
+        if "reflectance" in left_out:
+            options = replace(options, reflectance=())
+        options.check()
+        raise typer.Exit(command(**values, options=options))
 
-        def run(**values: Any) -> None:
-            options = _evaluate_options(**{name: values.pop(name) for name in shared})
-            if "reflectance" in leave_out:
-                options = replace(options, reflectance=())
-            options.check()
-            raise typer.Exit(command(**values, options=options))
-
-        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in [*own, *shared.values()]]
-        as_typer_reads_it: Any = run
-        as_typer_reads_it.__signature__ = inspect.Signature(parameters)
-        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-        run.__name__, run.__doc__ = command.__name__, command.__doc__
-        return run
-
-    return decorated
-
-
-def with_evaluate_options(command: Callable[..., int]) -> Callable[..., None]:
-    """A protocol's command with all of the shared options."""
-    return evaluate_options()(command)
+    parameters = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in [*own, *shared]]
+    as_typer_reads_it: Any = run
+    as_typer_reads_it.__signature__ = inspect.Signature(parameters)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__name__, run.__doc__ = command.__name__, command.__doc__
+    return run
