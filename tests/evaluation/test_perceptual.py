@@ -1,0 +1,109 @@
+"""LPIPS's weights: found, checked, and refused in words."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation import perceptual
+from facerf_cli.evaluation.perceptual import perceptual_metric
+from facerf_cli.network.perceptual import Lpips
+
+
+@pytest.fixture(autouse=True)
+def _small_and_not_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceptual, "Lpips", small)
+    perceptual_metric.cache_clear()
+
+
+def small() -> Lpips:
+    return Lpips(width=1 / 16)
+
+
+@pytest.fixture
+def heads() -> dict[str, torch.Tensor]:
+    names = [f"lin{place}.model.1.weight" for place in range(5)]
+    return {
+        n: head.detach().reshape(1, -1, 1, 1).clone() for n, head in zip(names, small().heads, strict=True)
+    }
+
+
+@pytest.fixture
+def vgg(tmp_path: Path) -> Path:
+    torch.save(small().trunk.state_dict(), tmp_path / "vgg16.pth")
+    return tmp_path / "vgg16.pth"
+
+
+def save(path: Path, tensors: dict[str, torch.Tensor]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.save(tensors, path)
+    return path
+
+
+def known(monkeypatch: pytest.MonkeyPatch, tensors: dict[str, torch.Tensor]) -> None:
+    """Let these heads be the published ones."""
+    network = small()
+    network.load_heads(tensors)
+    monkeypatch.setattr(perceptual, "_DIGEST", perceptual._digest(network))
+
+
+def test_a_metric_from_files(
+    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known(monkeypatch, heads)
+    metric = perceptual_metric(save(tmp_path / "heads.pth", heads), vgg)
+    picture = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
+    assert metric(picture, picture) == 0 < metric(1 - picture, picture)
+
+
+def test_heads_of_the_installed_package_are_found_without_importing_it(
+    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    known(monkeypatch, heads)
+    save(tmp_path / "site/lpips/weights/v0.1/vgg.pth", heads)
+    (tmp_path / "site/lpips/__init__.py").write_text("raise ImportError('torchvision')\n")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    assert callable(perceptual_metric(None, vgg)) and "lpips" not in sys.modules
+
+
+def test_without_heads_the_line_says_what_to_do(vgg: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="install the package lpips"):
+        perceptual_metric(None, vgg)
+
+
+def test_without_vgg_the_line_says_what_to_do(tmp_path: Path, heads: dict[str, torch.Tensor]) -> None:
+    with pytest.raises(UsageError, match="--vgg-weights imagenet"):
+        perceptual_metric(save(tmp_path / "heads.pth", heads), None)
+
+
+def test_heads_of_another_version_are_refused(
+    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor]
+) -> None:
+    with pytest.raises(InputError, match=r"not the published heads of LPIPS v0\.1"):
+        perceptual_metric(save(tmp_path / "heads.pth", heads), vgg)
+
+
+@pytest.mark.parametrize("trouble", ["missing", "pickle", "other"])
+def test_other_files_are_refused(tmp_path: Path, vgg: Path, trouble: str) -> None:
+    path = tmp_path / "heads.pth"
+    if trouble == "pickle":
+        torch.save({"a": Path("x")}, path)
+    elif trouble == "other":
+        save(path, {"features.0.weight": torch.zeros(1)})
+    with pytest.raises(InputError, match=r"heads\.pth: no "):
+        perceptual_metric(path, vgg)
+
+
+def test_the_published_file_is_known() -> None:
+    """With the package `lpips` at hand; it is no dependency."""
+    spec = perceptual.find_spec("lpips")
+    if spec is None or spec.origin is None:
+        pytest.skip("the package lpips is not installed")
+    network = Lpips()
+    perceptual._load_heads(network, Path(spec.origin).parent / "weights/v0.1/vgg.pth")
+    with pytest.raises(InputError, match="not the published"):
+        perceptual._load_heads(network, Path(spec.origin).parent / "weights/v0.0/vgg.pth")
