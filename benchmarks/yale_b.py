@@ -1,17 +1,14 @@
-"""Relight the real faces of Extended Yale B to its real point lights, and score that beside the peers.
+"""Relight the real faces of Extended Yale B to its real point lights, and hold checkpoints against the peers.
 
     python benchmarks/yale_b.py [--checkpoint SEED0 SEED1 ...] [--json FILE] [--jobs 2]
     python benchmarks/yale_b.py --subjects yaleB05 yaleB15 yaleB22   # for choosing settings: these alone
 
-Several checkpoints are seeds of one recipe: their mean is held against the bar, and each is shown. Every
-picture is measured by the benchmark's own score.py. `--out` keeps the pictures as that wants them,
-OUT/CHECKPOINT/SUBJECT/SOURCE/LIGHT.npy, 168x192, aligned with the source.
-
-Pictures are close to linear in light and taken as linear; a subject's sources share its frontal landmarks.
+The pictures and their figures are those of `facerf evaluate yale-b --shifts BENCH/shifts.csv`. Here several
+checkpoints are seeds of one recipe: their mean is held against bar and aim, and each is shown. `--out`
+keeps the pictures as the benchmark's own score.py wants them: OUT/CHECKPOINT/SUBJECT/SOURCE/LIGHT.npy.
 """
 
 import argparse
-import importlib
 import json
 import sys
 import time
@@ -21,33 +18,20 @@ from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from yale_table import Row, results, table
 
-from facerf_cli.face.landmarks import find_faces
-from facerf_cli.pipeline import (
-    Models,
-    crop_face,
-    explain_photo,
-    fit_face,
-    load_models,
-    predict_olat,
-    see_face,
-    see_head,
-    unwrap_face,
-    weigh_batches,
-)
-from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera
-from facerf_cli.raster.texture import inpaint, sample_texture
+from facerf_cli.errors import FacerfError
+from facerf_cli.evaluation.cases import Comparison
+from facerf_cli.evaluation.methods import Method
+from facerf_cli.evaluation.yale_b import compare_sitter
+from facerf_cli.metrics import si_mse, ssim
+from facerf_cli.pipeline import load_models
+from facerf_cli.stage.data.yale_b import YaleB, read_shifts, read_yale_b
 
 SHARED = Path("../shared")
-CROP_PX, TEXTURE_SIDE = 512, 256  # as the verbs have them
-_DARK = 0.02  # keeps ratios finite in the source's shadows
 
 
 @dataclass(frozen=True)
@@ -64,7 +48,7 @@ class Task:
 def main() -> None:
     given = _arguments()
     task = Task(given.data, given.bench, tuple(given.checkpoint or [None]), given.face_model, given.out)
-    everyone = load_yale(given.bench).Yale(str(given.data)).subjects
+    everyone = load_database(task.data, task.bench).subjects
     chosen = given.subjects or everyone
     if strangers := sorted(set(chosen) - set(everyone)):
         raise SystemExit(f"{', '.join(strangers)}: not in {given.data}")
@@ -87,7 +71,7 @@ def _arguments() -> argparse.Namespace:
     )
     add = parser.add_argument
     add("--data", type=Path, default=SHARED / "data/extended_yale_b", help="the yaleBXX folders")
-    add("--bench", type=Path, default=SHARED / "bench/yale_b", help="its yale.py and score.py")
+    add("--bench", type=Path, default=SHARED / "bench/yale_b", help="the folder of its shifts.csv")
     add("--checkpoint", type=Path, nargs="+", help="seeds of one recipe (default: the one shipped)")
     add("--face-model", default="builtin")
     add("--subjects", nargs="+", help="only these, such as yaleB05: no bar is held against them")
@@ -110,103 +94,51 @@ def _scored(task: Task, subjects: list[str], jobs: int) -> Iterator[list[list[Ro
         yield from pool.map(score_subject, [task] * len(subjects), subjects)
 
 
-def load_yale(bench: Path) -> ModuleType:
-    """The benchmark's own module of data, lights and cases."""
-    return load_bench(bench)[0]
+@lru_cache(maxsize=1)
+def load_database(data: Path, bench: Path) -> YaleB:
+    """The database, each picture moved onto its subject's frontal one as the benchmark does."""
+    try:
+        return read_yale_b(data, read_shifts(bench / "shifts.csv"))
+    except FacerfError as error:
+        raise SystemExit(f"{error} (--data and --bench say where)") from None
 
 
 @lru_cache(maxsize=1)
-def load_bench(bench: Path) -> tuple[ModuleType, ModuleType]:
-    """Its yale.py and its score.py."""
-    if not (bench / "yale.py").is_file():
-        raise SystemExit(f"{bench}: no yale.py there; give the benchmark's folder with --bench")
-    sys.path.insert(0, str(bench.resolve()))
-    return importlib.import_module("yale"), importlib.import_module("score")
-
-
-@lru_cache(maxsize=1)
-def _load_all(checkpoints: tuple[Path | None, ...], face_model: str) -> list[Models]:
-    return [load_models(path, face_model, torch.device("cpu")) for path in checkpoints]
+def _load_all(checkpoints: tuple[Path | None, ...], face_model: str) -> list[Method]:
+    """A method a checkpoint; several may share a stem."""
+    models = [load_models(path, face_model, torch.device("cpu")) for path in checkpoints]
+    return [Method(f"{number}-{each.checkpoint_name}", "field", each) for number, each in enumerate(models)]
 
 
 def score_subject(task: Task, subject: str) -> list[list[Row]]:
     """The measures of all of a subject's cases, for every checkpoint."""
-    yale, score = load_bench(task.bench)
-    data = yale.Yale(str(task.data))
-    frontal = np.repeat(data.source(subject, "frontal")[..., None], 3, -1)
-    landmarks_px = find_faces(frontal, subject)[0].landmarks_px
-    scored = []
-    for number, models in enumerate(_load_all(task.checkpoints, task.face_model)):
-        rows = []
-        for case, picture in relight_subject(models, yale, data, subject, landmarks_px):
-            name = dict(zip(("task", "source", "light"), case, strict=True))
-            measures = score.measure(picture, data.target(subject, name["light"]))
-            angle_deg = _angle_deg(yale, name["light"])
-            rows.append({"subject": subject, "angle_deg": angle_deg, **name, **measures})
+    methods = _load_all(task.checkpoints, task.face_model)
+    scored: list[list[Row]] = [[] for _ in methods]
+    for comparison in compare_sitter(load_database(task.data, task.bench), subject, methods):
+        for rows, method in zip(scored, methods, strict=True):
+            rows.append(_row(comparison, method.name))
             if task.out:
-                _keep(task.out / f"{number}-{models.checkpoint_name}" / subject, name, picture)
-        scored.append(rows)
+                _keep(task.out / method.name / f"{comparison.case.name}.npy", comparison, method.name)
     return scored
 
 
-def _angle_deg(yale: ModuleType, light: str) -> float | None:
-    """Between a single light and the camera."""
-    parsed = yale.parse_light(light)
-    return None if parsed is None else float(yale.angle_to_camera(*parsed))
+def _row(comparison: Comparison, method: str) -> Row:
+    facts, (subject, source, light) = comparison.case.facts, comparison.case.name.split("/")
+    pictures = comparison.predictions[method], comparison.truth, comparison.mask
+    return {
+        "subject": subject,
+        "angle_deg": facts.get("angle_deg"),
+        "task": "B" if facts["column"] == "environment" else "A",
+        "source": source,
+        "light": light,
+        "si_mse": si_mse(*pictures),
+        "ssim": ssim(*pictures),
+    }
 
 
-def _keep(folder: Path, name: dict[str, str], picture: np.ndarray) -> None:
-    (folder / name["source"]).mkdir(parents=True, exist_ok=True)
-    np.save(folder / name["source"] / f"{name['light']}.npy", picture)
-
-
-def relight_subject(
-    models: Models, yale: ModuleType, data: Any, subject: str, landmarks_px: np.ndarray
-) -> Iterator[tuple[tuple[str, str, str], np.ndarray]]:
-    """Every case of a subject (task, source, light), and its prediction [H, W]."""
-    lights = data.lights(subject)
-    directions = torch.tensor(np.array([yale.light_dir(*light) for light in lights]), dtype=torch.float32)
-    names = [yale.light_name(*light) for light in lights]
-    for source in yale.SOURCES:
-        cases = [case for case in data.cases(subject) if case[1] == source]
-        weights = torch.stack([target_weights(yale, names, lights, case[2]) for case in cases])
-        used = weights.sum(0) > 0
-        picture = data.source(subject, source)
-        predicted = relight(models, picture, landmarks_px, directions[used], weights[:, used])
-        yield from zip(cases, predicted.numpy(), strict=True)
-
-
-def target_weights(yale: ModuleType, names: list[str], lights: list[tuple[int, int]], target: str) -> Tensor:
-    """Weight [L] of every light of a subject under one target, a single light or an environment."""
-    if target in yale.ENV:
-        return torch.from_numpy(yale.env_weights(target, lights)).float()
-    return torch.tensor([float(name == target) for name in names])
-
-
-def relight(
-    models: Models, picture: np.ndarray, landmarks_px: np.ndarray, directions: Tensor, weights: Tensor
-) -> Tensor:
-    """Pictures [M, H, W] of a grey source [H, W] under M sums, weights [M, L], of lights [L, 3]."""
-    photo = np.repeat(picture[..., None], 3, -1).astype(np.float32)
-    crop, cropped = crop_face(photo, landmarks_px, CROP_PX)
-    fit = fit_face(models.face, crop, landmarks_px, photo.shape, see_head(models, cropped))
-    face = unwrap_face(models.face, fit, cropped, TEXTURE_SIDE, photo.shape)
-    grey_weights = weights[..., None].expand(-1, -1, 3)
-    textures = weigh_batches(
-        predict_olat(models, face, directions, quotient=explain_photo(models, face)), grey_weights
-    ).mean(1)  # [M, T, T]
-    height, width = picture.shape
-    centre_px = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
-    camera = Camera(CROP_FOCAL_PER_SIDE * crop.side_px, width, height, *centre_px)
-    uv, covered = see_face(fit.vertices_camera(models.face), camera)
-    relit = sample_texture(torch.cat([textures, face.texture.mean(0)[None]]), uv).permute(2, 0, 1)
-    return fill_uncovered(relit[:-1], relit[-1], torch.from_numpy(photo[..., 0]), covered)
-
-
-def fill_uncovered(relit: Tensor, source: Tensor, photo: Tensor, covered: Tensor) -> Tensor:
-    """Pictures [M, H, W] that go on beyond the mesh: the photo times the nearest change of light."""
-    change = inpaint((relit + _DARK) / (source + _DARK) * covered, covered)
-    return covered * relit + (1 - covered) * (change * (photo + _DARK) - _DARK).clamp_min(0)
+def _keep(path: Path, comparison: Comparison, method: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, comparison.predictions[method][..., 0])
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The columns of the Extended Yale B benchmark, what its README publishes of others, and a table of both."""
+"""The columns of the Extended Yale B benchmark, what it publishes of others, and a table of both."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,11 +6,13 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
+from facerf_cli.evaluation.yale_b_cases import ANGLES_DEG
+from facerf_cli.evaluation.yale_b_published import FIGURES, PEERS
 from facerf_cli.intervals import average, mean_interval
 
-Row = dict[str, Any]  # a picture: subject, task, source, light, angle_deg, and score.py's measures
+Row = dict[str, Any]  # a picture: subject, task, source, light, angle_deg, si_mse, ssim
 
-ANGLES_DEG = (0, 15, 30, 45, 60, 80)
+QUOTIENT = "quotient image"  # told more than a single photo may know
 
 
 @dataclass(frozen=True)
@@ -34,17 +36,23 @@ def _between(low: int, high: int, row: Row) -> bool:
 
 
 _BINS = list(pairwise(ANGLES_DEG))
-_DPR = ((0.0111, 0.686), (0.0131, 0.641), (0.0145, 0.729)), (0.0057, 0.0080, 0.0122, 0.0164, 0.0155)
-_GEOM = ((0.0119, 0.674), (0.0151, 0.629), (0.0145, 0.709)), (0.0055, 0.0101, 0.0139, 0.0178, 0.0145)
-_QUOTIENT = ((0.0074, 0.751), (0.0093, 0.724), (0.0078, 0.789)), (0.0024, 0.0046, 0.0094, 0.0120, 0.0105)
 _AIMS = (0.0065, 0.0068, 0.0072)
+
+
+def _at(method: str, column: int) -> tuple[float, float]:
+    return FIGURES[method][0][column]
+
+
+def _at_angle(method: str, place: int) -> tuple[float, None]:
+    return FIGURES[method][1][place], None
+
 
 COLUMNS = [
     Column(
         name,
         partial(_of, task, sources),
-        {"DPR": _DPR[0][i], "GeomConsistentFR": _GEOM[0][i]},
-        _QUOTIENT[0][i],
+        {peer: _at(peer, i) for peer in PEERS},
+        _at(QUOTIENT, i),
         _AIMS[i],
     )
     for i, (name, task, sources) in enumerate(
@@ -54,8 +62,8 @@ COLUMNS = [
     Column(
         f"{low}-{high} deg",
         partial(_between, low, high),
-        {"DPR": (_DPR[1][i], None), "GeomConsistentFR": (_GEOM[1][i], None)},
-        (_QUOTIENT[1][i], None),
+        {peer: _at_angle(peer, i) for peer in PEERS},
+        _at_angle(QUOTIENT, i),
     )
     for i, (low, high) in enumerate(_BINS)
 ]

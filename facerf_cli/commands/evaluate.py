@@ -10,6 +10,8 @@ from facerf_cli.commands.evaluate_pairs import WITHOUT as NOT_OF_PAIRS
 from facerf_cli.commands.evaluate_pairs import pairs
 from facerf_cli.commands.evaluate_reconstruction import reconstruction
 from facerf_cli.commands.evaluate_transfer import transfer
+from facerf_cli.commands.evaluate_yale_b import WITHOUT as NOT_OF_YALE_B
+from facerf_cli.commands.evaluate_yale_b import yale_b
 from facerf_cli.commands.evaluation_options import with_shared_options
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' pictures.")
@@ -21,6 +23,7 @@ PROTOCOLS: tuple[tuple[Callable[..., int], tuple[str, ...]], ...] = (
     (reconstruction, ()),
     (transfer, ()),
     (geometry, ()),
+    (yale_b, NOT_OF_YALE_B),
     (pairs, NOT_OF_PAIRS),
 )
 _EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."

@@ -1,0 +1,100 @@
+"""`facerf evaluate yale-b`: real people relit to the real point lights of Extended Yale B."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from facerf_cli.commands.evaluation_items import MethodOptions, load_methods
+from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.evaluation_run import run_protocol
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.options import FaceModelOption, settings_of
+from facerf_cli.commands.photo import PhotoOptions
+from facerf_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from facerf_cli.evaluation.cases import Comparison
+    from facerf_cli.stage.data.yale_b import YaleB
+
+WITHOUT = ("keep_eyes", "preset")  # the mask is one ellipse, and the paper has no such figures
+
+
+def yale_b(
+    context: typer.Context,
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="The cropped Extended Yale Face Database B: the folder with yaleB01, yaleB02 and so on.",
+            show_default=False,
+        ),
+    ],
+    options: EvaluateOptions,
+    shifts: Annotated[
+        Path | None,
+        typer.Option(
+            "--shifts",
+            metavar="CSV",
+            help="Where heads drifted: rows subject,light,dy,dx, pixels down and right that move a picture "
+            "onto its subject's frontal one.",
+            show_default="pictures as they are",
+        ),
+    ] = None,
+    subjects: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--subjects",
+            metavar="NAME,...",
+            help="Only these, such as yaleB05,yaleB15; may be given several times.",
+            show_default="all",
+        ),
+    ] = None,
+    network_alone: Annotated[
+        bool, typer.Option("--network-alone", help="Do not hold the field to the photo, as `relight` does.")
+    ] = False,
+    face_model: FaceModelOption = "builtin",
+) -> int:
+    """Relight real people to real point lights and compare with their photos under these.
+
+    Sources are a picture under one flash and four soft lights summed from the subject's own pictures; targets
+    are single flashes and four environments. Lights are given, not estimated. Pictures are taken as linear,
+    as they measure, and are compared inside one ellipse, open eyes too. Cases are SUBJECT/SOURCE/LIGHT; the
+    rows of other methods were published for the same pictures. Predictions that are given by --compare may
+    be made from the sources that --pictures keeps. The database is for research and is never trained on.
+    """
+    from facerf_cli.evaluation.yale_b import layout
+    from facerf_cli.stage.data.yale_b import read_shifts, read_yale_b
+
+    settings = settings_of(context)
+    database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
+    chosen = _chosen(database, subjects or [])
+    photo = PhotoOptions(settings, face_model=face_model)
+    work = _YaleB(MethodOptions.of(photo, options), database, network_alone)
+    items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
+    return run_protocol(layout(database, chosen, network_alone), items, work, options, settings)
+
+
+def _chosen(database: "YaleB", given: Sequence[str]) -> list[str]:
+    """The subjects that are asked for; UsageError for one that is not there."""
+    wanted = {name.strip() for entry in given for name in entry.split(",") if name.strip()}
+    if strangers := sorted(wanted - set(database.subjects)):
+        there = ", ".join(database.subjects)
+        raise UsageError(f"--subjects {', '.join(strangers)}: not in {database.folder}; there are {there}")
+    return [name for name in database.subjects if not wanted or name in wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class _YaleB:
+    """Compares one subject's cases."""
+
+    methods: MethodOptions
+    database: "YaleB"
+    network_alone: bool
+
+    def __call__(self, item: Item) -> "Iterator[Comparison]":
+        from facerf_cli.evaluation.yale_b import compare_sitter
+
+        return compare_sitter(self.database, item.name, load_methods(self.methods), not self.network_alone)
