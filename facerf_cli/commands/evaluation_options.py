@@ -30,8 +30,8 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         metavar="KIND",
-        help="Reflectance model: field, diffuse-sh, specular-sh or prt. May be given several times; the first "
-        "is what the others are held against.",
+        help="field, diffuse-sh, specular-sh or prt; may be given several times, and the first is what "
+        "the others are held against.",
         show_default="field",
     ),
 ]
