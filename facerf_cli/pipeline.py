@@ -5,7 +5,7 @@ photo -> crop_face -> fit_face -> unwrap_face (-> explain_photo) -> predict_olat
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -144,6 +144,17 @@ def unwrap_face(
     return FaceTexture(inpaint(texture, visible), visible, normals)
 
 
+def leave_out(model: MorphableModel, fit: FaceFit, face: FaceTexture, shown: np.ndarray) -> FaceTexture:
+    """The texture without what a mask [S, S] of the crop, 0 to 1, leaves out: filled in from around it."""
+    mask = torch.from_numpy(shown.astype(np.float32))[None]
+    side = face.texture.shape[-1]
+    kept = unwrap(mask, fit.vertices_camera(model), grid_triangles(), fit.camera, side)[0][0]
+    visible = face.visible * (kept > _SEEN_WELL)
+    if visible.max() < 0.5:
+        raise InputError("the face is masked out: nothing of it is left to look at")
+    return FaceTexture(inpaint(face.texture, visible), visible, face.normals)
+
+
 def explain_photo(models: Models, face: FaceTexture) -> Quotient:
     """What the field lacks of the face's own photo, for `predict_olat` to give back.
 
@@ -168,7 +179,13 @@ def estimate_photo_light(
 
 
 def light_evidence(models: Models, face: FaceTexture, rig: Tensor, keep_eyes: bool = False) -> LightEvidence:
-    """What the light of the face's photo is read from, over lights [L, 3], on small textures.
+    """What the light of the face's photo is read from, over lights [L, 3], on small textures."""
+    seen = evidence_of_photo(face, keep_eyes)
+    return replace(seen, directions=rig, olats=torch.cat(list(predict_olat(models, _shrunk(face), rig))))
+
+
+def evidence_of_photo(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
+    """The photo's side of the evidence, without any light; InputError where too little of a face is seen.
 
     The mask is the interior of the face where the photo shows it well. Without `keep_eyes` the eyes are left
     out, for the field of open eyes is not learnt (paper, 'Results').
@@ -177,9 +194,9 @@ def light_evidence(models: Models, face: FaceTexture, rig: Tensor, keep_eyes: bo
     mask = (small.visible > _SEEN_WELL) & (interior_texture(_EXPLAINED_SIDE)[0] > 0.5)
     if not keep_eyes:
         mask &= region_mask("eyes", _EXPLAINED_SIDE) < 0.5
-    nothing = torch.zeros(0, 3, *mask.shape)
-    LightEvidence(rig, nothing, small.texture, mask).require_a_face()  # before the field is predicted
-    return LightEvidence(rig, torch.cat(list(predict_olat(models, small, rig))), small.texture, mask)
+    evidence = LightEvidence(torch.zeros(0, 3), torch.zeros(0, 3, *mask.shape), small.texture, mask)
+    evidence.require_a_face()
+    return evidence
 
 
 def refine_photo_light(

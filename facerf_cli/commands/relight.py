@@ -24,8 +24,9 @@ from facerf_cli.commands.photo import (
     TextureSizeOption,
     load_models_once,
 )
+from facerf_cli.commands.photo_light import LightOptions, of_other_photos
 from facerf_cli.commands.relight_item import Composite, Relight
-from facerf_cli.commands.shots import Sampling, collect_shots, usable, write_balls
+from facerf_cli.commands.shots import Sampling, collect_shots, photo_lights, usable, write_balls
 from facerf_cli.commands.values import numbers, parse_directions, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
@@ -52,6 +53,16 @@ def relight(
             metavar="AZ,EL[,R,G,B][;...]",
             help="A picture under a single light from azimuth and elevation in degrees (AZ > 0: from the "
             "picture's right), or under several that shine together, with ; between them. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    light_from: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--light-from",
+            metavar="PHOTO|DIR",
+            help="The light of another photo's largest face, as `facerf estimate-light` reads it by default "
+            "(with this --reflectance); it turns and has balls as a map. May be repeated.",
             show_default=False,
         ),
     ] = None,
@@ -146,8 +157,9 @@ def relight(
     photo.check()
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file")
-    asked = collect_shots(envmap or (), rotate, light or (), output, settings.seed)
-    shots = usable(asked)
+    lit = photo_lights(light_from or (), output, LightOptions(of_other_photos(photo), reflectance))
+    asked = collect_shots(envmap or (), rotate, light or (), output, settings.seed, lit)
+    shots = asked if dry_run and lit else usable(asked)  # a photo's light takes its time
     if not shots:
         raise FacerfError("no map can be used")
     mode: Composite = composite or ("photo" if pose is None else "face")

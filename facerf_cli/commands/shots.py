@@ -5,12 +5,13 @@ import logging
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from facerf_cli.commands.inputs import Item, collect_items
+from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.commands.photo_light import LightOptions, light_of_photo
 from facerf_cli.commands.values import azel, numbers, parse_directions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import LOGGER_NAME, Provenance
@@ -22,6 +23,7 @@ MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "paper"]
 BALL_PX = 256
 DRAWN, DRAWN_WIDTH_PX = "procedural:", 512
+LIGHT_WIDTH_PX = 512  # of the map of a photo's light
 _MOST_FRAMES = 9999
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)")  # a name, and the frame numbers that it ends in
 log = logging.getLogger(LOGGER_NAME)
@@ -37,12 +39,21 @@ class DrawnMap:
 
 
 @dataclass(frozen=True)
+class PhotoLight:
+    """The light of a photo, estimated when it is read; its map is what `facerf estimate-light` writes."""
+
+    name: str
+    path: Path
+    options: LightOptions
+
+
+@dataclass(frozen=True)
 class Shot:
     """One picture of every photo: under a map, turned, or under lamps (azimuth, elevation, r, g, b)."""
 
     name: str  # of the light
     frame: str = ""  # '.0001': frame numbers, which end a file's name
-    envmap: Path | DrawnMap | None = None
+    envmap: Path | DrawnMap | PhotoLight | None = None
     rotate_deg: float = 0.0
     lamps: tuple[tuple[float, ...], ...] = ()
 
@@ -60,9 +71,14 @@ def split_frame(name: str) -> tuple[str, str]:
 
 
 def collect_shots(
-    envmaps: Sequence[str], rotate: str | None, lamps: Sequence[str], output: Path, seed: int = 0
+    envmaps: Sequence[str],
+    rotate: str | None,
+    lamps: Sequence[str],
+    output: Path,
+    seed: int = 0,
+    lit: Sequence[PhotoLight] = (),
 ) -> tuple[Shot, ...]:
-    """All pictures that the options ask for; maps are named here and read, or drawn from `seed`, later."""
+    """All pictures that the options ask for; maps are named here and read, drawn or estimated later."""
     rotations = parse_rotations(rotate)
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
     paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
@@ -79,9 +95,14 @@ def collect_shots(
         shots += [
             Shot(name + turn, frame + number, item.input_path, degrees) for turn, number, degrees in rotations
         ]
+    shots += [
+        Shot(photo.name + turn, number, photo, degrees)
+        for photo in lit
+        for turn, number, degrees in rotations
+    ]
     shots += map(_lamp_shot, lamps)
     if not shots:
-        raise UsageError("no light: give --envmap or --light")
+        raise UsageError("no light: give --envmap, --light or --light-from")
     names = [shot.name + shot.frame for shot in shots]
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two pictures would be called {min(twice)}; give each light once")
@@ -98,6 +119,13 @@ def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
     if most > _MOST_FRAMES:
         raise UsageError(f"--envmap {DRAWN}{most}: {_MOST_FRAMES} maps at most")
     return [DrawnMap(f"{index:05d}_{kind_of(index, seed)}", index, seed) for index in range(most)]
+
+
+def photo_lights(entries: Sequence[str], output: Path, options: LightOptions) -> list[PhotoLight]:
+    """The lights of photos: files, folders or quoted patterns; called as `estimate-light` calls its maps."""
+    paths = [path for entry in entries for path in _expand_glob(entry)]
+    items = collect_items(paths, output, PHOTO_SUFFIXES) if paths else []
+    return [PhotoLight(f"{item.name.replace('/', '_')}_light", item.input_path, options) for item in items]
 
 
 def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
@@ -121,7 +149,7 @@ def usable(shots: Iterable[Shot]) -> tuple[Shot, ...]:
     good: list[Shot] = []
     for path, group in groupby(shots, lambda shot: shot.envmap):
         try:
-            if isinstance(path, Path):
+            if isinstance(path, (Path, PhotoLight)):
                 read_map(path)
             good += group
         except InputError as error:
@@ -129,8 +157,10 @@ def usable(shots: Iterable[Shot]) -> tuple[Shot, ...]:
     return tuple(good)
 
 
-def read_map(path: Path | DrawnMap) -> "Tensor":
+def read_map(path: Path | DrawnMap | PhotoLight) -> "Tensor":
     """A lat-long map [H, W, 3], linear; an InputError names what is wrong with it."""
+    if isinstance(path, PhotoLight):
+        return _map_of_photo(path)
     if isinstance(path, DrawnMap):
         import torch
 
@@ -140,6 +170,14 @@ def read_map(path: Path | DrawnMap) -> "Tensor":
     from facerf_cli.stage.map_files import read_map_file
 
     return read_map_file(path)
+
+
+@cache
+def _map_of_photo(photo: PhotoLight) -> "Tensor":
+    """Estimated once a process; in the half floats of the file that `facerf estimate-light` writes."""
+    from facerf_cli.light.rig_latlong import rig_to_latlong
+
+    return rig_to_latlong(light_of_photo(photo.path, photo.options), LIGHT_WIDTH_PX // 2).half().float()
 
 
 @lru_cache(maxsize=1)

@@ -55,12 +55,11 @@ class LightEvidence:
         """The face under weights [L, 3], as it is explained: [3, T, T]."""
         return torch.einsum("lc,lcij->cij", weights, self.olats)
 
-    def residual(self, weights: Tensor) -> float:
-        """|explained - photo| / |photo| inside the mask; beyond white nothing is asked of clipped texels."""
-        photo = self.photo[:, self.mask]
-        explained = self.relit(weights)[:, self.mask]
-        clipped = self.clipped[:, self.mask]
-        error = torch.where(clipped, (explained - photo).clamp(max=0), explained - photo)
+    def residual(self, explained: Tensor) -> float:
+        """|explained [3, T, T] - photo| / |photo| in the mask; of clipped texels only what is too dark."""
+        photo, clipped = self.photo[:, self.mask], self.clipped[:, self.mask]
+        error = explained[:, self.mask] - photo
+        error = torch.where(clipped, error.clamp(max=0), error)
         return float(error.norm() / photo.norm().clamp_min(1e-12))
 
     def least_squares(self, non_negative: bool = True) -> Tensor:
