@@ -47,13 +47,18 @@ def rotated_weights(
     """`envmap_weights` at many rotations [R, L, 3]; what does not turn is computed once."""
     if sampling == "paper":
         return torch.stack([_pixel_weights(envmap, directions, rotation) for rotation in rotations_deg])
-    height = max(256, 2 * math.ceil(8 * math.sqrt(len(directions))))  # dozens of texels a cell at the least
+    height = cell_rows(len(directions))
     cell = nearest_light(directions, height, 2 * height).reshape(-1)
     rows = _RowIntegrals(envmap, height)
     weights = torch.zeros(len(rotations_deg), len(directions), 3, dtype=torch.float64)
     for weight, rotation_deg in zip(weights, rotations_deg, strict=True):
         weight.index_add_(0, cell, rows.turned(2 * height, rotation_deg).reshape(-1, 3) / math.pi)
     return weights.float()
+
+
+def cell_rows(lights: int) -> int:
+    """Rows of the grid on which cells are told apart: dozens of texels a cell at the least."""
+    return max(256, 2 * math.ceil(8 * math.sqrt(lights)))
 
 
 def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:

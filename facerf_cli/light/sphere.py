@@ -25,14 +25,15 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
     """
     if n < 1:
         raise ValueError(f"a rig needs at least one light, not {n}")
-    points = _golden_spiral(n)
+    points = golden_spiral(n)
     if n > 1:
         for step in range(_RELAX_STEPS):
             points = _repel(points, 0.2 * (1 - step / _RELAX_STEPS))
     return torch.from_numpy(points).float()
 
 
-def _golden_spiral(lights: int) -> np.ndarray:
+def golden_spiral(lights: int) -> np.ndarray:
+    """Unit vectors [lights, 3] in a spiral about +y, each with an equal share of the sphere."""
     index = np.arange(lights)
     azimuth = index * math.pi * (3 - math.sqrt(5))
     y = 1 - (2 * index + 1) / lights
