@@ -1,7 +1,7 @@
 """An evaluation's tables on the terminal: plain text when piped."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -22,9 +22,10 @@ def print_tables(summary: "Summary") -> None:
     layout = summary.layout
     pictures, persons = _count(summary.pictures, "picture"), _count(summary.persons, "person")
     console.print(Text(f"{layout.title}: {pictures} of {persons}", style="bold"))
-    for metric in layout.metrics:
-        if metric in summary.metrics:
-            console.print(_table(summary, metric, plain=not terminal))
+    first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
+    console.print(_table(summary, first, summary.groups, plain=not terminal))
+    for metric in others:
+        console.print(_table(summary, metric, summary.groups[:1], plain=not terminal))
     measured_on = dict.fromkeys(f"{figure.source}: {figure.data}" for figure in layout.published)
     if measured_on:
         console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
@@ -37,24 +38,25 @@ def _count(number: int, thing: str) -> str:
     return f"{number} {thing if number == 1 else plural}"
 
 
-def _table(summary: "Summary", metric: str, plain: bool) -> Table:
+def _table(summary: "Summary", metric: str, groups: "Sequence[Group]", plain: bool) -> Table:
     from facerf_cli.evaluation.summary import shown_as
 
     how = shown_as(metric)
     better = "less" if how.lower_is_better else "more"
     table = Table(
-        title=Text(f"{how.title} ({better} is better)"),
+        title=Text(f"\n{how.title} ({better} is better)"),
         title_justify="left",
         box=None if plain else box.SIMPLE_HEAD,
         pad_edge=False,
+        padding=(0, 1, 0, 0),
         expand=False,
     )
-    table.add_column("pictures", overflow="fold", max_width=24)
+    table.add_column("pictures", overflow="fold", min_width=20, max_width=26)
     table.add_column("method", overflow="fold", max_width=20)
-    for name in ("n", "mean", "sd", "median", "95 % interval", "less the first", "won"):
+    for name in ("n", "mean", "sd", "median", "95 % interval", "vs first", "won"):
         table.add_column(name, justify="right", no_wrap=True)
     several = len(summary.methods) > 1
-    for group in summary.groups:
+    for group in groups:
         for row in _rows(summary, group, metric):
             table.add_row(*(Text(entry) for entry in row))
     if not several:

@@ -63,16 +63,14 @@ def _head(summary: Summary, about: About, title: str) -> Iterator[str]:
 
 def _results(summary: Summary) -> Iterator[str]:
     """Every metric of the layout over all pictures."""
+    against = ""
+    if len(summary.methods) > 1:
+        first = escape(summary.methods[0])
+        against = f" Differences to {first} are on the same pictures; “won” is the share that is better."
     yield (
         '<p class="soft">Intervals are of the mean, by drawing people anew with all of their pictures '
-        "(bootstrap, 10 000 draws). "
-        + (
-            f"“Less the first” is a method's value less that of {escape(summary.methods[0])} on the same "
-            "pictures; “won” is the share of pictures on which it is the better one."
-            if len(summary.methods) > 1
-            else ""
-        )
-        + "</p>"
+        "(bootstrap). In the drawings the line spans 5 to 95 % of the pictures, the box their middle half; "
+        f"the bar is the median, the dot the mean.{against}</p>"
     )
     for metric in summary.layout.metrics:
         if metric in summary.metrics:
@@ -98,14 +96,15 @@ def _groups(summary: Summary) -> Iterator[str]:
 
 def _pictures(summary: Summary, chosen: Chosen, jpegs: Mapping[str, bytes]) -> Iterator[str]:
     how, first = shown_as(summary.metrics[0]), escape(summary.methods[0])
-    yield '<h2 id="worst">Worst cases</h2>'
+    everything = not (chosen.typical or chosen.best)
+    yield f'<h2 id="worst">{"All cases, the worst first" if everything else "Worst cases"}</h2>'
     if not chosen.worst:
         yield "<p>No pictures were kept.</p>"
         return
     yield (
-        f"<p>By {escape(how.title)} of {first}, the worst first. All pictures of a case are at the truth's "
-        "exposure, and a method's at the scale of its comparison where Si-MSE is what is compared; grey is "
-        "left out of the comparison. Predictions are synthetic. images.csv has every picture's figures.</p>"
+        f"<p>By {escape(how.title)} of {first}. All pictures of a case are at the truth's exposure, a "
+        "method's times the scale that Si-MSE compares it at, where that is the metric; grey is left out of the "
+        "comparison. Predictions are synthetic. images.csv has every picture's figures.</p>"
     )
     yield (
         '<p class="scale"><span>Error</span> 0 <i></i> '

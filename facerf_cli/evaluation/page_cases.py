@@ -49,10 +49,10 @@ def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[KeptStrip], w
 
     cases = [CasePicture(strip, tuple(of_case[strip.case])) for strip in strips if strip.case in of_case]
     cases = sorted(cases, key=lambda case: (-badness(case), case.strip.case))
-    shown = cases[: max(1, min(worst, len(cases) - BEST - TYPICAL))] if len(cases) > 1 else cases
-    rest = cases[len(shown) :]
-    best = rest[max(0, len(rest) - BEST) :][::-1]
-    between = rest[: len(rest) - len(best)]
+    if len(cases) <= worst + TYPICAL + BEST:
+        return Chosen(tuple(cases), (), ())
+    shown, rest = cases[:worst], cases[worst:]
+    between, best = rest[:-BEST], rest[-BEST:][::-1]
     cell = summary.groups[0].cells[metric].get(first)
     median = sign * cell.interval.median if cell else 0.0
     typical = sorted(between, key=lambda case: abs(badness(case) - median))[:TYPICAL]
@@ -94,7 +94,7 @@ def _column_head(summary: Summary, method: str, scale: float, row: Row | None) -
     how = shown_as(metric)
     value = row.values.get(metric) if row else None
     figure = "" if value is None else f"{how.title} {value:.{how.digits}f}"
-    scaled = "" if scale == 1 else f", shown at {scale:.2f}"
+    scaled = "" if scale == 1 else f", shown times {scale:.3g}"
     return (
         f"<div><b>{dot(colour_of(summary, method))}{escape(method)}</b>"
         f"{escape(figure + scaled)}; error below</div>"

@@ -13,7 +13,7 @@ STYLE = (
 @media (prefers-color-scheme: dark) { :root { --paper: #15181c; --ink: #e6e8eb; --soft: #a3abb6;
   --line: #363c45; --band: #1e2228; --link: #7dbdf5; --mark: #f0c674; --marked: #2c2616 } }
 * { box-sizing: border-box }
-body { margin: 0 auto; padding: 2rem 1.25rem 4rem; max-width: 72rem; background: var(--paper);
+body { margin: 0 auto; padding: 2rem 1.25rem 4rem; max-width: 80rem; background: var(--paper);
   color: var(--ink); font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif }
 h1 { font-size: 1.75rem; line-height: 1.2; margin: 0 0 .25rem }
 h2 { font-size: 1.25rem; margin: 2.75rem 0 .5rem; padding-top: .75rem; border-top: 1px solid var(--line) }
@@ -25,14 +25,15 @@ pre { background: var(--band); border: 1px solid var(--line); border-radius: 6px
   overflow-x: auto; white-space: pre-wrap; overflow-wrap: anywhere; font-size: .85rem; margin: .75rem 0 }
 nav ul { list-style: none; display: flex; flex-wrap: wrap; gap: .25rem 1.25rem; padding: 0; margin: 1rem 0 0 }
 .scroll { overflow-x: auto; margin: .5rem 0 1rem }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums; width: 100% }
+table { border-collapse: collapse; font-size: .85rem; font-variant-numeric: tabular-nums; width: 100% }
 caption { text-align: left; padding: 0 0 .4rem }
-th, td { padding: .3rem .7rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line) }
+th, td { padding: .3rem .55rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--line) }
 thead th { color: var(--soft); font-weight: 600; border-bottom: 2px solid var(--line) }
 th:first-child, td:first-child, th.text, td.text { text-align: left }
 tbody th { font-weight: 600 } tbody.group th { border-bottom-color: transparent }
 tr.published td, tr.published th { background: var(--marked); color: var(--mark); font-weight: 400 }
-td.chart { width: 28%; min-width: 11rem; padding: 0 .7rem }
+td.data { text-align: left; white-space: normal }
+td.chart { width: 22%; min-width: 8.5rem; padding: 0 .7rem }
 td.chart svg { display: block; width: 100%; height: 1.6rem; overflow: visible }
 .dot { display: inline-block; width: .7em; height: .7em; border-radius: 50%; margin-right: .5em }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; margin: .75rem 0;

@@ -27,15 +27,16 @@ def metric_table(summary: Summary, metric: str, groups: list[Group]) -> Iterator
     how = shown_as(metric)
     axis = _axis(groups, metric)
     several = len(summary.methods) > 1
-    heads = ["pictures", "mean", "sd", "median", "95 % interval of the mean"]
-    heads += ["less the first (95 % interval)", "won"] if several else []
+    heads = ["pictures", "spread", "mean", "sd", "median", "95 % interval"]
+    heads += [f"difference to {escape(summary.methods[0])} (95 % interval)", "won"] if several else []
     by_fact = bool(groups[0].fact)
     better = "less is better" if how.lower_is_better else "more is better"
     yield '<div class="scroll" tabindex="0" role="region" aria-label="' + escape(how.title) + '"><table>'
-    yield f"<caption>{escape(how.title)}; {better}. {_axis_words(how, axis)}</caption>"
+    title = escape(how.title[:1].upper() + how.title[1:])
+    yield f"<caption><b>{title}</b>, {better}; {_axis_words(how, axis)}</caption>"
     yield "<thead><tr>" + (f'<th scope="col">{escape(groups[0].fact)}</th>' if by_fact else "")
     yield '<th scope="col" class="text">method</th>'
-    yield "".join(f'<th scope="col">{head}</th>' for head in [*heads[:1], "spread", *heads[1:]])
+    yield "".join(f'<th scope="col">{head}</th>' for head in heads)
     yield "</tr></thead>"
     for group in groups:
         yield from _group(summary, group, metric, axis, by_fact, several)
@@ -57,10 +58,7 @@ def _axis(groups: list[Group], metric: str) -> tuple[float, float]:
 
 def _axis_words(how: Metric, axis: tuple[float, float]) -> str:
     low, high = (f"{value:.{how.digits}f}" for value in axis)
-    return (
-        f"The drawing runs from {low} to {high}: line 5 to 95 % of the pictures, box the middle half, "
-        "bar the median, dot the mean."
-    )
+    return f"drawn from {low} to {high}"
 
 
 def _group(
@@ -82,7 +80,7 @@ def _group(
         sd = "" if figure.sd is None else f"{figure.sd:.{digits}f}"
         empty = "<td></td>" * (4 if several else 2)
         name = f"{escape(figure.method)}, published ({escape(figure.source)})"
-        yield f'<tr class="published"><td class="text">{name}</td><td></td><td class="text">'
+        yield f'<tr class="published"><td class="text">{name}</td><td></td><td class="data">'
         yield f"{escape(figure.data)}</td><td>{figure.mean:.{digits}f}</td><td>{sd}</td>{empty}</tr>"
     yield "</tbody>"
 

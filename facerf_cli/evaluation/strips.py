@@ -12,7 +12,7 @@ from facerf_cli.metrics import best_scale
 ERROR_HIGHEST = 0.2  # of display values 0..1: where the false colours end
 # Dark to bright through violet and orange, in lightness that only rises, so that it also reads in grey.
 ERROR_COLOURS = ((8, 6, 20), (87, 22, 110), (187, 55, 84), (249, 142, 9), (252, 250, 176))
-_TILE_PX = 160
+_TILE_PX = 192
 _GAP_PX = 4
 _PAPER = 0.16  # display value of what is left out of the comparison
 
