@@ -20,6 +20,7 @@ from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.diffuse import ORDER, DiffuseNetwork, shading
+from facerf_cli.network.inputs import resize
 from facerf_cli.network.saved import load_networks
 from facerf_cli.pipeline import FaceTexture, Models
 
@@ -40,17 +41,23 @@ class Diffuse:
         return self.albedo * shading(normals[None], torch.stack(coefficients)[None])[0]
 
 
-@torch.no_grad()
 def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
-    """Albedo and light of a face's photo; the light as signed weights over the paper's 150 lights.
+    """Albedo and light of a face's photo by the network that is shipped; `fit` is not needed."""
+    return explain_texture(load_diffuse_network(CHECKPOINT).to(models.device), face)
 
-    The albedo has the network's 128 texels a side: what is finer is not brought in from the photo, for that
-    would put the photo's own shadows and highlights into every picture (and its error there to nothing).
+
+@torch.no_grad()
+def explain_texture(network: DiffuseNetwork, face: FaceTexture, fine: bool = True) -> Explained:
+    """Albedo and light of a texture; the light as signed weights over the paper's 150 lights.
+
+    `fine`: the network's gain and bias are applied at the texture's own side; else at the network's.
     """
-    network = load_diffuse_network(CHECKPOINT).to(models.device)
-    inputs = (face.texture[None], face.normals[None], face.visible[None, None])
-    estimate = network(*(tensor.to(models.device) for tensor in inputs))
-    albedo = (estimate.albedo * estimate.exposure)[0].cpu()
+    device, side = next(network.parameters()).device, face.texture.shape[-1]
+    inputs = [x[None].to(device) for x in (face.texture, face.normals, face.visible[None])]
+    if not fine:
+        inputs = [resize(x, network.settings.side) for x in inputs]
+    estimate = network(*inputs)
+    albedo = resize(estimate.albedo * estimate.exposure, side)[0].cpu()
     rig = rig_directions()
     light = RigLight(rig, coefficients_to_rig(estimate.coefficients[0].cpu(), rig))
     return Explained(Diffuse(albedo, face.normals), light)

@@ -74,6 +74,10 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
             ["--stage", "light-features", "--mean-face"],
             "--mean-face means nothing to the stage light",
         ),
+        (
+            ["--stage", "diffuse-sh", "--without-normals"],
+            "--without-normals means nothing to the stage diffuse-sh",
+        ),
         (["--dataset", "d", "--mean-face"], "--mean-face: a dataset was fitted already"),
         (
             ["--without-normals", "--start-from", "f"],
@@ -153,7 +157,7 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
 
 
 @pytest.mark.parametrize(
-    "stage", [pytest.param("geometry", marks=pytest.mark.slow), "light-features", "reflectance"]
+    "stage", [pytest.param("geometry", marks=pytest.mark.slow), "light-features", "reflectance", "diffuse-sh"]
 )
 def test_a_stage_carries_over_the_networks_of_others(run: Path, tmp_path: Path, stage: str) -> None:
     line = ["train", "-o", str(tmp_path / "run"), "--stage", stage, *TINY, "--bank", str(run / "bank")]

@@ -6,6 +6,7 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.checkpoints import save_checkpoint
+from facerf_cli.network.diffuse import DiffuseNetwork
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
 from facerf_cli.network.paper_reflectance import PaperReflectanceSettings
@@ -17,6 +18,7 @@ DESCRIBED: dict[str, dict[str, Any]] = {
     "paper": {"form": "paper", **PaperReflectanceSettings().__dict__},
     "geometry": {"form": "default", **GeometrySettings().__dict__},
     "light_features": LightNetwork().as_metadata(),
+    "diffuse_sh": DiffuseNetwork().as_metadata(),
 }
 NONSENSE = [[], [0], [[1]], [1e400], -1, 1e30, 10**30, float("inf"), float("nan"), "x", None, {"a": 1}]
 
