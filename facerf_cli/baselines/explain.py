@@ -1,7 +1,11 @@
 """A photo explained by the reflectance model of one's choice."""
 
+from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.field import explain_by_field
-from facerf_cli.baselines.reflectance import Explained, Kind
+from facerf_cli.baselines.kinds import Kind
+from facerf_cli.baselines.prt import explain_by_prt
+from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.pipeline import FaceTexture, Models
 
@@ -16,4 +20,8 @@ def explain(
     """
     if kind == "field":
         return explain_by_field(models, face, held_to_photo)
-    raise NotImplementedError(kind)
+    if kind == "specular-sh":
+        return explain_by_specular_sh(models, fit, face)
+    if kind == "prt":
+        return explain_by_prt(models, fit, face)
+    return explain_by_diffuse_sh(models, fit, face)

@@ -1,0 +1,90 @@
+"""A diffuse face that shadows itself, in the light of spherical harmonics: precomputed radiance transfer.
+
+The assumption of Schneider et al. (*Efficient Global Illumination for Morphable Models*, ICCV 2017), one of
+the three that the paper compares with, on this project's fitted mesh and priors; their code and models are
+not used, and where they learn the transfer of a morphable model, here each mesh's own is baked
+(`baked_transfer.py`), with one bounce off a face of its mean albedo.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.baselines.albedo import SIDE, skin_prior
+from facerf_cli.baselines.baked_transfer import TransferSettings, baked_transfer
+from facerf_cli.baselines.light_prior import light_prior
+from facerf_cli.baselines.photo_texels import coarse, with_detail
+from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.synthesis import Scene, Solution, SolveSettings, solve
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.sh import coefficients_to_rig, rotated, sh_basis
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.pipeline import FaceTexture, Models
+
+SETTINGS, BAKE = SolveSettings(), TransferSettings()
+DETAIL = 0.5  # of what the prior lacks of the photo
+_ROUNDS = 2  # of the face's mean albedo, which tints its bounce
+
+
+@dataclass(frozen=True, eq=False)
+class Prt:
+    """Albedo [3, T, T], and transfer [3, K, t, t] in the head frame; `rotation` [3, 3] is the photo's."""
+
+    albedo: Tensor
+    transfer: Tensor
+    rotation: Tensor
+
+    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
+        """See `Reflectance`."""
+        head_to_camera = self.rotation if turn is None else turn @ self.rotation
+        order = math.isqrt(self.transfer.shape[1]) - 1
+        basis = math.pi * sh_basis(directions @ head_to_camera, order)  # rows: camera to head
+        light = torch.einsum("lk,mlc->mkc", basis, weights)
+        return self.albedo * self.shading(light)
+
+    def shading(self, light: Tensor) -> Tensor:
+        """Radiance [M, 3, T, T] of a white face in a light of coefficients [M, K, 3] in the head frame."""
+        coarse_shading = torch.einsum("ckij,mkc->mcij", self.transfer, light).clamp_min(0)
+        side = self.albedo.shape[-2:]
+        return F.interpolate(coarse_shading, side, mode="bilinear", align_corners=False)
+
+
+def explain_by_prt(
+    models: Models,
+    fit: FaceFit,
+    face: FaceTexture,
+    settings: SolveSettings = SETTINGS,
+    bake: TransferSettings = BAKE,
+    detail: float = DETAIL,
+) -> Explained:
+    """The most probable albedo and light of a fitted photo."""
+    vertices = models.face.vertices(fit.alpha[None], fit.beta[None])[0]
+    direct, bounce = baked_transfer(vertices, bake)
+    side = face.texture.shape[-1]
+    tint = skin_prior().diffuse.mean.exp().mean((1, 2))
+    for _ in range(_ROUNDS):
+        transfer = direct + tint[:, None, None, None] * bounce  # [3, K, t, t]
+        found = _solve(transfer, fit, face, settings)
+        albedo = skin_prior().diffuse.at(found.albedo, side)
+        tint = albedo.exp().mean((1, 2))
+    shading = Prt(albedo, transfer, fit.rotation).shading(rotated(found.light, fit.rotation.T)[None])[0]
+    albedo = with_detail(albedo, face, shading, torch.zeros_like(shading), detail)
+    rig = rig_directions()
+    light = RigLight(rig, coefficients_to_rig(found.light, rig))
+    return Explained(Prt(albedo.exp(), transfer, fit.rotation), light)
+
+
+def _solve(transfer: Tensor, fit: FaceFit, face: FaceTexture, settings: SolveSettings) -> Solution:
+    """Albedo and light in camera space, where the light's prior is, of a transfer in the head frame."""
+    count = transfer.shape[1]
+    camera_to_head = rotated(torch.eye(count), fit.rotation.T)  # [K, K] of coefficients
+    small = F.interpolate(transfer, (SIDE, SIDE), mode="area").flatten(2)
+    radiance, trust = coarse(face)
+    in_camera = torch.einsum("ckn,kj->cnj", small, camera_to_head)
+    scene = Scene(radiance.flatten(1), trust.flatten(), in_camera, None)
+    prior = skin_prior()
+    return solve(scene, prior.diffuse, prior.gloss, light_prior(math.isqrt(count) - 1), settings)
