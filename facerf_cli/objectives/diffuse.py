@@ -1,8 +1,9 @@
 """Stage `diffuse-sh`: the network of the diffuse baseline (`network/diffuse.py`), in the chart.
 
-One albedo has to explain the source under the light that the network reads off it, and targets under lights
-that are known. Order 2 cannot explain a single light, nor is the baseline used in one: a target is a sum of
-several. All are at the network's own exposure.
+Albedo is learnt from targets, which it has to explain under lights that are known; light from the source,
+which it has to explain with that albedo. Were the albedo to learn from the source too, a copy of it under a
+constant light would explain it at once, and training stays there. Order 2 cannot explain a single light, nor
+is the baseline used in one: a target is a sum of several. All are at the network's own exposure.
 """
 
 from collections.abc import Callable, Iterator
@@ -91,12 +92,13 @@ class DiffuseObjective(Objective):
         return concatenate(drawn)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
-        """The terms `source` and `targets`, means over faces."""
+        """The terms `source`, of the light alone, and `targets`, of the albedo; means over faces."""
         with self.mixed_precision():
             estimate = self._network()(batch.source, batch.normals_source, batch.visible)
         source = (batch.source / estimate.exposure)[:, None]
         targets = batch.targets / estimate.exposure[:, None]
-        own, relit = explained(estimate, batch)
+        own, _ = explained(estimate._replace(albedo=estimate.albedo.detach()), batch)
+        _, relit = explained(estimate, batch)
         return {
             "source": root_loss(to_root(own), source, batch.visible),
             "targets": root_loss(to_root(relit), targets, batch.weight),
