@@ -36,7 +36,8 @@ METRICS: Mapping[str, Metric] = {  # by name, in the order of tables; a row has 
     "lpips": Metric("LPIPS (VGG, v0.1)", digits=4),
     "face_distance": Metric("Face dis", digits=3),
     "light_error_deg": Metric("light direction, degrees", digits=1),
-    "tone_drift_deg": Metric("skin tone drift, degrees of ITA", digits=1),  # of its size
+    "tone_drift_deg": Metric("skin tone drift, degrees of ITA", digits=1),  # without its sign
+    "tone_shift_deg": Metric("skin tone drift, above 0 too light", digits=1),
 }
 
 
@@ -125,10 +126,12 @@ def _check(comparison: Comparison) -> None:
     name, truth, mask = comparison.case.name, comparison.truth, comparison.mask
     if mask.shape != truth.shape[:2]:
         raise InputError(f"{name}: the mask has {_size(mask)} pixels, the truth {_size(truth)}")
+    if not np.isfinite(truth).all():
+        raise InputError(f"{name}: the truth holds values that are not finite")
     if not (mask > 0).any():
         raise InputError(f"{name}: nothing of the face is left in the mask; leave this picture out")
     for method, prediction in comparison.predictions.items():
-        if prediction.shape != truth.shape:
+        if prediction.shape[:2] != truth.shape[:2]:
             raise InputError(
                 f"{name}: {method} has {_size(prediction)} pixels, the truth {_size(truth)}; predictions are "
                 "to have the truth's frame"

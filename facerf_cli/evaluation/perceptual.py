@@ -11,7 +11,7 @@ import torch
 
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.network.perceptual import Lpips
+from facerf_cli.network.perceptual import SMALLEST_PX, Lpips
 from facerf_cli.objectives.feature_networks import load_vgg, read_tensors
 
 LPIPS_LICENCE = "LPIPS v0.1, VGG heads: BSD 2-Clause, Zhang et al. (package lpips)"
@@ -40,6 +40,8 @@ def perceptual_metric(
     network.eval().requires_grad_(False)
 
     def distance(ours_srgb: np.ndarray, true_srgb: np.ndarray) -> float:
+        if min(true_srgb.shape[:2]) < SMALLEST_PX:
+            raise InputError(f"LPIPS needs pictures of {SMALLEST_PX} px a side; leave --vgg-weights out")
         both = srgb_to_linear(np.stack([ours_srgb, true_srgb]))
         tensors = torch.from_numpy(both).permute(0, 3, 1, 2)
         return float(network(tensors[:1], tensors[1:]))

