@@ -1,0 +1,171 @@
+"""Light on disk: JSON of a rig's weights and spherical-harmonic coefficients; the text files of others."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.atomic import atomic_path
+
+FORMAT = "facerf-light-1"
+AXES = "camera: x to the picture's right, y up, z toward the camera; directions point to the light"
+UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
+_LIMIT_BYTES = 4 << 20
+_MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441
+_ADVICE = "give a .json that estimate-light or convert-light wrote"
+
+
+@dataclass(frozen=True, eq=False)
+class Harmonics:
+    """Coefficients [(order + 1)^2, 3], and the convention that they are in, in words."""
+
+    coefficients: Tensor
+    convention: str
+
+
+@dataclass(frozen=True, eq=False)
+class LightRecord:
+    """What a light's JSON holds: directions and weights [L, 3] of a rig, or coefficients, or both.
+
+    Without a rig, `directions` and `weights` have no rows. `rig` says in words what the directions are;
+    `attributes` are the provenance (`records.Provenance.attributes`), and how the light was found.
+    """
+
+    directions: Tensor
+    weights: Tensor
+    rig: str = ""
+    sh: Harmonics | None = None
+    attributes: Mapping[str, str | int | float] = field(default_factory=dict)
+
+
+def write_light(path: Path, record: LightRecord) -> None:
+    """Write a light as JSON of plain numbers, a light or a coefficient a line, through a temporary name."""
+    fields: dict[str, Any] = {"format": FORMAT, "axes": AXES, "units": UNITS}
+    if len(record.directions):
+        fields |= {"rig": record.rig, "directions": record.directions, "weights": record.weights}
+    if record.sh is not None:
+        order = math.isqrt(len(record.sh.coefficients)) - 1
+        convention = {"order": order, "convention": record.sh.convention}
+        fields["sh"] = convention | {"coefficients": record.sh.coefficients}
+    fields["provenance"] = dict(record.attributes)
+    with atomic_path(path) as temporary:
+        temporary.write_text(_text_of(fields, "") + "\n", encoding="utf-8")
+
+
+def _text_of(value: Any, indent: str) -> str:
+    """JSON with the rows of a matrix a line each."""
+    deeper = indent + "  "
+    if isinstance(value, Tensor):
+        lines = [f"[{', '.join(map(_number, row))}]" for row in value.float().tolist()]
+        return f"[\n{deeper}" + f",\n{deeper}".join(lines) + f"\n{indent}]"
+    if isinstance(value, dict) and value:
+        lines = [f"{json.dumps(name)}: {_text_of(entry, deeper)}" for name, entry in value.items()]
+        return f"{{\n{deeper}" + f",\n{deeper}".join(lines) + f"\n{indent}}}"
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+
+
+def _number(value: float) -> str:
+    """The shortest decimals that the same float32 is read back from."""
+    if not math.isfinite(value):
+        raise ValueError(f"a light of {value}")
+    return str(np.float32(value))
+
+
+def read_light(path: Path) -> LightRecord:
+    """The light of a JSON file, checked; directions are made unit vectors."""
+    fields = _parsed(path)
+    try:
+        if fields.get("format") != FORMAT:
+            raise ValueError(f"its format is not {FORMAT}")
+        if "directions" not in fields and "sh" not in fields:
+            raise ValueError("it holds neither directions nor sh")
+        directions, weights = torch.zeros(0, 3), torch.zeros(0, 3)
+        if "directions" in fields:
+            directions, weights = _rig(fields)
+        sh = _harmonics(fields["sh"]) if "sh" in fields else None
+    except ValueError as error:
+        raise InputError(f"{path}: not a light of facerf ({error}); {_ADVICE}") from None
+    provenance = fields.get("provenance")
+    kept = provenance.items() if isinstance(provenance, dict) else ()
+    attributes = {name: value for name, value in kept if isinstance(value, str | int | float)}
+    return LightRecord(directions, weights, str(fields.get("rig", "")), sh, attributes)
+
+
+def _parsed(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() != ".json" or not path.is_file():
+        raise InputError(f"{path}: {'not a .json file' if path.is_file() else 'no such file'}; {_ADVICE}")
+    if path.stat().st_size > _LIMIT_BYTES:
+        raise InputError(f"{path}: larger than a light can be ({_LIMIT_BYTES >> 20} MiB); {_ADVICE}")
+    try:
+        fields = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
+    except (OSError, ValueError, RecursionError) as error:
+        reason = "nested too deep" if isinstance(error, RecursionError) else error
+        raise InputError(f"{path}: cannot be read as JSON ({reason}); {_ADVICE}") from None
+    if not isinstance(fields, dict):
+        raise InputError(f"{path}: not a light of facerf (no JSON object); {_ADVICE}")
+    return fields
+
+
+def _rig(fields: dict[str, Any]) -> tuple[Tensor, Tensor]:
+    directions = _rows(fields, "directions", _MOST_LIGHTS)
+    weights = _rows(fields, "weights", _MOST_LIGHTS)
+    if len(directions) != len(weights):
+        raise ValueError(f"{len(directions)} directions but {len(weights)} weights")
+    lengths = directions.norm(dim=1, keepdim=True)
+    if float((lengths - 1).abs().max()) > 1e-2:
+        raise ValueError("its directions are not unit vectors")
+    return directions / lengths, weights
+
+
+def _harmonics(fields: Any) -> Harmonics:
+    if not isinstance(fields, dict):
+        raise ValueError("sh is no JSON object")
+    coefficients = _rows(fields, "coefficients", _MOST_COEFFICIENTS)
+    if math.isqrt(len(coefficients)) ** 2 != len(coefficients):
+        raise ValueError(f"{len(coefficients)} coefficients; there are 1, 4, 9, 16, ...")
+    return Harmonics(coefficients, str(fields.get("convention", "")))
+
+
+def _rows(fields: dict[str, Any], name: str, most: int) -> Tensor:
+    """A matrix [N, 3] of finite numbers."""
+    rows = fields.get(name)
+    if not isinstance(rows, list) or not 1 <= len(rows) <= most:
+        raise ValueError(f"{name} is no list of 1 to {most} rows")
+    if not all(isinstance(row, list) and len(row) == 3 for row in rows):
+        raise ValueError(f"{name} has a row that is not 3 numbers")
+    if not all(_is_finite_number(value) for row in rows for value in row):
+        raise ValueError(f"{name} has an entry that is no finite number")
+    return torch.tensor(rows, dtype=torch.float32)
+
+
+def _is_finite_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
+
+
+def write_numbers(path: Path, numbers: Tensor) -> None:
+    """Write numbers [N], one a line, as DPR and SfSNet keep their lights."""
+    with atomic_path(path) as temporary:
+        temporary.write_text("".join(f"{value:.9g}\n" for value in numbers.tolist()), encoding="utf-8")
+
+
+def read_numbers(path: Path, counts: tuple[int, ...]) -> Tensor:
+    """Numbers [N] of a text file, separated by any white space; N must be one of `counts`."""
+    wanted = " or ".join(map(str, counts))
+    try:
+        with path.open("rb") as stream:
+            words = stream.read(1 << 16).decode("ascii").split()
+        values = [float(word) for word in words]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except ValueError:
+        raise InputError(f"{path}: not a text file of numbers; a light is {wanted} of them") from None
+    if len(values) not in counts or not all(abs(value) < 1e30 for value in values):
+        raise InputError(f"{path}: {len(values)} numbers; a light is {wanted} finite ones")
+    return torch.tensor(values)

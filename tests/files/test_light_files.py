@@ -1,0 +1,95 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.light_files import (
+    FORMAT,
+    Harmonics,
+    LightRecord,
+    read_light,
+    read_numbers,
+    write_light,
+    write_numbers,
+)
+
+
+def drawn(rows: int) -> torch.Tensor:
+    return torch.randn(rows, 3, generator=torch.Generator().manual_seed(rows))
+
+
+def a_light() -> LightRecord:
+    directions = torch.nn.functional.normalize(drawn(7), dim=-1)
+    return LightRecord(directions, drawn(7), "seven", Harmonics(drawn(9), "ours"), {"facerf:input": "ä.jpg"})
+
+
+def test_a_light_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+    before, path = a_light(), tmp_path / "deep" / "light.json"
+    write_light(path, before)
+    after = read_light(path)
+    torch.testing.assert_close(after.directions, before.directions, rtol=0, atol=1e-7)
+    assert torch.equal(after.weights, before.weights)
+    assert before.sh and after.sh and torch.equal(after.sh.coefficients, before.sh.coefficients)
+    assert (after.rig, after.sh.convention, after.attributes) == ("seven", "ours", before.attributes)
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_the_file_is_plain_json_that_says_its_units(tmp_path: Path) -> None:
+    write_light(tmp_path / "a.json", a_light())
+    fields = json.loads((tmp_path / "a.json").read_text())
+    assert fields["format"] == FORMAT and "white" in fields["units"] and "camera" in fields["axes"]
+    assert [len(row) for row in fields["weights"]] == [3] * 7 and fields["sh"]["order"] == 2
+
+
+def test_coefficients_alone_are_a_light(tmp_path: Path) -> None:
+    write_light(tmp_path / "a.json", LightRecord(torch.zeros(0, 3), torch.zeros(0, 3), sh=a_light().sh))
+    after = read_light(tmp_path / "a.json")
+    assert len(after.directions) == 0 and after.sh is not None and len(after.sh.coefficients) == 9
+
+
+BAD: dict[str, dict[str, Any]] = {
+    "format is not": {"format": "other"},
+    "neither directions": {"directions": None},
+    "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
+    "not unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
+    "weights has a row that is not 3": {"weights": [[1, 1, 1], [1, 1]]},
+    "weights has an entry": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
+    "weights has an entry that": {"weights": [[1, 1, 1], [1, 1, "2"]]},
+    "directions is no list of 1 to 4096": {"directions": []},
+    "8 coefficients": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
+    "sh is no": {"sh": 5},
+}
+
+
+@pytest.mark.parametrize("complaint", BAD)
+def test_what_is_wrong_is_said_in_a_line(complaint: str, tmp_path: Path) -> None:
+    good = {"format": FORMAT, "directions": [[1, 0, 0], [0, 1, 0]], "weights": [[1, 1, 1], [2, 2, 2]]}
+    fields = {name: value for name, value in (good | BAD[complaint]).items() if value is not None}
+    (tmp_path / "a.json").write_text(json.dumps(fields))
+    with pytest.raises(InputError, match=complaint) as error:
+        read_light(tmp_path / "a.json")
+    assert "a.json" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b" " * (5 << 20)])
+def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(text)
+    with pytest.raises(InputError, match=r"a\.json: .*give a \.json"):
+        read_light(tmp_path / "a.json")
+    with pytest.raises(InputError, match="no such file"):
+        read_light(tmp_path / "b.json")
+
+
+def test_numbers_one_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "light.txt"
+    write_numbers(path, drawn(3).reshape(9))
+    assert len(path.read_text().splitlines()) == 9
+    assert torch.equal(read_numbers(path, (9, 27)), drawn(3).reshape(9))
+    with pytest.raises(InputError, match="9 numbers; a light is 27"):
+        read_numbers(path, (27,))
+    path.write_text("1 2 three")
+    with pytest.raises(InputError, match="not a text file of numbers"):
+        read_numbers(path, (3,))
