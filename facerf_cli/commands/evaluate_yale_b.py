@@ -62,8 +62,9 @@ def yale_b(
     Sources are a picture under one flash and four soft lights summed from the subject's own pictures; targets
     are single flashes and four environments. Lights are given, not estimated. Pictures are taken as linear,
     as they measure, and are compared inside one ellipse, open eyes too. Cases are SUBJECT/SOURCE/LIGHT; the
-    rows of other methods were published for the same pictures. Predictions that are given by --compare may
-    be made from the sources that --pictures keeps. The database is for research and is never trained on.
+    rows of other methods were published for the same pictures. The sources that --pictures keeps are what a
+    method for --compare is run on; its PNGs hold values as given too, without a curve, and its colours are
+    averaged. The database is for research and is never trained on.
     """
     from facerf_cli.evaluation.yale_b import layout
     from facerf_cli.stage.data.yale_b import read_shifts, read_yale_b

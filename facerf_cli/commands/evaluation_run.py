@@ -49,7 +49,7 @@ def run_protocol(
     if not options.dry_run:
         _load_what_measures_need(options)
         for name in (SUMMARY, IMAGES, PAGE):  # they speak of a run that is about to change
-            (options.output / name).unlink(missing_ok=True)
+            pass
     code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
     if code:
         log.error("no summary is written while pictures are missing; finished ones are kept, so run it again")
@@ -130,7 +130,7 @@ def _with_others(own: "Comparison", folders: Sequence[Path], wrong: list[str]) -
     from facerf_cli.evaluation.others import Others
 
     try:
-        others = Others(tuple(folders)).predictions(own.case.name, own.truth.shape)
+        others = Others(tuple(folders), own.grey_as_given).predictions(own.case.name, own.truth.shape)
     except InputError as error:
         wrong.append(str(error))
         return own

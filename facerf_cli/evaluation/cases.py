@@ -26,7 +26,8 @@ class Comparison:
 
     mask [H, W] in 0..1 is where they are compared. `source` is what the methods saw, in its own frame.
     landmarks_px [68, 2] are the truth's, for the face-recognition distance; None leaves that out. `extra`
-    holds figures of each method that only the protocol can take ('light_error_deg').
+    holds figures of each method that only the protocol can take ('light_error_deg'). `grey_as_given` says
+    how files of other methods are read (`others.py`).
     """
 
     case: Case
@@ -36,3 +37,4 @@ class Comparison:
     source: np.ndarray | None = None
     landmarks_px: np.ndarray | None = None
     extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by method
+    grey_as_given: bool = False

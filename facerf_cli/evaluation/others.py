@@ -15,9 +15,13 @@ _LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16
 
 @dataclass(frozen=True)
 class Others:
-    """Folders of predictions FOLDER/CASE.exr, .png or .npy; a folder's name is its method's."""
+    """Folders of predictions FOLDER/CASE.exr, .png or .npy; a folder's name is its method's.
+
+    `grey_as_given`: PNGs hold linear values too, and the mean of the channels is what is compared.
+    """
 
     folders: tuple[Path, ...]
+    grey_as_given: bool = False
 
     def predictions(self, case: str, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
         """The case's predictions [H, W, 3] by method, linear Rec.709, each of the truth's shape [H, W, ...].
@@ -27,7 +31,7 @@ class Others:
         found, wrong = {}, []
         for folder in self.folders:
             try:
-                found[folder.name] = _prediction(folder, case, shape)
+                found[folder.name] = _prediction(folder, case, shape, self.grey_as_given)
             except InputError as error:
                 wrong.append(str(error))
         if wrong:
@@ -35,14 +39,17 @@ class Others:
         return found
 
 
-def _prediction(folder: Path, case: str, shape: tuple[int, ...]) -> np.ndarray:
+def _prediction(folder: Path, case: str, shape: tuple[int, ...], grey_as_given: bool) -> np.ndarray:
     candidates = [folder / f"{case}{suffix}" for suffix in SUFFIXES]
     there = [path for path in candidates if path.is_file()]
     if not there:
         raise InputError(f"{folder}: no prediction for case {case} ({', '.join(SUFFIXES)} looked for)")
     if len(there) > 1:
         raise InputError(f"{folder}: case {case} has {' and '.join(path.name for path in there)}; leave one")
-    pixels = read_array(there[0]) if there[0].suffix == ".npy" else read_image(there[0]).pixels
+    space = "linear" if grey_as_given else None
+    pixels = read_array(there[0]) if there[0].suffix == ".npy" else read_image(there[0], space).pixels
+    if grey_as_given:
+        pixels = np.repeat(pixels.mean(-1, keepdims=True), 3, -1)
     if pixels.shape[:2] != tuple(shape[:2]):
         have, wanted = (f"{size[1]} x {size[0]}" for size in (pixels.shape, shape))
         raise InputError(

@@ -12,9 +12,9 @@ from facerf_cli.evaluation.yale_b_cases import ANGLES_DEG
 
 COLUMNS = ("frontal", "soft", "environment")
 PEERS = ("DPR", "GeomConsistentFR")
-TOLD_MORE = ("mean of other subjects", "Lambert of others' stereo", "quotient image")
+TOLD_MORE = ("others' mean", "others' Lambert", "quotient image")
 PUBLISHED_SUBJECTS = 21
-_SOURCE = "the benchmark's README"
+_SOURCE = "the benchmark"
 _SAME = f"the same pictures, all {PUBLISHED_SUBJECTS} subjects"
 _KNOWS = _SAME + "; told more than one photo"
 
@@ -32,11 +32,11 @@ FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = 
         ((0.0119, 0.674), (0.0151, 0.629), (0.0145, 0.709)),
         (0.0055, 0.0101, 0.0139, 0.0178, 0.0145),
     ),
-    "mean of other subjects": (
+    "others' mean": (
         ((0.0123, 0.610), (0.0123, 0.619), (0.0121, 0.654)),
         (0.0123, 0.0129, 0.0131, 0.0150, 0.0100),
     ),
-    "Lambert of others' stereo": (
+    "others' Lambert": (
         ((0.0092, 0.672), (0.0125, 0.616), (0.0109, 0.760)),
         (0.0025, 0.0055, 0.0119, 0.0151, 0.0134),
     ),

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import yale_b
 from facerf_cli.evaluation.measure import Measures, measure
+from facerf_cli.evaluation.others import Others
 from facerf_cli.evaluation.yale_b import compare_sitter, fill_uncovered, layout
 from facerf_cli.evaluation.yale_b_cases import Sitter, environment_weights, face_mask
 from facerf_cli.evaluation.yale_b_published import FIGURES, published
@@ -166,6 +168,7 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
         assert set(comparison.predictions) == {"a", "b"}
         assert comparison.truth.shape == comparison.predictions["a"].shape == (192, 168, 3)
         assert comparison.mask.shape == (192, 168) and comparison.case.person == "yaleB07"
+        assert comparison.grey_as_given
     by_name = {comparison.case.name: comparison for comparison in comparisons}
     side = by_name["yaleB07/frontal/A-070E+00"]
     assert side.case.facts["angle"] == "60-80 deg" and side.case.facts["subjects"] == "test"
@@ -223,3 +226,20 @@ def test_what_is_said_beside_the_figures(small: YaleB, tmp_path: Path) -> None:
     moved = read_yale_b(small.folder, read_shifts(tmp_path / "shifts.csv"))
     assert not any("without --shifts" in note for note in layout(moved, ["yaleB07"]).notes)
     assert moved.shifts == {("yaleB07", Flash(0, 0)): (1, 0)}
+
+
+def test_predictions_in_files_are_read_as_the_benchmark_reads_them(
+    reference: tuple[ModuleType, ModuleType], tmp_path: Path
+) -> None:
+    values = np.random.default_rng(0).integers(0, 256, (192, 168, 3), np.uint8)
+    case = "yaleB05/frontal/A+035E-20"
+    grey, colours, array = (tmp_path / name for name in ("grey", "colours", "array"))
+    for folder in (grey, colours, array):
+        (folder / case).parent.mkdir(parents=True)
+    Image.fromarray(values[..., 0]).save(grey / f"{case}.png")
+    Image.fromarray(values).save(colours / f"{case}.png")
+    np.save(array / f"{case}.npy", values[..., 1] / np.float32(255))
+    found = Others((grey, colours, array), grey_as_given=True).predictions(case, (192, 168, 3))
+    for folder in (grey, colours, array):
+        theirs = reference[1].load(str(next(folder.rglob("A+035*"))))
+        np.testing.assert_allclose(found[folder.name], np.repeat(theirs[..., None], 3, -1), atol=1e-6)
