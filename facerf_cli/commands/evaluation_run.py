@@ -49,7 +49,7 @@ def run_protocol(
     if not options.dry_run:
         _load_what_measures_need(options)
         for name in (SUMMARY, IMAGES, PAGE):  # they speak of a run that is about to change
-            pass
+            (options.output / name).unlink(missing_ok=True)
     code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
     if code:
         log.error("no summary is written while pictures are missing; finished ones are kept, so run it again")
