@@ -13,13 +13,12 @@ import itertools
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import skimage.data
 import torch
-from yale_b import load_yale
 
+from facerf_cli.evaluation.yale_b_cases import SETTINGS_SUBJECTS, Sitter, face_mask
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, FitSettings, fit_batch, fit_landmarks, trust_inside
 from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
@@ -29,6 +28,7 @@ from facerf_cli.files.images import read_image
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.stage.data.yale_b import read_shifts, read_yale_b
 
 SUBJECTS = ("yaleB05", "yaleB15", "yaleB22")
 Truth = tuple[np.ndarray, np.ndarray]  # normals [H, W, 3], where they are known [H, W]
@@ -84,19 +84,19 @@ def shadow_aware(values: np.ndarray, lights: np.ndarray) -> np.ndarray:
     return scaled
 
 
-def yale_truths(yale: Any, module: Any, subject: str) -> list[Truth]:
+def yale_truths(sitter: Sitter) -> list[Truth]:
     """Photometric-stereo normals: plain least squares over all lights, and shadow-aware."""
-    lights = yale.lights(subject)
-    values = np.stack([yale.olat(subject, light) for light in lights]).astype(np.float64)[:, module.MASK]
-    directions = np.stack([module.light_dir(*light) for light in lights])
+    mask = face_mask()
+    values = sitter.olats.astype(np.float64)[:, mask]
+    directions = np.stack([flash.direction for flash in sitter.flashes])
     truths = []
     for scaled in (
         least_squares(values, directions, np.ones_like(values)),
         shadow_aware(values, directions),
     ):
-        normals = np.zeros((*module.MASK.shape, 3))
-        normals[module.MASK] = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-9)
-        truths.append((normals, module.MASK))
+        normals = np.zeros((*mask.shape, 3))
+        normals[mask] = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-9)
+        truths.append((normals, mask))
     return truths
 
 
@@ -177,20 +177,16 @@ def main() -> None:
     options = parser.parse_args()
     model = load_face_model(options.face_model)
     pictures = photos(options.shared)
-    module = load_yale(options.shared / "bench/yale_b")
-    data = module.Yale(str(options.shared / "data/extended_yale_b"))
-    subjects = (
-        data.subjects
-        if options.all
-        else [s for s in module.DEV if s in data.subjects]
-        if options.sweep
-        else SUBJECTS
-    )
+    shifts = read_shifts(options.shared / "bench/yale_b/shifts.csv")
+    database = read_yale_b(options.shared / "data/extended_yale_b", shifts)
+    chosen = SETTINGS_SUBJECTS if options.sweep else SUBJECTS
+    subjects = [name for name in database.subjects if options.all or name in chosen]
     yale = []
     for subject in subjects:
-        frontal = np.round(255 * data.olat(subject, (0, 0))).astype(np.uint8)
+        sitter = Sitter(database, subject)
+        frontal = np.round(255 * sitter.picture("frontal")).astype(np.uint8)
         photo = look_at(subject, np.repeat(frontal[..., None], 3, -1))
-        yale.append((photo, yale_truths(data, module, subject)))
+        yale.append((photo, yale_truths(sitter)))
     print(model.name, "| photos:", *(photo.name for photo in pictures), "| yale:", *subjects)
     if options.sweep:
         for settings in settings_to_try():
