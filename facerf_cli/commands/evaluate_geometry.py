@@ -84,7 +84,7 @@ def geometry(
     layout = Layout(
         name="geometry",
         title="The fitted face and the mean face in its pose",
-        metrics=("si_mse", "face_dis", "ssim"),
+        metrics=("si_mse", "face_distance", "ssim"),
         by=("tone",) if folder else (),
         published=TABLE_4,
         notes=(_note(mean_checkpoint),),

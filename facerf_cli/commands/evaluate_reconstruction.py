@@ -74,7 +74,7 @@ def reconstruction(
     layout = Layout(
         name="reconstruction",
         title="Photos explained and put together again",
-        metrics=("si_mse", "face_dis", "ssim", *(("light_error_deg",) if folder else ())),
+        metrics=("si_mse", "face_distance", "ssim", *(("light_error_deg",) if folder else ())),
         by=("tone",) if folder else (),
         published=TABLE_2_RECONSTRUCTION,
         notes=("The field is the network's own, not held to the photo: it would be exact by construction.",),

@@ -91,7 +91,7 @@ def transfer(
     layout = Layout(
         name="transfer",
         title="Reflectances of two pictures of a person exchanged",
-        metrics=("si_mse", "face_dis", "ssim"),
+        metrics=("si_mse", "face_distance", "ssim"),
         by=() if photos else ("tone",),
         published=TABLE_2_TRANSFER,
         notes=("The field is the network's own, not held to a photo.",),
