@@ -103,8 +103,8 @@ def _pictures(summary: Summary, chosen: Chosen, jpegs: Mapping[str, bytes]) -> I
         return
     yield (
         f"<p>By {escape(how.title)} of {first}. All pictures of a case are at the truth's exposure, a "
-        "method's times the scale that Si-MSE compares it at, where that is the metric; grey is left out of the "
-        "comparison. Predictions are synthetic. images.csv has every picture's figures.</p>"
+        "method's times the scale that Si-MSE compares it at, where that is the metric; grey is left out. "
+        "Predictions are synthetic. images.csv has every picture's figures.</p>"
     )
     yield (
         '<p class="scale"><span>Error</span> 0 <i></i> '

@@ -1,0 +1,68 @@
+"""Other methods' predictions: found by case, and never quietly absent."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.others import Others, read_array
+from facerf_cli.files.images import write_display, write_exr
+
+SHAPE = (6, 9, 3)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "theirs"
+    write_exr(folder / "a/00.exr", np.full(SHAPE, 0.25, np.float32))
+    write_display(folder / "a/01.png", np.full(SHAPE, 0.25, np.float32))
+    np.save(folder / "a/02.npy", np.full(SHAPE[:2], 0.25))
+    return folder
+
+
+@pytest.mark.parametrize("case", ["a/00", "a/01", "a/02"])
+def test_every_kind_of_file_is_linear_light(folder: Path, case: str) -> None:
+    (found,) = Others((folder,)).predictions(case, SHAPE).items()
+    assert found[0] == "theirs" and found[1].shape == SHAPE
+    np.testing.assert_allclose(found[1], 0.25, atol=2e-3)
+
+
+def test_all_that_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError) as error:
+        Others((folder, tmp_path / "empty")).predictions("a/03", SHAPE)
+    assert all(part in str(error.value) for part in (str(folder), "empty", "case a/03", ".npy"))
+
+
+def test_a_wrong_size_and_two_files_of_a_case(folder: Path) -> None:
+    with pytest.raises(InputError, match="9 x 6 pixels, the truth has 6 x 9"):
+        Others((folder,)).predictions("a/00", (9, 6, 3))
+    write_exr(folder / "a/02.exr", np.zeros(SHAPE, np.float32))
+    with pytest.raises(InputError, match=r"02.exr and 02.npy; leave one"):
+        Others((folder,)).predictions("a/02", SHAPE)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (np.zeros(SHAPE, np.uint8), "PNG is for bytes"),
+        (np.zeros((2, 3, 4)), "a picture is"),
+        (np.full(SHAPE, np.nan), "NaN"),
+        (np.array([{"a": 1}], dtype=object), "not an array"),
+        (np.zeros((0, 3, 3)), "a picture is"),
+    ],
+)
+def test_arrays_that_are_no_pictures(tmp_path: Path, content: np.ndarray, words: str) -> None:
+    np.save(tmp_path / "x.npy", content)
+    with pytest.raises(InputError, match=words):
+        read_array(tmp_path / "x.npy")
+
+
+def test_a_file_that_is_no_array_and_one_cut_short(tmp_path: Path) -> None:
+    (tmp_path / "text.npy").write_text("hello")
+    np.save(tmp_path / "cut.npy", np.zeros(SHAPE))
+    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:200])
+    for name in ("text.npy", "cut.npy", "none.npy"):
+        with pytest.raises(InputError, match="not an array"):
+            read_array(tmp_path / name)

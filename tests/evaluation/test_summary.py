@@ -1,0 +1,87 @@
+"""Tables from rows: means, people, facts, and what is better than the first method."""
+
+import math
+
+import numpy as np
+import pytest
+
+from facerf_cli.evaluation.measure import METRICS, Row
+from facerf_cli.evaluation.paper import TABLE_1, TABLE_2_RECONSTRUCTION, TABLE_2_TRANSFER, TABLE_3, TABLE_4
+from facerf_cli.evaluation.summary import Layout, natural, published_beside, summarise
+
+LAYOUT = Layout("toy", "Toy", ("si_mse", "psnr"), ("pose",), TABLE_1)
+ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}
+PEOPLE = ("a", "a", "b", "b")
+POSES = ("same pose", "different pose", "same pose", "different pose")
+
+
+def rows(**more: float) -> list[Row]:
+    return [
+        Row(
+            f"case{n}",
+            PEOPLE[n],
+            method,
+            {"pose": POSES[n], "az": 3.0},
+            {"si_mse": e[n], "psnr": -e[n]} | more,
+        )
+        for method, e in ERRORS.items()
+        for n in range(4)
+    ]
+
+
+def test_means_and_pairs_by_hand() -> None:
+    summary = summarise(LAYOUT, rows())
+    assert (summary.pictures, summary.persons, summary.methods) == (4, 2, ("ours", "theirs"))
+    ours, theirs = (summary.groups[0].cells["si_mse"][name] for name in summary.methods)
+    assert ours.interval.mean == pytest.approx(0.25) and ours.interval.sd == pytest.approx(
+        np.std(ERRORS["ours"])
+    )
+    assert ours.paired is None and theirs.paired.difference.mean == pytest.approx(0.1)
+    assert theirs.paired.won == pytest.approx(1.5 / 4)  # one better, one alike, two worse
+    # PSNR's more is better: the same wins though every sign is the other way round.
+    assert summary.groups[0].cells["psnr"]["theirs"].paired.won == pytest.approx(1.5 / 4)
+    # Two people: the interval of the mean spans their own means at most.
+    assert 0.15 - 1e-9 <= ours.interval.low <= ours.interval.high <= 0.35 + 1e-9
+
+
+def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
+    summary = summarise(Layout("toy", "Toy", ("si_mse",), ("pose", "not there")), rows())
+    assert [(group.fact, group.value) for group in summary.groups] == [
+        ("", ""), ("pose", "different pose"), ("pose", "same pose"),
+    ]  # fmt: skip
+    assert summary.groups[1].cells["si_mse"]["ours"].interval.mean == pytest.approx(0.25)
+    assert summary.groups[2].cells["si_mse"]["theirs"].interval.mean == pytest.approx(0.5)
+    assert "psnr" in summary.groups[0].cells and "psnr" not in summary.groups[1].cells
+
+
+def test_values_that_are_none_are_counted_not_hidden() -> None:
+    found = rows()
+    found[0].values["si_mse"] = math.nan
+    cells = summarise(LAYOUT, found).groups[0].cells["si_mse"]
+    assert cells["ours"].left_out == 1 and cells["ours"].interval.pictures == 3
+    assert cells["theirs"].paired.difference.pictures == 3  # only where both are
+
+
+def test_a_picture_measured_twice_is_our_bug() -> None:
+    with pytest.raises(ValueError, match="twice"):
+        summarise(LAYOUT, [*rows(), rows()[0]])
+
+
+def test_published_figures_stand_beside_their_group() -> None:
+    summary = summarise(LAYOUT, rows())
+    beside = [[figure.mean for figure in published_beside(summary, g, "si_mse")] for g in summary.groups]
+    assert beside == [[], [0.00084], [0.0007]]
+
+
+def test_the_papers_tables_are_whole() -> None:
+    tables = [TABLE_1, TABLE_2_RECONSTRUCTION, TABLE_2_TRANSFER, TABLE_3, TABLE_4]
+    assert [len(table) for table in tables] == [2, 8, 8, 2, 4]
+    assert all(
+        figure.metric in METRICS and "other data" in figure.data for table in tables for figure in table
+    )
+
+
+def test_bins_sort_as_numbers_do() -> None:
+    assert sorted(["90 to 180 deg", "5 deg", "30 to 60 deg", "10 deg"], key=natural) == [
+        "5 deg", "10 deg", "30 to 60 deg", "90 to 180 deg",
+    ]  # fmt: skip

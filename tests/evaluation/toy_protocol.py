@@ -1,0 +1,76 @@
+"""A protocol of a few made-up pictures, to drive the evaluation without networks or faces."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.evaluation_run import run_protocol
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.options import Settings
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.cases import Case, Comparison
+from facerf_cli.evaluation.paper import TABLE_1
+from facerf_cli.evaluation.summary import Layout
+
+PEOPLE = ("anna", "bea", "carl")
+LAYOUT = Layout(
+    "toy",
+    "Toy <pictures> & more",
+    ("si_mse", "psnr", "light_error_deg"),
+    ("pose", "angle"),
+    TABLE_1,
+    ("A note with a <b>tag</b>.",),
+)
+HEIGHT, WIDTH = 36, 48
+NOISE = {"good": 0.02, "bad <i>": 0.1}
+
+
+@dataclass(frozen=True)
+class Toy:
+    """Each item is a person with `cases` pictures: a blob under a light, and two noisy guesses at it.
+
+    A folder of `notes` gets a file for each item asked for; an item fails while NAME.broken is there.
+    """
+
+    cases: int = 4
+    notes: Path | None = None
+
+    def __call__(self, item: Item) -> Iterator[Comparison]:
+        if self.notes is not None:
+            (self.notes / f"{item.name}.asked").touch()
+            if (self.notes / f"{item.name}.broken").exists():
+                raise InputError(f"{item.input_path}: is broken")
+        for number in range(self.cases):
+            yield comparison(item.name, number)
+
+
+def comparison(person: str, number: int) -> Comparison:
+    draw = np.random.default_rng([PEOPLE.index(person) if person in PEOPLE else 9, number])
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    mask = (np.hypot((x - 24) / 18, (y - 18) / 15) < 1).astype(np.float32)
+    tone = np.array([0.5, 0.35, 0.25]) * (0.3 + x[..., None] / WIDTH)
+    truth = (tone * (0.2 + mask[..., None])).astype(np.float32)
+    guesses = {
+        name: np.maximum(truth + draw.normal(0, sd * (1 + number), truth.shape), 0).astype(np.float32)
+        for name, sd in NOISE.items()
+    }
+    facts = {
+        "pose": "same pose" if number % 2 == 0 else "different pose",
+        "angle": f"{30 * (number % 4)}°",
+        "light_deg": 30.0 * number,
+    }
+    extra = {"good": {"light_error_deg": 3.0 + number}, "bad <i>": {"light_error_deg": 9.0 + number}}
+    case = Case(f"{person}/{number:02d}", person, facts)
+    return Comparison(case, truth, mask, guesses, truth[::-1, ::2], None, extra)
+
+
+def items(output: Path, people: tuple[str, ...] = PEOPLE) -> list[Item]:
+    return [Item(Path(person), output / person, person) for person in people]
+
+
+def evaluate(output: Path, toy: Toy | None = None, layout: Layout = LAYOUT, **options: object) -> int:
+    given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
+    return run_protocol(layout, items(output), toy or Toy(), given, Settings())
