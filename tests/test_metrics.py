@@ -6,6 +6,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import torch
 
 from facerf_cli.metrics import (
     PSNR_HIGHEST_DB,
@@ -22,6 +23,7 @@ from facerf_cli.metrics import (
     tone_drift_deg,
     tone_of,
 )
+from facerf_cli.network.losses import si_mse as training_si_mse
 from tests.conftest import SHARED
 from tests.oracles import metrics as slow
 
@@ -80,6 +82,12 @@ def test_figures_are_those_of_the_slow_twins(pictures: Pictures) -> None:
     assert ssim(*pictures) == pytest.approx(slow.ssim(*pictures), rel=1e-6)
     assert dssim(*pictures) == pytest.approx((1 - ssim(*pictures)) / 2)
     assert psnr(*pictures) == pytest.approx(-10 * np.log10(mse(*pictures)))
+
+
+def test_si_mse_is_that_of_training(pictures: Pictures) -> None:
+    planes = [torch.from_numpy(picture).double().permute(2, 0, 1)[None, None] for picture in pictures[:2]]
+    expected = training_si_mse(*planes, torch.from_numpy(pictures[2])[None, None])
+    assert si_mse(*pictures) == pytest.approx(expected.item(), rel=1e-9)
 
 
 def test_a_scale_of_the_prediction_means_nothing_to_si_mse_and_ssim(pictures: Pictures) -> None:

@@ -107,6 +107,17 @@ def test_another_size_is_refused_before_anything_is_read(truths: Path, ours: Pat
         collect_pairs([ours], truths)
 
 
+def test_a_turned_photo_has_its_upright_size(tmp_path: Path) -> None:
+    upright = Image.fromarray((picture("a") * 255).astype(np.uint8))  # 9 x 6
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn to be made when it is shown
+    (tmp_path / "ours").mkdir()
+    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "ours/a.jpg", exif=exif, quality=100)
+    save(tmp_path / "truth/a.exr", picture("a"))
+    comparison = compare_pair(collect_pairs([tmp_path / "ours"], tmp_path / "truth")[0])
+    assert comparison.predictions["ours"].shape == comparison.truth.shape == SHAPE
+
+
 def test_masks_are_the_pictures_values_then_alpha_then_all(truths: Path, ours: Path) -> None:
     alpha = np.full(SHAPE[:2], 0.25, np.float32)
     save(truths / "anna/two.exr", picture(NAMES[1]), alpha)
