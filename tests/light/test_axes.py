@@ -1,0 +1,151 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.light.axes import (
+    MapAxes,
+    from_dpr,
+    from_map_axes,
+    from_sfsnet,
+    to_dpr,
+    to_map_axes,
+    to_sfsnet,
+)
+from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.sh import irradiance, rig_coefficients
+from facerf_cli.light.sphere import (
+    azel_to_direction,
+    direction_to_uv,
+    latlong_directions,
+    latlong_solid_angles,
+    rig_directions,
+)
+
+NORMALS = rig_directions(60).double()
+
+
+def drawn_light() -> Tensor:
+    return torch.randn(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+
+def dpr_shading(normals: np.ndarray, nine: np.ndarray) -> np.ndarray:
+    """DPR's shading at normals [N, 3] in its axes, written out from its published formula."""
+    x, y, z = normals.T
+    a0, a1, a2 = math.pi, 2 * math.pi / 3, math.pi / 4
+    terms = [
+        a0 * 0.5 / math.sqrt(math.pi) * np.ones_like(x),
+        a1 * math.sqrt(3 / (4 * math.pi)) * y,
+        a1 * math.sqrt(3 / (4 * math.pi)) * z,
+        a1 * math.sqrt(3 / (4 * math.pi)) * x,
+        a2 * math.sqrt(15 / (4 * math.pi)) * x * y,
+        a2 * math.sqrt(15 / (4 * math.pi)) * y * z,
+        a2 * math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
+        a2 * math.sqrt(15 / (4 * math.pi)) * x * z,
+        a2 * math.sqrt(15 / (16 * math.pi)) * (x * x - y * y),
+    ]
+    return np.stack(terms, -1) @ nine
+
+
+def test_dprs_shading_is_our_white_surfaces_radiance() -> None:
+    grey = drawn_light()[:, :1].expand(9, 3)
+    nine = to_dpr(grey)
+    in_dprs_axes = torch.stack([NORMALS[:, 0], -NORMALS[:, 2], NORMALS[:, 1]], -1)
+    shading = torch.from_numpy(dpr_shading(in_dprs_axes.numpy(), nine.numpy()))
+    ours = irradiance(NORMALS, grey)[:, 0] / math.pi
+    torch.testing.assert_close(shading, ours, rtol=0, atol=1e-6)
+    torch.testing.assert_close(from_dpr(nine), grey)
+
+
+def test_dprs_own_example_lights_the_right_of_a_face_from_the_front() -> None:
+    # data/example_light/rotate_light_1/txt/rotate_light_01.txt of its repository, to five digits
+    example = [1.08413, -0.46427, 0.08723, 0.67148, -0.36221, 0.01640, -0.23573, -0.02072, 0.29257]
+    coefficients = from_dpr(torch.tensor(example))
+    right, left, front, back = irradiance(
+        torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1]]), coefficients
+    )
+    assert right[0] > 2 * left[0] and front[0] > 1.5 * back[0]
+
+
+def test_a_coloured_light_becomes_its_luminance() -> None:
+    nine = from_dpr(to_dpr(drawn_light()))
+    torch.testing.assert_close(nine[:, 0], drawn_light() @ torch.tensor([0.2126, 0.7152, 0.0722]).double())
+
+
+def test_sfsnets_order_and_channels() -> None:
+    light = rig_coefficients(RigLight(azel_to_direction(90, 0)[None], torch.tensor([[1.0, 0, 0]])), 2)
+    numbers = to_sfsnet(light).reshape(3, 9)
+    assert numbers[1:].abs().max() == 0
+    # The light comes from +x: only 1, x, 3z^2-1 (as -1) and x^2-y^2 are lit, in SfSNet's places for them.
+    assert (numbers[0].abs() > 1e-3).tolist() == [True, False, True, False, True, False, False, True, False]
+    assert numbers[0, 2] > 0 and numbers[0, 4] < 0
+    torch.testing.assert_close(from_sfsnet(to_sfsnet(drawn_light())), drawn_light())
+
+
+@pytest.mark.parametrize("height", [64, 33])
+def test_maps_turn_and_turn_back(height: int) -> None:
+    axes: MapAxes
+    for axes in ("facerf", "blender", "mitsuba"):
+        smooth = torch.linspace(0, 2 * math.pi, 2 * height + 1)[:-1].cos() + 2
+        envmap = smooth[None, :, None].expand(height, 2 * height, 3)
+        back = from_map_axes(to_map_axes(envmap, axes), axes)
+        torch.testing.assert_close(back, envmap, rtol=0, atol=0 if height % 2 == 0 else 5e-3)
+
+
+def test_blenders_map_is_read_by_its_formula() -> None:
+    direction = azel_to_direction(54, 36).double()  # to the picture's right, above, in front
+    u, v = direction_to_uv(direction).tolist()
+    envmap = torch.zeros(180, 360, 3)
+    envmap[int(v * 180), int(u * 360)] = 1
+    row, column = divmod(int(to_map_axes(envmap, "blender")[..., 0].argmax()), 360)
+    x, y, z = direction[0], -direction[2], direction[1]  # Blender's: the head looks along -Y, Z up
+    blender_u = 0.5 - math.atan2(y, x) / (2 * math.pi)
+    blender_v = 1 - math.acos(z) / math.pi  # 1 at the top
+    assert column + 0.5 == pytest.approx(blender_u * 360, abs=1)
+    assert row + 0.5 == pytest.approx((1 - blender_v) * 180, abs=1)
+    # In Blender 4.5 (bpy, Cycles) a spot at u = 0.6, 0.3 from the top lit a ball from (0.658, 0.595, 0.463).
+    assert (blender_u, 1 - blender_v) == pytest.approx((0.6, 0.3), abs=1e-3)
+    assert direction.tolist() == pytest.approx((0.658, 0.595, 0.463), abs=0.02)
+
+
+def test_mitsuba_sees_our_map_as_it_stands() -> None:
+    mitsuba = pytest.importorskip("mitsuba", reason="Mitsuba is not installed (extra [synth])")
+    mitsuba.set_variant("scalar_rgb")
+    direction = azel_to_direction(54, 36)
+    u, v = direction_to_uv(direction).tolist()
+    envmap = torch.full((64, 128, 3), 0.1)
+    envmap[int(v * 64) - 1 : int(v * 64) + 1, int(u * 128) - 1 : int(u * 128) + 1] = torch.tensor(
+        [600.0, 400, 200]
+    )
+    bitmap = mitsuba.Bitmap(to_map_axes(envmap, "mitsuba").numpy())
+    scene = mitsuba.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct", "hide_emitters": True},
+            "sky": {"type": "envmap", "bitmap": bitmap},
+            "ball": {
+                "type": "sphere",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}},
+            },
+            "camera": {
+                "type": "orthographic",
+                "to_world": mitsuba.ScalarTransform4f().look_at(
+                    origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]
+                ),
+                "film": {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": 128},
+            },
+        }
+    )
+    picture = torch.from_numpy(np.array(mitsuba.render(scene, seed=1), np.float32)[..., :3])
+    x, y = torch.meshgrid((torch.arange(24) + 0.5) / 12 - 1, 1 - (torch.arange(24) + 0.5) / 12, indexing="xy")
+    seen = x * x + y * y < 0.7
+    normals = torch.stack([x, y, (1 - x * x - y * y).clamp(min=0).sqrt()], -1)[seen]
+    rig = latlong_directions(64, 128).reshape(-1, 3)
+    power = (envmap * latlong_solid_angles(64, 128)[..., None]).reshape(-1, 3)
+    truth = (normals @ rig.T).clamp(min=0) @ power / math.pi
+    assert float((picture[seen] - truth).abs().mean()) < 0.05 * float(truth.mean())
+    mirrored = truth.reshape(-1, 3).flip(0)
+    assert float((picture[seen] - mirrored).abs().mean()) > 0.3 * float(truth.mean())  # it could fail
