@@ -20,6 +20,7 @@ from facerf_cli import __version__
 from facerf_cli.commands import evaluate, face_model
 from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.envmap import envmap
+from facerf_cli.commands.estimate_light import estimate_light
 from facerf_cli.commands.fit_geometry import fit_geometry
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
@@ -33,6 +34,7 @@ from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 
 VERBS: tuple[Callable[..., Any], ...] = (
     relight,
+    estimate_light,
     predict_olat,
     fit_geometry,
     synth_stage,

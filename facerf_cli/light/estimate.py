@@ -1,10 +1,11 @@
 """The light of a photo by least squares over a field's single lights (paper, 'Light Estimation')."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import qr
+from scipy.linalg import cholesky, qr, solve_triangular
 from scipy.optimize import nnls
 from torch import Tensor
 
@@ -12,7 +13,9 @@ from facerf_cli.errors import InputError
 
 _RIDGE = 0.02  # against lights that undo each other, as a share of the picture's norm
 _OUTLIER = 3.0  # a texel further off than this many median errors weighs in inverse proportion
-_ROUNDS, _ROUNDS_CLIPPED = 3, 6  # of reweighting; which texels stay clipped takes longer to settle
+_ROUNDS = 3  # of reweighting
+_SMOOTH, _COLOURED, _LENGTH = 0.05, 0.1, 1e-3  # of `estimate_smooth_light`, as shares of the picture's norm
+_NEIGHBOURHOOD = 1.5  # standard deviation of what is around a light, in mean distances between lights
 _WHITE = 0.95  # of a picture that ends at 1: what was brighter lies, averaged with its neighbours, above this
 _LEAST_TEXELS = 200  # fewer say nothing of where light comes from
 _BLACK = 1e-4  # the mean of a face that nothing lights: below one step of 8 bits
@@ -63,24 +66,37 @@ class LightEvidence:
         return float(error.norm() / photo.norm().clamp_min(1e-12))
 
     def least_squares(self, non_negative: bool = True) -> Tensor:
-        """Weights [L, 3]: `estimate_light` or `plain_estimate` over the mask."""
+        """Weights [L, 3] over the mask: by `estimate_smooth_light`, or the paper's own `plain_estimate`."""
         olats, photo = self.olats[..., self.mask], self.photo[:, self.mask]
         if not non_negative:
             return plain_estimate(olats, photo)
-        return estimate_light(olats, photo, self.clipped[:, self.mask])
+        return estimate_smooth_light(self.directions, olats, photo, self.clipped[:, self.mask])
 
 
-def estimate_light(olats: Tensor, picture: Tensor, clipped: Tensor | None = None) -> Tensor:
+def estimate_light(olats: Tensor, picture: Tensor) -> Tensor:
     """Non-negative weights [L, C] with which lights' pictures [L, C, N] sum to a picture [C, N].
 
-    Eq. (leastsq) of the paper, a channel at a time, with what is covered or misfitted weighing less
-    (iteratively reweighted least squares). `clipped` [C, N] bool marks what is at white in the picture: there
-    only being too dark is an error. Everything is scene-linear.
+    Eq. (leastsq) of the paper, a channel at a time, with what is clipped, covered or misfitted weighing less
+    (iteratively reweighted least squares). Everything is scene-linear.
     """
-    if clipped is None:
-        clipped = torch.zeros_like(picture, dtype=torch.bool)
-    channels = [_weights(a, b, c) for a, b, c in zip(olats.unbind(1), picture, clipped, strict=True)]
+    channels = [_weights(a, b) for a, b in zip(olats.unbind(1), picture, strict=True)]
     return torch.from_numpy(np.stack(channels, -1)).float()
+
+
+def _weights(olats: Tensor, picture: Tensor) -> np.ndarray:
+    lights, target = olats.double().T.numpy(), picture.double().numpy()  # [N, L], [N]
+    if not len(target):  # nothing is seen well enough
+        return np.zeros(lights.shape[1])
+    ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
+    trust = np.ones(len(target))
+    for _ in range(_ROUNDS):
+        rows = np.concatenate([lights * trust[:, None], ridge])
+        basis, square = qr(rows, mode="economic")  # as small a problem as there are lights
+        weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
+        error = np.abs(lights @ weights - target)
+        limit = _OUTLIER * np.median(error) + 1e-12
+        trust = np.sqrt(np.minimum(1, limit / np.maximum(error, limit)))
+    return np.asarray(weights)
 
 
 def plain_estimate(olats: Tensor, picture: Tensor) -> Tensor:
@@ -95,20 +111,90 @@ def plain_estimate(olats: Tensor, picture: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def _weights(olats: Tensor, picture: Tensor, clipped: Tensor) -> np.ndarray:
-    lights, target = olats.double().T.numpy(), picture.double().numpy()  # [N, L], [N]
-    white = clipped.numpy()
-    if not len(target):  # nothing is seen well enough
-        return np.zeros(lights.shape[1])
-    ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
-    trust = np.ones(len(target))
-    for _ in range(_ROUNDS_CLIPPED if white.any() else _ROUNDS):
-        rows = np.concatenate([lights * trust[:, None], ridge])
-        basis, square = qr(rows, mode="economic")  # as small a problem as there are lights
-        weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
-        beyond = lights @ weights - target
-        error = np.abs(np.where(white, np.minimum(beyond, 0), beyond))
-        limit = _OUTLIER * np.median(error[~white] if not white.all() else error) + 1e-12
-        trust = np.sqrt(np.minimum(1, limit / np.maximum(error, limit)))
-        trust[white & (beyond > 0)] = 0
-    return np.asarray(weights)
+def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, clipped: Tensor) -> Tensor:
+    """Eq. (leastsq) for a light that is to be looked at: non-negative, smooth where the face leaves it open.
+
+    Of lights at directions [L, 3], whose pictures [L, 3, N] are to sum to a picture [3, N]. A face fixes few
+    numbers of the hundreds sought, and a channel at a time the rest comes out as coloured specks. So first
+    all channels share one grey light in one colour, of which what differs from its neighbours is kept small;
+    then each channel goes its own way from there as far as the picture asks for it. What is covered or
+    misfitted weighs less; where `clipped` [3, N] bool, only being too dark is an error.
+    """
+    channels = [
+        _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
+        for lights, target, white in zip(olats.unbind(1), picture, clipped, strict=True)
+    ]
+    grey, colour = _grey_light(channels, _roughness(directions.double().numpy()))
+    own = [channel.near(gain * grey) for channel, gain in zip(channels, colour, strict=True)]
+    return torch.from_numpy(np.stack(own, -1)).float()
+
+
+def _grey_light(channels: "list[_Channel]", roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The light [L] that all channels share, and how much of it each has [3]."""
+    power = sum(channel.power for channel in channels)
+    prior = power * (_SMOOTH**2 * roughness + _LENGTH**2 * np.eye(len(roughness)))
+    colour = np.array([channel.gain_of(np.ones(len(roughness))) for channel in channels])
+    colour /= max(colour.mean(), 1e-12)
+    for _ in range(_ROUNDS):
+        gram, moment = prior.copy(), np.zeros(len(prior))
+        for channel, gain in zip(channels, colour, strict=True):
+            gram += gain * gain * channel.gram()
+            moment += gain * channel.moment()
+        grey = _non_negative(gram, moment)
+        for channel, gain in zip(channels, colour, strict=True):
+            channel.weigh_anew(gain * grey)
+        colour = np.array([channel.gain_of(grey) for channel in channels])
+    return grey, colour
+
+
+class _Channel:
+    """One colour of the pictures under each light [N, L] and of the photo [N], and each texel's trust."""
+
+    def __init__(self, lights: np.ndarray, target: np.ndarray, clipped: np.ndarray) -> None:
+        self._lights, self._target, self._clipped = lights, target, clipped
+        self._trust = np.ones(len(target))  # of its squared error
+        self.power = float(target @ target)
+
+    def gram(self) -> np.ndarray:
+        return (self._lights.T * self._trust) @ self._lights
+
+    def moment(self) -> np.ndarray:
+        return self._lights.T @ (self._trust * self._target)
+
+    def gain_of(self, weights: np.ndarray) -> float:
+        """What `weights` are best multiplied by."""
+        explained = self._lights @ weights
+        return float(
+            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, 1e-12)
+        )
+
+    def weigh_anew(self, weights: np.ndarray) -> None:
+        """Trust each texel by its error under the weights (Huber); none that is clipped and bright enough."""
+        beyond = self._lights @ weights - self._target
+        error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
+        told = error if self._clipped.all() else error[~self._clipped]
+        limit = _OUTLIER * np.median(told) + 1e-12
+        self._trust = np.minimum(1, limit / np.maximum(error, limit)) * ~(self._clipped & (beyond > 0))
+
+    def near(self, wanted: np.ndarray) -> np.ndarray:
+        """The weights [L] that explain this channel, held near the `wanted` ones."""
+        hold = max(self.power, 1e-12) * _COLOURED**2
+        for _ in range(_ROUNDS):
+            weights = _non_negative(self.gram() + hold * np.eye(len(wanted)), self.moment() + hold * wanted)
+            self.weigh_anew(weights)
+        return weights
+
+
+def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
+    """argmin over x >= 0 of x' gram x - 2 moment' x, by Lawson and Hanson's NNLS on the Cholesky factor."""
+    factor = cholesky(gram, lower=True)
+    return np.asarray(nnls(factor.T, solve_triangular(factor, moment, lower=True))[0])
+
+
+def _roughness(directions: np.ndarray) -> np.ndarray:
+    """R [L, L] with w' R w = the squared difference of each light from the mean around it, summed."""
+    spacing = math.sqrt(4 * math.pi / len(directions))
+    near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
+    np.fill_diagonal(near, 0)
+    own = np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), 1e-12)
+    return own.T @ own
