@@ -7,16 +7,13 @@
 at white, of the source in the light that each model reads off it, and of sums of eight lights.
 
 --dataset: as a user's photo is taken, on people of a prepared dataset: pictures of the crop at 256 texels,
-the mean of the truth in the mask brought to 0.25. Beside the baseline (`network`) stand the two forms of it
-that were not taken or were: `low-pass`, its albedo from a texture of the network's own side, and `refitted`,
-its light solved for by least squares given its albedo, in the place of the network's.
+the mean of the truth in the mask brought to 0.25. Beside the baseline stand two forms of it that were not
+taken: `low-pass`, its albedo at the network's own side, and `network`, its light as the network has it.
 """
 
 import argparse
-import math
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +21,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from facerf_cli.baselines.diffuse_sh import CHECKPOINT, Diffuse, explain_texture, load_diffuse_network
+from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
 from facerf_cli.baselines.field import Field, explain_by_field
 from facerf_cli.baselines.reflectance import Explained
 from facerf_cli.evaluation.views import View
@@ -32,11 +29,9 @@ from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.intervals import mean_interval
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sh import coefficients_to_rig, irradiance
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.metrics import si_mse_clipped
-from facerf_cli.network.diffuse import COEFFICIENTS, DiffuseNetwork
+from facerf_cli.network.diffuse import DiffuseNetwork
 from facerf_cli.network.losses import clipped_si_mse
 from facerf_cli.objectives.diffuse import draw_sums, explained, summed
 from facerf_cli.objectives.objective import seeded
@@ -49,7 +44,7 @@ from facerf_cli.stage.samples import Sample
 
 _COARSE_RIG = 50  # lights over which the field explains a source
 _HELD_OUT, _LIGHTS, _SUMS = 12, 8, 3  # of the stage's validation
-_METHODS = ("field", "network", "low-pass", "refitted")
+_METHODS = ("field", "diffuse-sh", "low-pass", "network")
 _MEAN = 0.25  # of a truth, in its mask
 Errors = dict[tuple[str, str], list[tuple[str, float]]]  # by figure and method: (person, error)
 
@@ -159,21 +154,7 @@ def _on_pair(
 def _explained(method: str, models: Models, network: DiffuseNetwork, face: FaceTexture) -> Explained:
     if method == "field":
         return explain_by_field(models, face, held_to_photo=False)
-    found = explain_texture(network, face, fine=method != "low-pass")
-    return _refitted(found, face) if method == "refitted" else found
-
-
-def _refitted(found: Explained, face: FaceTexture) -> Explained:
-    """The light of order 2 that explains the seen texture best, given the albedo."""
-    reflectance, seen = found.reflectance, face.visible > 0.9
-    assert isinstance(reflectance, Diffuse)
-    white = irradiance(face.normals[:, seen].T, torch.eye(COEFFICIENTS)) / math.pi  # [N, 9]
-    channels = [
-        torch.linalg.lstsq(albedo[seen, None] * white, texture[seen, None]).solution[:, 0]
-        for albedo, texture in zip(reflectance.albedo, face.texture, strict=True)
-    ]
-    rig = found.light.directions
-    return replace(found, light=RigLight(rig, coefficients_to_rig(torch.stack(channels, -1), rig)))
+    return explain_texture(network, face, fine=method != "low-pass", refit=method != "network")
 
 
 def _view(models: Models, dataset: Dataset, subject: str, camera: str) -> View:

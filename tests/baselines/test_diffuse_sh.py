@@ -4,10 +4,11 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.baselines.diffuse_sh import CHECKPOINT, Diffuse, load_diffuse_network
+from facerf_cli.baselines.diffuse_sh import CHECKPOINT, Diffuse, load_diffuse_network, refitted
 from facerf_cli.errors import InputError
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.pipeline import DEFAULT_CHECKPOINT
+from facerf_cli.network.diffuse import shading
+from facerf_cli.pipeline import DEFAULT_CHECKPOINT, FaceTexture
 from facerf_cli.raster.camera import pose_to_rotation
 
 
@@ -53,3 +54,21 @@ def test_a_checkpoint_without_the_network_is_named() -> None:
     with pytest.raises(InputError, match="no such checkpoint"):
         load_diffuse_network(Path("nobody.safetensors"))
     assert CHECKPOINT.parent == DEFAULT_CHECKPOINT.parent
+
+
+def test_the_light_is_solved_for_in_spite_of_what_is_clipped_or_covered() -> None:
+    normals, albedo, true = ball(24), 0.1 + 0.3 * torch.rand(3, 24, 24), 0.3 * torch.randn(9, 3)
+    true[0] += 4.0
+    lit = albedo * shading(normals[None], true[None, None])[0, 0]
+    texture = lit.clone()
+    texture[:, :5, :6] = 1.0
+    visible = torch.ones(24, 24)
+    visible[:, -2:] = 0
+    texture[:, :, -2:] = 7.0
+    start = torch.zeros(9, 3)
+    found = refitted(Diffuse(albedo, normals), FaceTexture(texture, visible, normals), start)
+    again = albedo * shading(normals[None], found[None, None])[0, 0]
+    error = (again - lit).abs()[:, 6:, :-2] / lit[:, 6:, :-2]
+    assert error.median() < 0.02
+    kept = refitted(Diffuse(albedo, normals), FaceTexture(lit, visible, normals), true)
+    assert torch.allclose(kept, true, atol=1e-3)
