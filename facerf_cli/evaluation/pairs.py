@@ -104,7 +104,7 @@ def _check_folders(predictions: Sequence[Path], folders: Sequence[Path]) -> None
 
 def _pictures_in(folder: Path, leave_out: Sequence[Path]) -> dict[str, Path]:
     """Pictures by name, hidden ones and those of folders to be left out not among them."""
-    elsewhere = {other.resolve() for other in leave_out} - {folder.resolve()}
+    elsewhere = {other.resolve() for other in leave_out}
     found: dict[str, Path] = {}
     for here, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f[0] != "." and (Path(here) / f).resolve() not in elsewhere]

@@ -1,6 +1,7 @@
 """Descriptors tell people apart, and say nothing of where a face stands in its picture."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from facerf_cli.face import landmarks, recognition
 from facerf_cli.face.landmarks import find_faces, to_display
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.files.images import read_image
+from facerf_cli.raster.camera import PIXEL_CENTRE
 
 PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 
@@ -38,6 +40,20 @@ def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
     elsewhere = face_descriptor(PHOTO, np.add(landmarks_px, (60, 90)))
     assert descriptor_distance(face_descriptor(darker, landmarks_px), descriptor) < 0.2
     assert descriptor_distance(elsewhere, descriptor) > 0.5
+
+
+def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Recorder:
+        def compute_face_descriptor(self, picture: np.ndarray, shape: Any) -> list[float]:
+            self.picture, self.points = picture, [(point.x, point.y) for point in shape.parts()]
+            return [0.0] * 128
+
+    recorder = Recorder()
+    monkeypatch.setattr(recognition, "_network", lambda: recorder)
+    places = np.stack([np.arange(68), 2 * np.arange(68)], -1)
+    face_descriptor(np.full((9, 7, 3), [0.2, 0.5, 1.3]), places + PIXEL_CENTRE + 0.2)
+    assert recorder.points == [tuple(place) for place in places.tolist()]  # a pixel's centre is whole there
+    assert recorder.picture.dtype == np.uint8 and recorder.picture[3, 3].tolist() == [51, 128, 255]
 
 
 def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> None:
