@@ -1,0 +1,192 @@
+"""The report: whole in one file, nothing of a name or a command becomes markup, worst cases first."""
+
+import base64
+import io
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from facerf_cli.evaluation.case_files import KeptStrip
+from facerf_cli.evaluation.measure import Row, measure
+from facerf_cli.evaluation.page import About, page
+from facerf_cli.evaluation.page_cases import BEST, TYPICAL, WORST, Chosen, choose
+from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST, strip_of
+from facerf_cli.evaluation.summary import Summary, summarise
+from tests.evaluation.toy_protocol import LAYOUT, NOISE, comparison, evaluate
+
+NASTY = '"><script>alert(1)</script>&'
+KNOWN = (
+    "id lang charset name content class style tabindex role aria-label aria-hidden focusable scope href "
+    "rowspan src alt width height x y x1 x2 y1 y2 cx cy r fill fill-opacity stroke stroke-width"
+)
+VOID = {"meta", "img", "line", "rect", "circle"}
+TILE, GAP = 192, 4
+
+
+class Reader(HTMLParser):
+    """Checks that tags nest, and collects them and their texts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.texts.append(data)
+
+
+def read(text: str) -> Reader:
+    reader = Reader()
+    reader.feed(text)
+    assert not reader.open
+    return reader
+
+
+def rows(errors: list[float], method: str = "ours") -> list[Row]:
+    return [
+        Row(f"case{n:03d}", f"p{n % 3}", method, {"pose": "same pose"}, {"si_mse": error})
+        for n, error in enumerate(errors)
+    ]
+
+
+def strips(found: list[Row]) -> list[KeptStrip]:
+    return [
+        KeptStrip(row.case, f"strips/{row.case}.jpg", ("ours",), 0.0, (1.0,), True, (392, 392))
+        for row in found
+    ]
+
+
+def write(summary: Summary, chosen: Chosen, command: str = "facerf evaluate") -> str:
+    jpegs = {case.strip.case: f"jpeg of {case.strip.case}".encode() for case in chosen.all()}
+    return page(summary, About(command, "1.2.3", {"checkpoint x": "abc"}), chosen, jpegs)
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    assert evaluate(folder) == 0
+    return folder / "report.html"
+
+
+def test_one_file_that_needs_nothing_else(report: Path) -> None:
+    text = report.read_text()
+    reader = read(text)
+    tags = [tag for tag, _ in reader.tags]
+    assert not {"script", "link", "iframe", "object"} & set(tags)
+    assert not re.search(r"(?:src|href)=\"(?!data:image/jpeg;base64,|#)", text) and "url(" not in text
+    images = [attributes for tag, attributes in reader.tags if tag == "img"]
+    assert len(images) == 12
+    for image in images:
+        picture = Image.open(io.BytesIO(base64.b64decode(image["src"].split(",")[1])))
+        assert (picture.width, picture.height) == (int(image["width"]), int(image["height"]))
+        assert "above the truth" in image["alt"] and "good, bad <i>" in image["alt"]
+    ids = {attributes["id"] for _, attributes in reader.tags if "id" in attributes}
+    assert {attributes["href"][1:] for tag, attributes in reader.tags if tag == "a"} == ids
+
+
+def test_what_is_said_is_there(report: Path) -> None:
+    words = " ".join(read(report.read_text()).texts)
+    for said in (
+        "Toy <pictures> & more", "12 pictures of 3 people", "A note with a <b>tag</b>.", "By pose",
+        "the paper's, published (Table 1)", "other data than ours", "0.00070", "95 % interval", "By angle",
+    ):  # fmt: skip
+        assert said in words, said
+    assert "SHA-256" not in words  # no network was asked for
+
+
+def test_nothing_becomes_markup() -> None:
+    found = [
+        replace(row, case=row.case + NASTY, person=NASTY, method=NASTY, facts={NASTY: NASTY})
+        for row in rows([1, 2])
+    ]
+    layout = replace(LAYOUT, title=NASTY, notes=(NASTY,), by=(NASTY,))
+    summary = summarise(layout, found)
+    kept = [replace(strip, methods=(NASTY,)) for strip in strips(found)]
+    reader = read(write(summary, choose(summary, found, kept), NASTY))
+    assert "script" not in {tag for tag, _ in reader.tags}
+    assert {name for _, attributes in reader.tags for name in attributes} <= set(KNOWN.split())
+
+
+def test_the_worst_come_first_and_the_page_is_bounded() -> None:
+    errors = list(np.random.default_rng(0).permutation(100) / 100)
+    found = rows(errors)
+    chosen = choose(summarise(LAYOUT, found), found, strips(found))
+    shown = [case.rows[0].values["si_mse"] for case in chosen.all()]
+    assert shown[:WORST] == sorted(errors)[::-1][:WORST]
+    assert shown[-BEST:] == sorted(errors)[:BEST]
+    assert [round(abs(x - 0.495), 3) for x in shown[WORST:-BEST]] == [0.005, 0.005, 0.015, 0.015]
+    assert len(shown) == WORST + TYPICAL + BEST
+    few = choose(summarise(LAYOUT, found[:9]), found[:9], strips(found[:9]))
+    assert len(few.worst) == 9 and not few.best
+
+
+def test_for_a_similarity_the_worst_are_the_lowest() -> None:
+    found = [replace(row, values={"ssim": row.values["si_mse"]}) for row in rows([0.3, 0.1, 0.2])]
+    summary = summarise(replace(LAYOUT, metrics=("ssim",)), found)
+    chosen = choose(summary, found, strips(found))
+    assert [case.rows[0].values["ssim"] for case in chosen.worst] == [0.1, 0.2, 0.3]
+
+
+def test_equal_figures_give_equal_bytes() -> None:
+    found = rows([0.3, 0.1, 0.2])
+    summary = summarise(LAYOUT, found)
+    assert write(summary, choose(summary, found, strips(found))) == write(
+        summary, choose(summary, found, strips(found)[::-1])
+    )
+
+
+def test_a_strip_shows_what_was_compared() -> None:
+    own = comparison("bea", 0)
+    own = replace(own, predictions={"half": 0.5 * own.truth, "none": 0 * own.truth})
+    strip = strip_of(own, scaled=True)
+    height = round(TILE * own.truth.shape[0] / own.truth.shape[1])
+    assert strip.pixels.shape == (2 * (height + GAP), 3 * (TILE + GAP), 3)
+    assert strip.scales[0] == pytest.approx(2) and strip.scales[1] == 0
+    middle = (height + GAP + height // 2, 3 * (TILE + GAP) - GAP - TILE // 2)  # of the last error map
+    half = strip.pixels[middle[0], middle[1] - TILE - GAP]
+    np.testing.assert_array_equal(half, ERROR_COLOURS[0])  # at its scale, nothing is wrong
+    np.testing.assert_array_equal(
+        strip.pixels[middle], ERROR_COLOURS[-1]
+    )  # black is wrong by more than the most
+    truth = strip.pixels[height + GAP + height // 2, TILE // 2]
+    shown = strip.pixels[height // 2, TILE + GAP + TILE // 2]
+    np.testing.assert_allclose(shown, truth, atol=1)
+    unscaled = strip_of(own, scaled=False)
+    assert unscaled.scales == (1, 1)
+    assert not np.array_equal(unscaled.pixels[middle[0], middle[1] - TILE - GAP], ERROR_COLOURS[0])
+
+
+def test_error_colours_rise_in_lightness_and_reach_their_end() -> None:
+    lightness = np.array(ERROR_COLOURS) @ [0.2126, 0.7152, 0.0722]
+    assert (np.diff(lightness) > 20).all() and ERROR_HIGHEST == 0.2
+
+
+def test_strips_agree_with_the_figures_about_the_scale() -> None:
+    own = comparison("anna", 1)
+    (good, _) = measure(own, _measures())
+    strip = strip_of(own, scaled=True)
+    inside = own.mask > 0
+    apart = strip.scales[0] * own.predictions["good"] - own.truth
+    assert good.values["si_mse"] == pytest.approx(float((apart[inside] ** 2).mean()), rel=1e-4)
+    assert strip.methods == tuple(NOISE)
+
+
+def _measures():
+    from facerf_cli.evaluation.measure import Measures
+
+    return Measures()
