@@ -18,6 +18,7 @@ import typer
 
 from facerf_cli import __version__
 from facerf_cli.commands import evaluate, face_model
+from facerf_cli.commands.convert_light import convert_light
 from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.envmap import envmap
 from facerf_cli.commands.estimate_light import estimate_light
@@ -35,6 +36,7 @@ from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
 VERBS: tuple[Callable[..., Any], ...] = (
     relight,
     estimate_light,
+    convert_light,
     predict_olat,
     fit_geometry,
     synth_stage,
