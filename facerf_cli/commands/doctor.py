@@ -127,12 +127,18 @@ def _checkpoint(path: Path) -> dict[str, Any]:
 
 def _landmark_model() -> dict[str, str]:
     from facerf_cli.face.landmarks import DETECTOR_LICENCE, PREDICTOR_LICENCE, predictor_path
+    from facerf_cli.face.recognition import RECOGNITION_LICENCE
 
     try:
         size = _size(predictor_path())
     except FacerfError as error:
         size = f"{MISSING}: {error}"
-    return {"points": PREDICTOR_LICENCE, "size": size, "detector": DETECTOR_LICENCE}
+    return {
+        "points": PREDICTOR_LICENCE,
+        "size": size,
+        "detector": DETECTOR_LICENCE,
+        "recognition": RECOGNITION_LICENCE,
+    }
 
 
 def _colour_configuration() -> dict[str, Any]:

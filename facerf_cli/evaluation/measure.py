@@ -29,6 +29,7 @@ class Metric:
 METRICS: Mapping[str, Metric] = {  # by name, in the order of tables; a row has those that it could have
     "si_mse": Metric("Si-MSE"),
     "si_mse_clipped": Metric("Si-MSE, truth clipped at white"),
+    "si_mse_channels": Metric("Si-MSE, a scale for each channel"),
     "mse": Metric("MSE"),
     "psnr": Metric("PSNR, dB", lower_is_better=False, digits=2),
     "ssim": Metric("SSIM", lower_is_better=False, digits=4),

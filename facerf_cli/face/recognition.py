@@ -8,7 +8,10 @@ import numpy as np
 from facerf_cli.face.landmarks import bundled_model
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
-RECOGNITION_LICENCE = "dlib_face_recognition_resnet_model_v1: public domain (CC0), by Davis King"
+RECOGNITION_LICENCE = (
+    "dlib_face_recognition_resnet_model_v1: in the public domain (Davis King); trained on FaceScrub, VGG "
+    "Face and pictures of the web"
+)
 _NETWORK_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
 
