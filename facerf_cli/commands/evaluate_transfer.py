@@ -91,10 +91,13 @@ def transfer(
     layout = Layout(
         name="transfer",
         title="Reflectances of two pictures of a person exchanged",
-        metrics=("si_mse", "face_distance", "ssim"),
-        by=() if photos else ("tone",),
+        metrics=("si_mse", "face_distance", "si_mse_channels", "ssim"),
+        by=("turn",) if photos else ("turn", "tone"),
         published=TABLE_2_TRANSFER,
-        notes=("The field is the network's own, not held to a photo.",),
+        notes=(
+            "The field is the network's own, not held to a photo.",
+            "si_mse_channels has a scale for each channel: one photo cannot tell red light from red skin.",
+        ),
     )
     return run_protocol(layout, items, work, options, settings)
 
@@ -118,7 +121,24 @@ def _chosen_couples(
     return {name: members for name, members in chosen.items() if members}
 
 
-def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, tuple[Item, Item]]:
+@dataclass(frozen=True)
+class _Couple:
+    """Two photos of a person."""
+
+    person: str
+    first: Item
+    second: Item
+
+    @property
+    def item(self) -> Item:
+        """The couple under the first one's place, both in its name."""
+        tail = f"--{Path(self.second.name).name}"
+        return Item(
+            self.first.input_path, Path(f"{self.first.output_base}{tail}"), f"{self.first.name}{tail}"
+        )
+
+
+def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     """An item a couple: files two by two as they are named, folders' files two by two in their order."""
     files = [name for name in inputs if not os.path.isdir(name)]
     if len(files) % 2:
@@ -130,18 +150,15 @@ def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, tuple[Item
     for item in found:
         if item not in named:
             groups.setdefault(item.input_path.parent, []).append(item)
-    couples = list(zip(named[::2], named[1::2], strict=True))
+    couples = [
+        _Couple(first.name, first, second) for first, second in zip(named[::2], named[1::2], strict=True)
+    ]
     for folder, members in groups.items():
         if len(members) < 2:
             raise UsageError(f"{folder}: one photo; give two of a person at least")
-        couples += zip(members[::2], members[1::2], strict=False)
-    return {_couple_item(*couple): couple for couple in couples}
-
-
-def _couple_item(first: Item, second: Item) -> Item:
-    """The couple under the first one's place, both in its name."""
-    tail = f"--{Path(second.name).name}"
-    return Item(first.input_path, Path(f"{first.output_base}{tail}"), f"{first.name}{tail}")
+        two_by_two = zip(members[::2], members[1::2], strict=False)
+        couples += [_Couple(str(folder), first, second) for first, second in two_by_two]
+    return {couple.item: couple for couple in couples}
 
 
 def _require_enough_photos(couples: Mapping[Item, object], options: EvaluateOptions) -> None:
@@ -156,7 +173,7 @@ class _OfPhotos:
     """Exchanges the reflectances of two photos."""
 
     methods: MethodOptions
-    couples: Mapping[Item, tuple[Item, Item]]
+    couples: Mapping[Item, _Couple]
     keep_eyes: bool
 
     def __call__(self, item: Item) -> "Iterator[Comparison]":
@@ -165,8 +182,8 @@ class _OfPhotos:
 
         methods, sides = load_methods(self.methods), []
         couple = self.couples[item]
-        for own, other in (couple, couple[::-1]):
-            case = Case(f"{own.name}_by_{Path(other.name).name}", couple[0].name)
+        for own, other in ((couple.first, couple.second), (couple.second, couple.first)):
+            case = Case(f"{own.name}_by_{Path(other.name).name}", couple.person)
             portrait = next(portraits(own, self.methods.photo, self.keep_eyes))[1]
             sides.append(Side(case, portrait.view, portrait.picture, portrait.face))
         yield from transfer((sides[0], sides[1]), methods)

@@ -7,12 +7,12 @@ Beside the methods stands a naive twin, 'lambert': the source's own texture unde
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.evaluation.angles import angle_class, angle_of, turn_class
 from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person, Shot
@@ -23,7 +23,6 @@ from facerf_cli.pipeline import turn_to
 from facerf_cli.stage.data.recipes import Pair
 
 LAMBERT = "lambert"
-ANGLES_DEG = (0, 30, 60, 90, 180)  # between the light and the camera's axis
 _NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shape
 
 
@@ -54,7 +53,7 @@ def _compare(
 ) -> Comparison:
     picture, face = person.source(pair)
     fit, white = person.shot(pair.source_camera).view.fit, torch.ones(1, 1, 3)
-    cosine = torch.einsum("c,dc,dij->ij", asked.light, asked.turn, face.normals).clamp_min(0)
+    cosine = torch.einsum("c,cd,dij->ij", asked.light, asked.turn, face.normals).clamp_min(0)
     textures = {
         method.name: method.reflectance(fit, face, held_to_photo).relit(asked.light[None], white, asked.turn)[
             0
@@ -67,7 +66,7 @@ def _compare(
     view = asked.shot.view
     predictions = {name: view.picture(texture) for name, texture in textures.items()}
     comparison = Comparison(
-        Case(f"{pair.subject}/{pair.index:05d}", pair.subject, _facts(person, pair, asked.light)),
+        Case(f"{pair.subject}/{pair.index:05d}", pair.subject, _facts(person, pair, asked)),
         truth.permute(1, 2, 0).numpy(),
         view.mask,
         predictions,
@@ -76,23 +75,21 @@ def _compare(
     return _with_drift(comparison, person.albedo, view.region("skin"))
 
 
-def _facts(person: Person, pair: Pair, light: Tensor) -> dict[str, str | float]:
-    same = pair.source_camera == pair.target_camera
+def _facts(person: Person, pair: Pair, asked: _Question) -> dict[str, str | float]:
+    light, same = asked.light, pair.source_camera == pair.target_camera
+    turn_deg = angle_of(asked.turn)
     angle_deg = float(torch.rad2deg(light[2].clamp(-1, 1).acos()))
     azimuth_deg, elevation_deg = direction_to_azel(light)
     return {
         "pose": "same pose" if same else "different pose",
         "angle": angle_class(angle_deg),
+        "turn": turn_class(turn_deg),
         **person.facts,
+        "turn_deg": turn_deg,
         "angle_deg": angle_deg,
         "azimuth_deg": float(azimuth_deg),
         "elevation_deg": float(elevation_deg),
     }
-
-
-def angle_class(angle_deg: float) -> str:
-    """'0 to 30 deg' and so on, of the angle between a light and the camera's axis."""
-    return next(f"{low} to {high} deg" for low, high in pairwise(ANGLES_DEG) if angle_deg <= high)
 
 
 def _with_drift(comparison: Comparison, albedo: np.ndarray | None, skin: np.ndarray) -> Comparison:

@@ -6,19 +6,22 @@ not read off.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.evaluation.angles import angle_of, turn_class
 from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.methods import Method, relit_by
 from facerf_cli.evaluation.people import Person
 from facerf_cli.evaluation.views import View
+from facerf_cli.metrics import si_mse
 from facerf_cli.pipeline import FaceTexture, turn_to
 from facerf_cli.stage.data.recipes import Pair
 
+CHANNELS = "si_mse_channels"
 Sides = tuple["Side", "Side"]
 
 
@@ -52,8 +55,25 @@ def _made_of(
         name: view.picture(relit_by(others[name].reflectance, explained, turn))
         for name, explained in own.items()
     }
-    landmarks_px = view.fit.landmarks_px.numpy()
-    return Comparison(side.case, side.picture, view.mask, predictions, other.picture, landmarks_px)
+    turn_deg = angle_of(turn)
+    facts = {**side.case.facts, "turn": turn_class(turn_deg), "turn_deg": turn_deg}
+    return Comparison(
+        replace(side.case, facts=facts),
+        side.picture,
+        view.mask,
+        predictions,
+        other.picture,
+        view.fit.landmarks_px.numpy(),
+        {name: {CHANNELS: si_mse_channels(p, side.picture, view.mask)} for name, p in predictions.items()},
+    )
+
+
+def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """`si_mse` with a scale for each channel: what is left once the colour of light and skin is given.
+
+    One photo cannot tell a red light from red skin, so pictures in lights of two colours need not agree.
+    """
+    return float(np.mean([si_mse(prediction[..., c], truth[..., c], mask) for c in range(3)]))
 
 
 def transfer_person(

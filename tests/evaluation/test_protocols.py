@@ -1,0 +1,198 @@
+"""The protocols' geometry and bookkeeping on a tiny dataset whose truth is known in closed form."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.angles import angle_class, angle_of, turn_class
+from facerf_cli.evaluation.cases import Case
+from facerf_cli.evaluation.geometry import FULL, MEAN, Form, compare_geometries
+from facerf_cli.evaluation.olat import LAMBERT, compare_olats
+from facerf_cli.evaluation.people import Person, evenly
+from facerf_cli.evaluation.reconstruction import brightest, reconstruct
+from facerf_cli.evaluation.transfer import Side, couples_of, si_mse_channels, transfer
+from facerf_cli.evaluation.views import View
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.metrics import si_mse
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.stage.data.dataset import Dataset
+from facerf_cli.stage.data.recipes import Pair
+from tests.evaluation.method_doubles import BRIGHTEST, Double, PersonOfAlbedo
+from tests.stage.data.dataset_fixture import write_small_dataset
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_small_dataset(tmp_path_factory.mktemp("dataset"), counts=(0, 0, 1), lights=30, crop_px=96)
+
+
+@pytest.fixture(scope="module")
+def person(dataset: Dataset) -> Person:
+    return PersonOfAlbedo(load_face_model(), dataset, "0000")
+
+
+def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
+    return Pair("0000", index, "test", source, envmap, 0.0, 0, target, light)
+
+
+def side_light(person: Person, camera: str) -> int:
+    """A light from the side that the camera sees."""
+    directions = person.shot(camera).header.directions
+    return int(np.abs(directions @ np.array([0.7, 0.1, 0.7]) - 1).argmin())
+
+
+@pytest.mark.parametrize("target", ["C0", "C1"])
+def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, target: str) -> None:
+    asked = pair(3, "C0", target, side_light(person, target))
+    (found,) = compare_olats(person, [asked], [Double("unlit")], held_to_photo=True)
+    truth, mask = found.truth, found.mask
+    right = si_mse(found.predictions[LAMBERT], truth, mask)
+    wrong = si_mse(found.predictions["unlit"], truth, mask)
+    assert list(found.predictions) == ["unlit", LAMBERT] and found.case.name == "0000/00003"
+    assert right < 0.03 * wrong
+    same = target == "C0"
+    assert found.case.facts["pose"] == ("same pose" if same else "different pose")
+    assert found.case.facts["turn"] == (
+        "none" if same else "30 to 60 deg"
+    )  # the fixture's -15 and 20 degrees
+    assert found.case.facts["tone"] == "unknown" and not found.extra
+
+
+def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, dataset: Dataset) -> None:
+    traits = {"ita_deg": 30.0, "melanin": 0.05, "haemoglobin": 0.02, "random_texture": False}
+    known = PersonOfAlbedo(person.model, replace(dataset, traits={"0000": traits}), "0000")
+    front = int(known.shot("C0").header.directions[:, 2].argmax())
+    asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
+    near, aside = compare_olats(known, asked, [Double("unlit")], held_to_photo=False)
+    assert near.case.facts["tone"] == "intermediate"
+    assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
+    assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
+    assert not aside.extra
+    painted = replace(dataset, traits={"0000": traits | {"random_texture": True}})
+    assert PersonOfAlbedo(person.model, painted, "0000").facts == {"tone": "unknown"}
+
+
+def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) -> None:
+    picture, face = person.source(pair(0, "C0", "C0", 0))
+    truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
+    view = person.shot("C0").view
+    found = reconstruct(Case("a", "0000"), view, picture, face, [Double("unlit", gain=0.5)], truth)
+    error = si_mse(found.predictions["unlit"], picture, found.mask)
+    assert error < 0.01 * np.square(picture[found.mask > 0.5]).mean()
+    np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
+    assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
+    np.testing.assert_allclose(found.landmarks_px, person.shot("C0").view.fit.landmarks_px)
+
+
+def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
+    method = Double("unlit")
+    sides = []
+    for camera in ("C0", "C1"):
+        picture, face = person.source(pair(0, camera, camera, 0))
+        sides.append(Side(Case(f"by {camera}", "0000"), person.shot(camera).view, picture, face))
+    first, second = transfer((sides[0], sides[1]), [method])
+    a, b = method.made
+    ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
+    assert torch.equal(light_of_a[0], a.light.weights)
+    fits = [side.view.fit for side in sides]
+    torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
+    assert first.truth is sides[0].picture and first.source is sides[1].picture
+    assert second.case.facts["turn"] == "30 to 60 deg"
+    for found in (
+        first,
+        second,
+    ):  # the same face in another picture, so its texture fits but for what is hidden
+        energy = np.square(found.truth[found.mask > 0.5]).mean()
+        assert si_mse(found.predictions["unlit"], found.truth, found.mask) < 0.05 * energy
+        assert found.extra["unlit"]["si_mse_channels"] < 0.05 * energy
+
+
+def test_a_scale_a_channel_forgives_colour_alone() -> None:
+    truth, mask = np.random.default_rng(0).random((6, 8, 3)), np.ones((6, 8))
+    assert si_mse_channels(truth * [1, 2, 3], truth, mask) < 1e-20 < si_mse(truth * [1, 2, 3], truth, mask)
+    assert si_mse_channels(truth[::-1], truth, mask) > 0.01
+
+
+def test_the_mean_face_is_compared_where_both_see_the_face(person: Person) -> None:
+    model = person.model
+    people = {FULL: replace(person, refit=True, _shots={})}
+    people[MEAN] = replace(people[FULL], model=model.pose_only(), _shots={})
+    asked = pair(0, "C1", "C1", 0)
+    picture, _ = person.source(asked)
+    forms = {
+        name: Form(p.shot("C1").view, p.shot("C1").view.texture_of(picture), [Double("unlit")])
+        for name, p in people.items()
+    }
+    assert not forms[MEAN].view.fit.alpha.any() and forms[FULL].view.fit.alpha.any()
+    found = compare_geometries(Case("a", "0000"), picture, forms)
+    assert list(found.predictions) == [FULL, MEAN]
+    assert (found.mask <= forms[MEAN].view.mask).all() and (found.mask <= forms[FULL].view.mask).all()
+    two: dict[str, Any] = {
+        name: replace(form, methods=[Double("x"), Double("y")]) for name, form in forms.items()
+    }
+    names = list(compare_geometries(Case("a", "0000"), picture, two).predictions)
+    assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
+
+
+def test_open_eyes_are_left_out_unless_they_are_kept(person: Person) -> None:
+    shot = person.shot("C0")
+    kept = View.of(person.model, shot.view.fit, shot.header.seen, keep_eyes=True)
+    eyes = shot.view.region("eyes") > 0.9
+    assert eyes.sum() > 10 and shot.view.mask[eyes].max() < 0.11
+    assert kept.mask[eyes].min() > 0.5 and (kept.mask >= shot.view.mask).all()
+
+
+def test_a_face_of_which_nothing_is_seen_is_named(person: Person) -> None:
+    shot = person.shot("C0")
+    with pytest.raises(InputError, match="nothing of the fitted face"):
+        View.of(person.model, shot.view.fit, 0 * shot.header.seen)
+
+
+def test_couples_are_of_two_cameras_and_two_maps_and_each_picture_is_in_one() -> None:
+    sources = [("C0", "a"), ("C0", "b"), ("C1", "a"), ("C1", "a"), ("C1", "c"), ("C0", "a")]
+    pairs = [pair(index, camera, camera, 0, envmap) for index, (camera, envmap) in enumerate(sources)]
+    couples = [(a.index, b.index) for a, b in couples_of(pairs)]
+    assert couples == [(1, 2), (0, 4)]
+
+
+def test_a_preset_takes_the_first_of_each_before_the_second_of_any() -> None:
+    groups = {"a": [1, 2, 3, 4], "b": [5], "c": [6, 7]}
+    assert evenly(groups, 4) == {"a": [1, 2], "b": [5], "c": [6]}
+    assert evenly(groups, 99) == groups and evenly(groups, 1) == {"a": [1]}
+
+
+def test_classes_of_angles() -> None:
+    assert [angle_class(x) for x in (0, 30, 31, 180)] == [
+        "0 to 30 deg",
+        "0 to 30 deg",
+        "30 to 60 deg",
+        "90 to 180 deg",
+    ]
+    assert turn_class(0.1) == "none" and turn_class(100) == "60 to 180 deg"
+    assert abs(angle_of(pose_to_rotation(-50, 0, 0)) - 50) < 1e-3
+
+
+def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
+    from facerf_cli.main import main
+
+    dataset = write_small_dataset(tmp_path / "d", counts=(0, 0, 1), lights=12, crop_px=32)
+    assert (
+        main(["relight-dataset", str(dataset.folder), "--envmaps", "procedural:2", "--per-subject", "2"]) == 0
+    )
+    from facerf_cli.stage.data.pair_weights import weights_path
+    from facerf_cli.stage.data.recipes import picture_path, read_pairs
+
+    person, (first, second) = Person(load_face_model(), dataset, "0000"), read_pairs(dataset)
+    directions, weights = person.light(second)
+    assert directions.shape == (12, 3)
+    weights_path(dataset).unlink()
+    np.testing.assert_array_equal(person.light(second)[1], weights)
+    assert not weights_path(dataset).exists()
+    written, _ = person.source(first)
+    picture_path(dataset, *first.key).unlink()
+    np.testing.assert_array_equal(person.source(first)[0], written)
