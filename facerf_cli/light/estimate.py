@@ -14,7 +14,9 @@ from facerf_cli.errors import InputError
 _RIDGE = 0.02  # against lights that undo each other, as a share of the picture's norm
 _OUTLIER = 3.0  # a texel further off than this many median errors weighs in inverse proportion
 _ROUNDS = 3  # of reweighting
-_SMOOTH, _COLOURED, _LENGTH = 0.05, 0.1, 1e-3  # of `estimate_smooth_light`, as shares of the picture's norm
+_SMOOTH, _SHORT = 0.1, 0.01  # the grey light of `estimate_smooth_light`, as shares of the picture's norm;
+_SMOOTH_OWN, _SHORT_OWN = 1.0, 0.1  # and what each channel adds to it
+_TINY = 1e-12
 _NEIGHBOURHOOD = 1.5  # standard deviation of what is around a light, in mean distances between lights
 _WHITE = 0.95  # of a picture that ends at 1: what was brighter lies, averaged with its neighbours, above this
 _LEAST_TEXELS = 200  # fewer say nothing of where light comes from
@@ -63,7 +65,7 @@ class LightEvidence:
         photo, clipped = self.photo[:, self.mask], self.clipped[:, self.mask]
         error = explained[:, self.mask] - photo
         error = torch.where(clipped, error.clamp(max=0), error)
-        return float(error.norm() / photo.norm().clamp_min(1e-12))
+        return float(error.norm() / photo.norm().clamp_min(_TINY))
 
     def least_squares(self, non_negative: bool = True) -> Tensor:
         """Weights [L, 3] over the mask: by `estimate_smooth_light`, or the paper's own `plain_estimate`."""
@@ -94,7 +96,7 @@ def _weights(olats: Tensor, picture: Tensor) -> np.ndarray:
         basis, square = qr(rows, mode="economic")  # as small a problem as there are lights
         weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
         error = np.abs(lights @ weights - target)
-        limit = _OUTLIER * np.median(error) + 1e-12
+        limit = _OUTLIER * np.median(error) + _TINY
         trust = np.sqrt(np.minimum(1, limit / np.maximum(error, limit)))
     return np.asarray(weights)
 
@@ -117,24 +119,25 @@ def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, cl
     Of lights at directions [L, 3], whose pictures [L, 3, N] are to sum to a picture [3, N]. A face fixes few
     numbers of the hundreds sought, and a channel at a time the rest comes out as coloured specks. So first
     all channels share one grey light in one colour, of which what differs from its neighbours is kept small;
-    then each channel goes its own way from there as far as the picture asks for it. What is covered or
+    then each channel departs from that, again by what is smooth over the sphere. What is covered or
     misfitted weighs less; where `clipped` [3, N] bool, only being too dark is an error.
     """
     channels = [
         _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
         for lights, target, white in zip(olats.unbind(1), picture, clipped, strict=True)
     ]
-    grey, colour = _grey_light(channels, _roughness(directions.double().numpy()))
-    own = [channel.near(gain * grey) for channel, gain in zip(channels, colour, strict=True)]
+    roughness = _roughness(directions.double().numpy())
+    grey, colour = _grey_light(channels, roughness)
+    own = [channel.near(gain * grey, roughness) for channel, gain in zip(channels, colour, strict=True)]
     return torch.from_numpy(np.stack(own, -1)).float()
 
 
 def _grey_light(channels: "list[_Channel]", roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The light [L] that all channels share, and how much of it each has [3]."""
     power = sum(channel.power for channel in channels)
-    prior = power * (_SMOOTH**2 * roughness + _LENGTH**2 * np.eye(len(roughness)))
+    prior = power * (_SMOOTH**2 * roughness + _SHORT**2 * np.eye(len(roughness)))
     colour = np.array([channel.gain_of(np.ones(len(roughness))) for channel in channels])
-    colour /= max(colour.mean(), 1e-12)
+    colour /= max(colour.mean(), _TINY)
     for _ in range(_ROUNDS):
         gram, moment = prior.copy(), np.zeros(len(prior))
         for channel, gain in zip(channels, colour, strict=True):
@@ -165,7 +168,7 @@ class _Channel:
         """What `weights` are best multiplied by."""
         explained = self._lights @ weights
         return float(
-            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, 1e-12)
+            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, _TINY)
         )
 
     def weigh_anew(self, weights: np.ndarray) -> None:
@@ -173,21 +176,22 @@ class _Channel:
         beyond = self._lights @ weights - self._target
         error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
         told = error if self._clipped.all() else error[~self._clipped]
-        limit = _OUTLIER * np.median(told) + 1e-12
+        limit = _OUTLIER * np.median(told) + _TINY
         self._trust = np.minimum(1, limit / np.maximum(error, limit)) * ~(self._clipped & (beyond > 0))
 
-    def near(self, wanted: np.ndarray) -> np.ndarray:
-        """The weights [L] that explain this channel, held near the `wanted` ones."""
-        hold = max(self.power, 1e-12) * _COLOURED**2
+    def near(self, wanted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        """The weights [L] that explain this channel and differ smoothly from the `wanted` ones."""
+        hold = self.power * (_SMOOTH_OWN**2 * roughness + _SHORT_OWN**2 * np.eye(len(wanted)))
         for _ in range(_ROUNDS):
-            weights = _non_negative(self.gram() + hold * np.eye(len(wanted)), self.moment() + hold * wanted)
+            weights = _non_negative(self.gram() + hold, self.moment() + hold @ wanted)
             self.weigh_anew(weights)
         return weights
 
 
 def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
     """argmin over x >= 0 of x' gram x - 2 moment' x, by Lawson and Hanson's NNLS on the Cholesky factor."""
-    factor = cholesky(gram, lower=True)
+    floor = 1e-9 * gram.trace() / len(gram) + _TINY  # a channel may be black throughout
+    factor = cholesky(gram + floor * np.eye(len(gram)), lower=True)
     return np.asarray(nnls(factor.T, solve_triangular(factor, moment, lower=True))[0])
 
 
@@ -196,5 +200,5 @@ def _roughness(directions: np.ndarray) -> np.ndarray:
     spacing = math.sqrt(4 * math.pi / len(directions))
     near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
     np.fill_diagonal(near, 0)
-    own = np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), 1e-12)
+    own = np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)
     return own.T @ own
