@@ -20,6 +20,11 @@ def coarse(face: FaceTexture) -> tuple[Tensor, Tensor]:
     return seen / share.clamp_min(1e-6), trust
 
 
+def shrunk(field: Tensor) -> Tensor:
+    """A field [C, T, T] at the priors' side."""
+    return F.interpolate(field[None], (SIDE, SIDE), mode="area")[0]
+
+
 def with_detail(albedo: Tensor, face: FaceTexture, shading: Tensor, shining: Tensor, share: float) -> Tensor:
     """An albedo's logarithm [3, T, T] with a share of what it lacks of the photo.
 

@@ -16,9 +16,9 @@ from torch import Tensor
 from facerf_cli.baselines.albedo import SIDE, skin_prior
 from facerf_cli.baselines.baked_transfer import TransferSettings, baked_transfer
 from facerf_cli.baselines.light_prior import light_prior
-from facerf_cli.baselines.photo_texels import coarse, with_detail
+from facerf_cli.baselines.photo_texels import coarse, shrunk, with_detail
 from facerf_cli.baselines.reflectance import Explained
-from facerf_cli.baselines.synthesis import Scene, Solution, SolveSettings, solve
+from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, rotated, sh_basis
@@ -66,25 +66,26 @@ def explain_by_prt(
     direct, bounce = baked_transfer(vertices, bake)
     side = face.texture.shape[-1]
     tint = skin_prior().diffuse.mean.exp().mean((1, 2))
+    light = light_prior(bake.order)
     for _ in range(_ROUNDS):
         transfer = direct + tint[:, None, None, None] * bounce  # [3, K, t, t]
-        found = _solve(transfer, fit, face, settings)
+        scene = _scene(transfer, fit, face)
+        found = solve(scene, skin_prior().diffuse, skin_prior().gloss, light, settings)
         albedo = skin_prior().diffuse.at(found.albedo, side)
         tint = albedo.exp().mean((1, 2))
     shading = Prt(albedo, transfer, fit.rotation).shading(rotated(found.light, fit.rotation.T)[None])[0]
     albedo = with_detail(albedo, face, shading, torch.zeros_like(shading), detail)
+    coefficients = light_given(scene, shrunk(albedo), skin_prior().gloss.mean, light)
     rig = rig_directions()
-    light = RigLight(rig, coefficients_to_rig(found.light, rig))
-    return Explained(Prt(albedo.exp(), transfer, fit.rotation), light)
+    return Explained(
+        Prt(albedo.exp(), transfer, fit.rotation), RigLight(rig, coefficients_to_rig(coefficients, rig))
+    )
 
 
-def _solve(transfer: Tensor, fit: FaceFit, face: FaceTexture, settings: SolveSettings) -> Solution:
-    """Albedo and light in camera space, where the light's prior is, of a transfer in the head frame."""
-    count = transfer.shape[1]
-    camera_to_head = rotated(torch.eye(count), fit.rotation.T)  # [K, K] of coefficients
+def _scene(transfer: Tensor, fit: FaceFit, face: FaceTexture) -> Scene:
+    """The photo, and a transfer in the head frame as one in camera space, where the light's prior is."""
+    camera_to_head = rotated(torch.eye(transfer.shape[1]), fit.rotation.T)  # [K, K] of coefficients
     small = F.interpolate(transfer, (SIDE, SIDE), mode="area").flatten(2)
     radiance, trust = coarse(face)
     in_camera = torch.einsum("ckn,kj->cnj", small, camera_to_head)
-    scene = Scene(radiance.flatten(1), trust.flatten(), in_camera, None)
-    prior = skin_prior()
-    return solve(scene, prior.diffuse, prior.gloss, light_prior(math.isqrt(count) - 1), settings)
+    return Scene(radiance.flatten(1), trust.flatten(), in_camera, None)

@@ -4,8 +4,7 @@ The assumption of Smith et al. (*A Morphable Face Albedo Model*, CVPR 2020), one
 compares with, on this project's fitted mesh and priors; their code and their model of albedo are not used.
 The diffuse part takes light of order 2 (Ramamoorthi and Hanrahan, *An Efficient Representation for
 Irradiance Environment Maps*, 2001), the gloss a Blinn-Phong lobe about the mirrored view, filtered in
-spherical harmonics (the same authors' *Frequency Space Environment Map Rendering*, 2002), times Schlick's
-Fresnel factor at the normal.
+spherical harmonics (the same authors' *Frequency Space Environment Map Rendering*, 2002).
 """
 
 import math
@@ -19,9 +18,9 @@ from torch import Tensor
 
 from facerf_cli.baselines.albedo import SIDE, skin_prior
 from facerf_cli.baselines.light_prior import light_prior
-from facerf_cli.baselines.photo_texels import coarse, with_detail
+from facerf_cli.baselines.photo_texels import coarse, shrunk, with_detail
 from facerf_cli.baselines.reflectance import Explained
-from facerf_cli.baselines.synthesis import Scene, SolveSettings, solve
+from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.rig_light import RigLight
@@ -97,16 +96,19 @@ def explain_by_specular_sh(
     transfer = F.pad(transfer, (0, missing)).flatten(0, 1).expand(3, -1, -1)
     radiance, trust = coarse(face)
     scene = Scene(radiance.flatten(1), trust.flatten(), transfer, mirror.flatten(0, 1))
-    prior = skin_prior()
-    found = solve(scene, prior.diffuse, prior.gloss, light_prior(GLOSS_ORDER), settings)
+    skin, light = skin_prior(), light_prior(GLOSS_ORDER)
+    found = solve(scene, skin.diffuse, skin.gloss, light, settings)
     side = face.texture.shape[-1]
+    albedo, gloss = skin.diffuse.at(found.albedo, side), skin.gloss.at(found.gloss, side)
     surface = _surface(vertices, fit, side)
-    albedo, gloss = prior.diffuse.at(found.albedo, side), prior.gloss.at(found.gloss, side).exp()
     shading, shining = SpecularSh(surface, albedo, gloss).parts(found.light[None])
-    albedo = with_detail(albedo, face, shading[0], gloss * shining[0], detail)
+    albedo = with_detail(albedo, face, shading[0], gloss.exp() * shining[0], detail)
+    coefficients = light_given(scene, shrunk(albedo), shrunk(gloss), light)
     rig = rig_directions()
-    light = RigLight(rig, coefficients_to_rig(found.light, rig))
-    return Explained(SpecularSh(surface, albedo.exp(), gloss), light)
+    return Explained(
+        SpecularSh(surface, albedo.exp(), gloss.exp()),
+        RigLight(rig, coefficients_to_rig(coefficients, rig)),
+    )
 
 
 def _surface(vertices: Tensor, fit: FaceFit, side: int) -> Surface:
@@ -126,9 +128,7 @@ def mirror_transfer(normals: Tensor, views: Tensor) -> Tensor:
     mirrored = 2 * cosine * normals - views
     mirrored = F.normalize(mirrored, dim=0).permute(1, 2, 0)
     lobe = _by_degree(_blinn_phong(EXPONENT, GLOSS_ORDER))
-    # Schlick's 1 - F0 + F0 / F0 split: the rise to 1 at grazing angles, over a typical F0 of skin.
-    fresnel = 1 + (1 / 0.028 - 1) * (1 - cosine) ** 5
-    return sh_basis(mirrored, GLOSS_ORDER) * lobe * fresnel.clamp(max=8)[..., None]
+    return sh_basis(mirrored, GLOSS_ORDER) * lobe
 
 
 def _by_degree(factors: tuple[float, ...]) -> Tensor:

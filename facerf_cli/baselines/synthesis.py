@@ -15,7 +15,7 @@ from torch import Tensor
 from facerf_cli.baselines.albedo import LogGaussian
 from facerf_cli.baselines.light_prior import LightPrior
 
-_FLOOR = 0.1  # of the mean radiance: errors are measured against the radiance, and this in the dark
+_FLOOR = 0.1  # of the mean radiance, below which errors do not grow: they are relative to the radiance
 _FIRM_STEPS = 3  # before outliers are told by the fit
 _OUTLIER = 2.0  # median errors at which a texel's weight is halved
 
@@ -27,8 +27,11 @@ class SolveSettings:
     Neighbouring texels err together, so it is far less than a term a texel would make it.
     """
 
-    evidence: float = 2e4
+    evidence: float = 500.0
     steps: int = 15
+
+
+_OF_LIGHT = SolveSettings(evidence=2e4)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +57,24 @@ class Solution:
     light: Tensor
 
 
+def light_given(scene: Scene, albedo: Tensor, gloss: Tensor, light: LightPrior) -> Tensor:
+    """The light [K, 3] of a scene whose logarithms of albedo [3, t, t] and gloss [1, t, t] are known.
+
+    The photo says more of it than of a face that is still to be found.
+    """
+    return solve(scene, _known(albedo), _known(gloss), light, _OF_LIGHT).light
+
+
+def _known(logarithm: Tensor) -> LogGaussian:
+    return LogGaussian(logarithm, logarithm.new_zeros(0, *logarithm.shape))
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """All in float64 and flattened; texels of no trust are left out."""
 
     radiance: Tensor  # [3, N], of mean 1
-    weight: Tensor  # [3, N], of squared errors
+    evidence: Tensor  # [N], of a texel's squared relative error
     transfer: Tensor  # [3, N, K]
     mirror: Tensor | None
     albedo: tuple[Tensor, Tensor]  # mean [3, N] and modes [Q, 3, N] of logarithms
@@ -114,7 +129,7 @@ def _problem(
     modes = 0 if scene.mirror is None else len(gloss.modes)
     return _Problem(
         radiance=radiance,
-        weight=settings.evidence * share / (radiance + _FLOOR).square(),
+        evidence=settings.evidence * share,
         transfer=scene.transfer[:, seen].double(),
         mirror=None if scene.mirror is None else scene.mirror[seen].double(),
         albedo=(at(albedo.mean), at(albedo.modes)),
@@ -129,15 +144,17 @@ def _minimise(problem: _Problem, steps: int) -> Tensor:
     state = torch.zeros(size, dtype=torch.float64)
     picture, _ = _synthesise(problem, state, with_slopes=False)
     state[0] = -picture.mean().clamp_min(1e-6).log()
-    damping, trust = 1e-3, torch.ones_like(problem.weight[0])
+    damping = 1e-3
     prior = torch.ones(size, dtype=torch.float64)
     prior[0] = 0  # any exposure is as likely
     for step in range(steps):
         picture, slopes = _synthesise(problem, state)
         error = picture - problem.radiance
+        # Against the greater of the two, or black hair would count for more than the face.
+        reach = torch.maximum(picture, problem.radiance) + _FLOOR
+        weight = problem.evidence / reach.square()
         if step >= _FIRM_STEPS:
-            trust = _robust(error, problem.radiance)
-        weight = problem.weight * trust
+            weight = weight * _robust(error / reach)
         cost = _cost(error, weight, state, prior)
         flat = slopes.flatten(1)
         weighted = flat * weight.flatten()
@@ -175,10 +192,10 @@ def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> t
     return picture, torch.cat([picture[None], by_light, problem.albedo[1] * lit, by_gloss])
 
 
-def _robust(error: Tensor, radiance: Tensor) -> Tensor:
-    """Cauchy weights [N] of the texels' relative errors, against their median."""
-    relative = (error / (radiance + _FLOOR)).abs().mean(0)
-    return 1 / (1 + (relative / (_OUTLIER * relative.median() + 1e-9)).square())
+def _robust(relative: Tensor) -> Tensor:
+    """Cauchy weights [N] of the texels' relative errors [3, N], against their median."""
+    size = relative.abs().mean(0)
+    return 1 / (1 + (size / (_OUTLIER * size.median() + 1e-9)).square())
 
 
 def _cost(error: Tensor, weight: Tensor, state: Tensor, prior: Tensor) -> float:

@@ -1,0 +1,110 @@
+"""A scene that the priors made is taken apart again."""
+
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.baselines import synthesis
+from facerf_cli.baselines.albedo import LogGaussian
+from facerf_cli.baselines.light_prior import LightPrior
+from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
+
+T, K = 12, 9
+
+
+def priors() -> tuple[LogGaussian, LogGaussian, LightPrior]:
+    albedo = LogGaussian(torch.full((3, T, T), -1.0), 0.3 * torch.randn(4, 3, T, T))
+    gloss = LogGaussian(torch.full((1, T, T), -2.0), 0.3 * torch.randn(2, 1, T, T))
+    mean = torch.cat([torch.full((1, 3), 3.0), torch.zeros(K - 1, 3)])
+    return albedo, gloss, LightPrior(mean, 0.5 * torch.randn(6, K, 3))
+
+
+def transfers() -> tuple[Tensor, Tensor]:
+    """Mostly the constant term, so that light stays positive."""
+    both = 0.08 * torch.randn(2, T * T, K)
+    both[:, :, 0] = 0.3
+    return both[0].expand(3, -1, -1), both[1]
+
+
+def picture(scene: tuple[Tensor, Tensor], albedo: Tensor, gloss: Tensor, light: Tensor) -> Tensor:
+    """The forward model, written out: [3, N]."""
+    transfer, mirror = scene
+    diffuse = albedo.exp().flatten(1) * torch.einsum("cnk,kc->cn", transfer, light)
+    return diffuse + gloss.exp().flatten() * (mirror @ light).T
+
+
+def drawn() -> tuple[tuple[LogGaussian, LogGaussian, LightPrior], tuple[Tensor, Tensor], Tensor]:
+    albedo, gloss, light = priors()
+    given = transfers()
+    coefficients = 5 * (light.mean + torch.einsum("r,rkc->kc", torch.randn(6), light.modes))
+    radiance = picture(given, albedo.at(torch.randn(4), T), gloss.at(torch.randn(2), T), coefficients)
+    return (albedo, gloss, light), given, radiance
+
+
+def error_of(found: synthesis.Solution, parts: tuple, given: tuple[Tensor, Tensor], truth: Tensor) -> float:
+    remade = picture(given, parts[0].at(found.albedo, T), parts[1].at(found.gloss, T), found.light)
+    return float((remade - truth).norm() / truth.norm())
+
+
+def test_what_the_priors_made_comes_back() -> None:
+    parts, given, radiance = drawn()
+    scene = Scene(radiance, torch.ones(T * T), *given)
+    assert (
+        error_of(solve(scene, *parts, SolveSettings(evidence=1e6, steps=25)), parts, given, radiance) < 0.01
+    )
+
+
+def test_hair_over_a_part_of_it_hardly_matters() -> None:
+    parts, given, radiance = drawn()
+    covered = radiance.clone()
+    covered[:, : T * T // 8] = 0.01
+    settings = SolveSettings(evidence=1e6, steps=25)
+    found = solve(Scene(covered, torch.ones(T * T), *given), *parts, settings)
+    assert error_of(found, parts, given, radiance) < 0.03
+
+
+def test_texels_without_trust_are_left_out() -> None:
+    parts, given, radiance = drawn()
+    trust = torch.ones(T * T)
+    trust[:20] = 0
+    spoilt = radiance.clone()
+    spoilt[:, :20] = torch.nan
+    found = solve(Scene(spoilt, trust, *given), *parts, SolveSettings(evidence=1e6, steps=25))
+    assert error_of(found, parts, given, radiance) < 0.01
+
+
+def test_a_brighter_photo_is_the_same_face_in_more_light() -> None:
+    parts, given, radiance = drawn()
+    once = solve(Scene(radiance, torch.ones(T * T), *given), *parts)
+    twice = solve(Scene(2 * radiance, torch.ones(T * T), *given), *parts)
+    assert torch.allclose(once.albedo, twice.albedo, atol=1e-4)
+    assert torch.allclose(2 * once.light, twice.light, rtol=1e-3, atol=1e-3)
+
+
+def test_a_black_photo_has_no_light() -> None:
+    parts, given, radiance = drawn()
+    found = solve(Scene(0 * radiance, torch.ones(T * T), *given), *parts)
+    assert not found.light.any() and not found.albedo.any()
+
+
+def test_the_light_of_a_known_face() -> None:
+    parts, given, _ = drawn()
+    albedo, gloss = parts[0].at(torch.randn(4), T), parts[1].at(torch.randn(2), T)
+    light = 2 * (parts[2].mean + torch.einsum("r,rkc->kc", torch.randn(6), parts[2].modes))
+    radiance = picture(given, albedo, gloss, light)
+    found = light_given(Scene(radiance, torch.ones(T * T), *given), albedo, gloss, parts[2])
+    assert float((found - light).norm() / light.norm()) < 0.02
+
+
+@pytest.mark.parametrize("shines", [True, False])
+def test_slopes_are_those_of_the_picture(shines: bool) -> None:
+    parts, (transfer, mirror), radiance = drawn()
+    scene = Scene(radiance, torch.ones(T * T), transfer, mirror if shines else None)
+    seen = scene.trust > 0
+    problem = synthesis._problem(scene, seen, 1.0, *parts, SolveSettings())
+    state = 0.3 * torch.randn(1 + 6 + 4 + (2 if shines else 0), dtype=torch.float64)
+    _, slopes = synthesis._synthesise(problem, state)
+    wanted = torch.autograd.functional.jacobian(
+        lambda at: synthesis._synthesise(problem, at, False)[0], state
+    )
+    assert torch.allclose(slopes, wanted.permute(2, 0, 1), atol=1e-9)
