@@ -12,11 +12,12 @@ from facerf_cli.evaluation.yale_b_cases import ANGLES_DEG
 
 COLUMNS = ("frontal", "soft", "environment")
 PEERS = ("DPR", "GeomConsistentFR")
+SHOWN = ("copy of the source", *PEERS, "quotient image")  # beside ours
 TOLD_MORE = ("others' mean", "others' Lambert", "quotient image")
 PUBLISHED_SUBJECTS = 21
 _SOURCE = "the benchmark"
-_SAME = f"the same pictures, all {PUBLISHED_SUBJECTS} subjects"
-_KNOWS = _SAME + "; told more than one photo"
+_SAME = f"same pictures, {PUBLISHED_SUBJECTS} people"
+_KNOWS = _SAME + ", told more"
 
 # (Si-MSE, SSIM) by column, then Si-MSE by angle.
 FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = {
@@ -47,12 +48,12 @@ FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = 
 }
 
 
-def published(subjects: int) -> tuple[Published, ...]:
-    """The rows to stand beside ours over so many subjects."""
+def published() -> tuple[Published, ...]:
+    """The rows to stand beside ours."""
     rows: list[Published] = []
-    part = "" if subjects == PUBLISHED_SUBJECTS else f" (ours: {subjects})"
-    for method, (by_column, by_angle) in FIGURES.items():
-        where = _SOURCE, (_KNOWS if method in TOLD_MORE else _SAME) + part
+    for method in SHOWN:
+        where = _SOURCE, _KNOWS if method in TOLD_MORE else _SAME
+        by_column, by_angle = FIGURES[method]
         for column, (si_mse, ssim) in zip(COLUMNS, by_column, strict=True):
             group = "column", column
             rows.append(Published(method, "si_mse", si_mse, None, group, *where))

@@ -5,7 +5,6 @@ import importlib.util
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import yale_b
@@ -23,11 +21,10 @@ from facerf_cli.evaluation.others import Others
 from facerf_cli.evaluation.yale_b import compare_sitter, fill_uncovered, layout
 from facerf_cli.evaluation.yale_b_cases import Sitter, environment_weights, face_mask
 from facerf_cli.evaluation.yale_b_published import FIGURES, published
-from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.raster.camera import Camera, project
-from facerf_cli.stage.data.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB, read_shifts, read_yale_b
+from facerf_cli.stage.data.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from tests.conftest import SHARED
+from tests.evaluation.toy_sitters import Lambert, Networks, someone
 from tests.stage.data.yale_fixture import FLASHES, write_yale_b
 
 BENCH = SHARED / "bench" / "yale_b"
@@ -123,36 +120,14 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
         [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
     ]
     assert sorted([*sum(columns, ()), *angles] for columns, angles in FIGURES.values()) == sorted(figures)
-    assert len(published(21)) == 11 * len(FIGURES) and "(ours: 3)" in published(3)[0].data
+    quotient = [row for row in published() if row.method == "quotient image"]
+    assert len(published()) == 11 * 4 and len(quotient) == 11
+    assert all(row.data == "same pictures, 21 people, told more" for row in quotient)
 
 
 @pytest.fixture
 def small(tmp_path: Path) -> YaleB:
     return read_yale_b(write_yale_b(tmp_path / "yale"))
-
-
-@dataclass(frozen=True, eq=False)
-class Lambert:
-    """A method whose face is white and without shape: the cosine of the light to the camera."""
-
-    name: str
-    models: Any
-
-    def reflectance(self, fit: Any, face: Any, held_to_photo: bool) -> "Lambert":
-        assert held_to_photo and face.texture.shape == (3, 256, 256)
-        return self
-
-    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))
-        return cosines[..., None, None].expand(-1, -1, 256, 256)
-
-
-@dataclass(frozen=True, eq=False)
-class Networks:
-    """Models without a network: the landmarks alone are fitted."""
-
-    face: Any
-    geometry: None = None
 
 
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -175,14 +150,6 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
     assert "angle" not in by_name["yaleB07/dome/A-070E+00"].case.facts
     centre = side.predictions["a"][110, 84]
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
-
-
-def someone() -> Face:
-    """The mean face, seen by a camera that it fills."""
-    model = load_face_model("builtin")
-    points = model.landmarks(model.mean[None])[0] + torch.tensor([0, 0, -0.9])
-    landmarks_px = project(points, Camera(4.0 * WIDTH_PX, WIDTH_PX, HEIGHT_PX, WIDTH_PX / 2, HEIGHT_PX / 2))
-    return Face(landmarks_px.numpy(), (0, 0, WIDTH_PX, HEIGHT_PX), 1.0)
 
 
 def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:

@@ -25,10 +25,12 @@ def ramp(seed: int) -> np.ndarray:
     return ((3 * row + 5 * column + 37 * seed) % 251).astype(np.uint8)
 
 
-def write_yale_b(folder: Path, subjects: tuple[str, ...] = ("yaleB05", "yaleB07")) -> Path:
+def write_yale_b(
+    folder: Path, subjects: tuple[str, ...] = ("yaleB05", "yaleB07"), flashes: tuple[Flash, ...] = FLASHES
+) -> Path:
     """The pictures `ramp(place of the flash)` of each subject."""
     for subject in subjects:
-        for seed, flash in enumerate(FLASHES):
+        for seed, flash in enumerate(flashes):
             write_pgm(folder / subject / f"{subject}_P00{flash.name}.pgm", ramp(seed))
         (folder / subject / f"{subject}_P00.info").write_text("a list\n")
     return folder
