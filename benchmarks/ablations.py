@@ -4,7 +4,8 @@
 
 Each is trained from scratch by `facerf train` on the same baked heads, with the same seed, schedule and
 number of steps, then measured (1) as the paper does, on pictures of held-out people, each fitted by its own
-landmarks with the face model that the run was trained with (`table1.py --refit --network-alone`), and (2) on
+landmarks with the face model that the run was trained with (`facerf evaluate olat --refit --network-alone`
+does so for the full method and the one without normal maps: the paper's Table 3), and (2) on
 held-out heads in the chart of their fits (`synthetic.py`), where a wrong shape costs less, for the truth is
 seen through the same fit. What is interrupted goes on; a finished run is not trained again.
 """
@@ -13,15 +14,21 @@ import argparse
 import json
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import synthetic
-import table1
 import torch
 
-from facerf_cli.pipeline import load_models
-from facerf_cli.stage.data.dataset import read_dataset
+from facerf_cli.evaluation.methods import Method
+from facerf_cli.evaluation.olat import compare_olats
+from facerf_cli.evaluation.people import Person
+from facerf_cli.intervals import mean_interval
+from facerf_cli.metrics import si_mse_clipped
+from facerf_cli.pipeline import Models, load_models
+from facerf_cli.stage.data.dataset import Dataset, read_dataset
+from facerf_cli.stage.data.recipes import read_pairs
 
 RUNS = {"without normal maps": ["--without-normals"], "mean face": ["--mean-face"], "full": []}
 _MEAN_FACE = "builtin-mean"  # the face model that `facerf train --mean-face` leaves in the bank
@@ -117,11 +124,27 @@ def measure(checkpoint: Path, bank: Path, mean_face: bool, given: argparse.Names
     chart = synthetic.summary(pictures)["rows"]
     found = {"chart": chart, "rows": chart, "people": 0}
     if given.dataset:
-        dataset = read_dataset(given.dataset)
-        pairs = table1.pairs_of(dataset, "test")[:: given.every]
-        measured = list(table1.measure(models, dataset, pairs, table1.How(refit=True, held_to_photo=False)))
-        found |= table1.summary(measured) | {"people": len({m.subject for m in measured})}
+        found |= on_people(models, read_dataset(given.dataset), given.every)
     return found
+
+
+def on_people(models: Models, dataset: Dataset, step: int) -> dict[str, Any]:
+    """The errors on pictures of held-out people, every `step`th pair, each fitted by its own landmarks."""
+    pairs = [pair for pair in read_pairs(dataset) if pair.split == "test"][::step]
+    if not pairs:
+        raise SystemExit(f"{dataset.folder}: no pairs in the split test; run facerf relight-dataset")
+    method, rows = Method("field", "field", models), []
+    for subject, own in groupby(pairs, lambda pair: pair.subject):
+        person = Person(models.face, dataset, subject, refit=True)
+        for found in compare_olats(person, own, [method], held_to_photo=False):
+            error = si_mse_clipped(found.predictions["field"], found.truth, found.mask)
+            rows.append((found.case.facts["pose"], subject, error))
+    intervals = {
+        name: mean_interval((subject, error) for pose, subject, error in rows if pose == name)
+        for name in ("same pose", "different pose")
+    }
+    by_pose = {name: {"clipped": found.as_dict()} for name, found in intervals.items() if found}
+    return {"rows": by_pose, "people": len({subject for _, subject, _ in rows})}
 
 
 def table(result: dict[str, Any]) -> str:

@@ -1,8 +1,9 @@
 """MODEL_CARD.md's tables from what the benchmarks wrote with --json, so that no figure is typed.
 
-    python benchmarks/model_card.py yale.json synthetic.json table1.json ablations.json training_speed.json
+    python benchmarks/model_card.py yale.json synthetic.json olat/summary.json ablations.json speed.json
 
-Prints Markdown, a table a file, each told by what it holds. A figure is given with its 95 % interval.
+Prints Markdown, a table a file, each told by what it holds: what a benchmark wrote with --json, or the
+summary of a `facerf evaluate olat`. A figure is given with its 95 % interval.
 """
 
 import argparse
@@ -80,17 +81,25 @@ def _errors(row: Table) -> list[Any]:
 
 
 def table1(found: Table) -> list[str]:
-    """The paper's Table 1."""
+    """The paper's Table 1, and Table 3 where another checkpoint stands beside: a row a method and pose."""
+    if found["protocol"] != "olat":
+        raise SystemExit(f"the card has a table of evaluate olat, not of evaluate {found['protocol']}")
     lines = [
-        f"| {found['people']} synthetic people | n | Si-MSE (sd) | truth clipped at white (sd) "
-        "| 95 % interval | Lambert | the paper, on its own data (sd) |",
+        f"| {found['persons']} synthetic people | | n | Si-MSE (sd) | truth clipped at white (sd) "
+        "| 95 % interval | the paper's Table 1, on its own data (sd) |",
         "|---|---|---|---|---|---|---|",
     ]
-    for name, row in found["rows"].items():
-        (mean, sd), clip = found["paper"][name], row["clipped"]
-        both = [f"{part['mean']:.5f} ({part['sd']:.5f})" for part in (row["si_mse"], clip)]
-        cells = [*both, f"[{clip['low']:.5f}, {clip['high']:.5f}]", f"{row['lambert']['mean']:.5f}"]
-        lines.append(_row([name, clip["pictures"], *cells, f"{mean:.5f} ({sd:.5f})"]))
+    paper = {tuple(row["group"]): row for row in found["published"] if row["source"] == "Table 1"}
+    for group in found["groups"]:
+        if group["fact"] != "pose":
+            continue
+        whole, clipped = (group["metrics"][name] for name in ("si_mse", "si_mse_clipped"))
+        published = paper["pose", group["value"]]
+        for method, clip in clipped.items():
+            both = [f"{part['mean']:.5f} ({part['sd']:.5f})" for part in (whole[method], clip)]
+            beside = f"{published['mean']:.5f} ({published['sd']:.5f})" if method == "field" else ""
+            cells = [*both, f"[{clip['low']:.5f}, {clip['high']:.5f}]", beside]
+            lines.append(_row([group["value"], method, clip["pictures"], *cells]))
     return lines
 
 
@@ -130,7 +139,7 @@ def _word(held: bool | None) -> str:
 WRITERS = {
     "columns": yale,
     "tones": synthetic,
-    "paper": table1,
+    "groups": table1,
     "ablations": ablations,
     "presets": speed,
 }

@@ -1,5 +1,6 @@
 """The arithmetic behind the benchmarks' figures: intervals over people, and what clears the bar."""
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -16,10 +17,11 @@ from loss_curve import curve, draw_chart, read_log
 from model_card import ablations, speed, synthetic, table1, yale
 from synthetic import Picture, drift_of, summary
 from synthetic import table as held_out_table
-from table1 import Measured
-from table1 import summary as table1_summary
 from yale_table import COLUMNS, results, table
 
+from facerf_cli.evaluation.measure import Row
+from facerf_cli.evaluation.paper import TABLE_1
+from facerf_cli.evaluation.summary import Layout, summarise
 from facerf_cli.intervals import average, mean_interval
 from facerf_cli.metrics import tone_of
 
@@ -149,13 +151,21 @@ def test_the_cards_tables_are_rectangular() -> None:
     whole = results(["a", "b"], [rows(0.002, 0.8), rows(0.003, 0.8)], whole=True)
     picture = Picture(1, True, 10.0, "tan", 0.001, 0.001, 0.002, -2.0)
     heads = summary([picture, replace(picture, same_pose=False, tone=None, drift_deg=None)])
-    people = table1_summary([Measured("p", same, 0.003, 0.002, 0.004) for same in (True, False)])
-    runs = {"steps": 9, "ablations": {"full": people, "mean face": people}}
+    figures = {"si_mse": 0.003, "si_mse_clipped": 0.002}
+    cases = [
+        Row(f"{pose} {method}", "p", method, {"pose": pose}, figures)
+        for pose in ("same pose", "different pose")
+        for method in ("field", "lambert")
+    ]
+    people = summarise(Layout("olat", "", tuple(figures), ("pose",), TABLE_1), cases).as_dict()
+    clipped = {"clipped": {"mean": 0.002, "sd": 0.001}}
+    by_pose = {"rows": {"same pose": clipped, "different pose": clipped}}
+    runs = {"steps": 9, "ablations": {"full": by_pose, "mean face": by_pose}}
     rates = {"steps_per_s": 1.0, "bare_steps_per_s": 2.0, "ratio": 0.5, "waiting": 0.1}
     written = [
         yale(whole),
         synthetic(heads),
-        table1(people | {"people": 1}),
+        table1(json.loads(json.dumps(people))),
         ablations(runs),
         speed({"presets": {"tiny": rates}}),
     ]

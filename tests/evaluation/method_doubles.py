@@ -33,7 +33,7 @@ class Unlit:
 
 @dataclass(frozen=True, eq=False)
 class Double:
-    """A method whose reflectance is `Unlit`; `light` grows with each photo, so that they can be told apart."""
+    """A method whose reflectance is `Unlit`; its light is brighter with each photo, to tell them apart."""
 
     name: str
     models: Any = None
