@@ -9,6 +9,7 @@ from facerf_cli.evaluation.page_style import STYLE
 from facerf_cli.evaluation.page_tables import metric_table, other_metrics
 from facerf_cli.evaluation.strips import ERROR_HIGHEST
 from facerf_cli.evaluation.summary import Group, Summary, shown_as
+from facerf_cli.files.html import html_page
 
 
 @dataclass(frozen=True)
@@ -22,22 +23,19 @@ class About:
 
 def page(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, bytes]) -> str:
     """The report; `jpegs` are the chosen cases' strips by case. Equal figures give equal bytes."""
-    return "\n".join(_lines(summary, about, chosen, jpegs)) + "\n"
+    title = f"{summary.layout.title} · facerf"
+    return html_page(title, STYLE, _lines(summary, about, chosen, jpegs))
 
 
 def _lines(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, bytes]) -> Iterator[str]:
-    title = escape(summary.layout.title)
-    yield '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
-    yield '<meta name="viewport" content="width=device-width, initial-scale=1">'
-    yield f"<title>{title} · facerf</title>\n<style>{STYLE}</style>\n</head>\n<body>"
-    yield from _head(summary, about, title)
+    yield from _head(summary, about, escape(summary.layout.title))
     yield '<main>\n<h2 id="result">Result</h2>'
     yield from _results(summary)
     yield from _groups(summary)
     yield '<h2 id="metrics">All metrics</h2>'
     yield from other_metrics(summary)
     yield from _pictures(summary, chosen, jpegs)
-    yield "</main>\n</body>\n</html>"
+    yield "</main>"
 
 
 def _head(summary: Summary, about: About, title: str) -> Iterator[str]:

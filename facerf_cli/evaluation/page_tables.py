@@ -9,6 +9,7 @@ from facerf_cli.evaluation.measure import Metric
 from facerf_cli.evaluation.page_style import METHOD_COLOURS
 from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, published_beside, shown_as
 
+_LEFT = {"spread": ' class="text"'}
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -36,7 +37,7 @@ def metric_table(summary: Summary, metric: str, groups: list[Group]) -> Iterator
     yield f"<caption><b>{title}</b>, {better}; {_axis_words(how, axis)}</caption>"
     yield "<thead><tr>" + (f'<th scope="col">{escape(groups[0].fact)}</th>' if by_fact else "")
     yield '<th scope="col" class="text">method</th>'
-    yield "".join(f'<th scope="col">{head}</th>' for head in heads)
+    yield "".join(f'<th scope="col"{_LEFT.get(head, "")}>{head}</th>' for head in heads)
     yield "</tr></thead>"
     for group in groups:
         yield from _group(summary, group, metric, axis, by_fact, several)
@@ -78,10 +79,10 @@ def _group(
         head = ""
     for figure in published:
         sd = "" if figure.sd is None else f"{figure.sd:.{digits}f}"
-        empty = "<td></td>" * (4 if several else 2)
         name = f"{escape(figure.method)}, published ({escape(figure.source)})"
-        yield f'<tr class="published"><td class="text">{name}</td><td></td><td class="data">'
-        yield f"{escape(figure.data)}</td><td>{figure.mean:.{digits}f}</td><td>{sd}</td>{empty}</tr>"
+        yield f'<tr class="published"><td class="text">{name}</td><td></td><td></td>'
+        yield f"<td>{figure.mean:.{digits}f}</td><td>{sd}</td>"
+        yield f'<td class="data" colspan="{4 if several else 2}">{escape(figure.data)}</td></tr>'
     yield "</tbody>"
 
 

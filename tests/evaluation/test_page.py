@@ -22,7 +22,7 @@ from tests.evaluation.toy_protocol import LAYOUT, NOISE, comparison, evaluate
 NASTY = '"><script>alert(1)</script>&'
 KNOWN = (
     "id lang charset name content class style tabindex role aria-label aria-hidden focusable scope href "
-    "rowspan src alt width height x y x1 x2 y1 y2 cx cy r fill fill-opacity stroke stroke-width"
+    "rowspan colspan src alt width height x y x1 x2 y1 y2 cx cy r fill fill-opacity stroke stroke-width"
 )
 VOID = {"meta", "img", "line", "rect", "circle"}
 TILE, GAP = 192, 4

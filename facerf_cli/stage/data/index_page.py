@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping
 from html import escape
 from typing import Any
 
+from facerf_cli.files.html import html_page
+
 _STYLE = """
 body { font: 15px/1.5 sans-serif; margin: 2em; background: #181818; color: #ddd }
 a { color: #8bf } h2 { margin: 2em 0 0 } p { margin: .2em 0 } img { max-width: 100%; margin-top: .5em }
@@ -19,20 +21,18 @@ _COLUMNS = (
 
 def index_page(dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> str:
     """The page for the content of `dataset.json` and the records of its finished subjects."""
-    return "\n".join(_lines(dataset, records)) + "\n"
+    title = f"{dataset['capture']}: {len(records)} of {len(dataset['subjects'])} subjects"
+    return html_page(title, _STYLE, _lines(title, dataset, records))
 
 
-def _lines(dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
-    title = escape(f"{dataset['capture']}: {len(records)} of {len(dataset['subjects'])} subjects")
-    yield '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">'
-    yield f"<title>{title}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<h1>{title}</h1>"
+def _lines(title: str, dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    yield f"<h1>{escape(title)}</h1>"
     split_of = {name: split for split, names in dataset["splits"].items() for name in names}
     counts = ", ".join(f"{len(names)} {split}" for split, names in dataset["splits"].items())
     yield f"<p>{counts}. {len(dataset['rig']['lights'])} lights, {len(dataset['cameras'])} cameras.</p>"
     yield f"<p>{escape(_COLUMNS)}</p>"
     for subject in dataset["subjects"]:
         yield from _subject(subject, split_of.get(subject, "in no split"), records.get(subject))
-    yield "</body>\n</html>"
 
 
 def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iterator[str]:
