@@ -8,6 +8,7 @@ light a constant map, there is neither a Voronoi edge nor a spike, and what is n
 """
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -66,8 +67,7 @@ def _points(directions: np.ndarray) -> np.ndarray:
 
 def _spread(weights: np.ndarray, directions: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Radiance [N, C] at points [N, 3] whose map has non-negative weights [L, C] in the cells [L, 3]."""
-    smooth = _blur(points, points, 1.0)
-    weigh = _weigh(directions, points)
+    smooth, weigh = _matrices(directions.tobytes())
     shares = (diags(1 / np.asarray(weigh.sum(0)).ravel()) @ weigh.T).tocsr()  # [N, L], rows sum to 1
     radiance = shares @ (weights / np.asarray(weigh.sum(1)))
     rounds = min(
@@ -81,14 +81,18 @@ def _spread(weights: np.ndarray, directions: np.ndarray, points: np.ndarray) -> 
     return radiance
 
 
-def _weigh(directions: np.ndarray, points: np.ndarray) -> csr_matrix:
-    """Matrix [L, N] from radiance at the points to the weights of its map's cells, as they are measured."""
+@lru_cache(maxsize=2)  # one photo after the other has the same rig
+def _matrices(directions_bytes: bytes) -> tuple[csr_matrix, csr_matrix]:
+    """What smooths radiance at the points [N, N]; from it to the weights of its map's cells [L, N]."""
+    directions = np.frombuffer(directions_bytes).reshape(-1, 3)
+    points = _points(directions)
     rows = cell_rows(len(directions))
     texels = latlong_directions(rows, 2 * rows, torch.float64).reshape(-1, 3).numpy()
     areas = latlong_solid_angles(rows, 2 * rows, torch.float64).reshape(-1).numpy()
     cell = cKDTree(directions).query(texels)[1]
     shape = (len(directions), len(texels))
-    return csr_matrix((areas / math.pi, (cell, np.arange(len(texels)))), shape) @ _texel_blur(texels, points)
+    sums = csr_matrix((areas / math.pi, (cell, np.arange(len(texels)))), shape)
+    return _blur(points, points, 1.0), sums @ _texel_blur(texels, points)
 
 
 def _map_of(radiance: np.ndarray, points: np.ndarray, height: int) -> Tensor:
