@@ -67,7 +67,7 @@ def olat(
         name="olat",
         title="Single lights of held-out people",
         metrics=("si_mse", "si_mse_clipped", "ssim", "tone_drift_deg"),
-        by=("pose", "angle", "tone"),
+        by=("pose", "turn", "angle", "tone"),
         published=TABLE_1 + (TABLE_3 if options.against else ()),
         notes=_notes(split, refit, network_alone),
     )
