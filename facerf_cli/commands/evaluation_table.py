@@ -76,8 +76,7 @@ def _rows(summary: "Summary", group: "Group", metric: str) -> Iterator[list[str]
         yield [title, method, *_figures(cell, digits)]
         title = ""
     for figure in published_beside(summary, group, metric):
-        sd = "" if figure.sd is None else f"{figure.sd:.{digits}f}"
-        yield [f"published, {figure.source}", figure.method, "", f"{figure.mean:.{digits}f}", sd, *[""] * 4]
+        yield [f"published, {figure.source}", figure.method, "", *figure.shown(digits), *[""] * 4]
 
 
 def _figures(cell: "Cell", digits: int) -> list[str]:

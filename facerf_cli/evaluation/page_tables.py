@@ -78,10 +78,10 @@ def _group(
         yield _figures(cell, digits, colour, axis, several) + "</tr>"
         head = ""
     for figure in published:
-        sd = "" if figure.sd is None else f"{figure.sd:.{digits}f}"
+        mean, sd = figure.shown(digits)
         name = f"{escape(figure.method)}, published ({escape(figure.source)})"
         yield f'<tr class="published"><td class="text">{name}</td><td></td><td></td>'
-        yield f"<td>{figure.mean:.{digits}f}</td><td>{sd}</td>"
+        yield f"<td>{mean}</td><td>{sd}</td>"
         yield f'<td class="data" colspan="{4 if several else 2}">{escape(figure.data)}</td></tr>'
     yield "</tbody>"
 

@@ -18,6 +18,12 @@ class Published:
     group: tuple[str, str] | None = None
     source: str = "the paper"
     data: str = "other data than ours"
+    digits: int | None = None  # after the point, as published; None: as ours are shown
+
+    def shown(self, digits: int) -> tuple[str, str]:
+        """Mean and standard deviation as text, with no more digits than were published."""
+        digits = digits if self.digits is None else self.digits
+        return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
 
 
 _LIGHT_STAGE = "people in a light stage; other data than ours"
@@ -34,7 +40,7 @@ TABLE_1 = (
 def _table_2(metric: str, data: str, figures: tuple[tuple[float, float], ...]) -> tuple[Published, ...]:
     """A row of Table 2, in the order of `_METHODS`."""
     return tuple(
-        Published(method, metric, mean, sd, None, "Table 2", data)
+        Published(method, metric, mean, sd, None, "Table 2", data, 3)
         for method, (mean, sd) in zip(_METHODS, figures, strict=True)
     )
 
@@ -54,8 +60,8 @@ TABLE_3 = (
     ),
 )
 TABLE_4 = (
-    Published("all components", "si_mse", 0.004, 0.002, None, "Table 4", _CELEBA),
-    Published("mean face", "si_mse", 0.011, 0.005, None, "Table 4", _CELEBA),
-    Published("all components", "face_distance", 0.550, 0.080, None, "Table 4", _CELEBA),
-    Published("mean face", "face_distance", 0.550, 0.073, None, "Table 4", _CELEBA),
+    Published("all components", "si_mse", 0.004, 0.002, None, "Table 4", _CELEBA, 3),
+    Published("mean face", "si_mse", 0.011, 0.005, None, "Table 4", _CELEBA, 3),
+    Published("all components", "face_distance", 0.550, 0.080, None, "Table 4", _CELEBA, 3),
+    Published("mean face", "face_distance", 0.550, 0.073, None, "Table 4", _CELEBA, 3),
 )

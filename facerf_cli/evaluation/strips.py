@@ -14,6 +14,7 @@ ERROR_HIGHEST = 0.2  # of display values 0..1: where the false colours end
 ERROR_COLOURS = ((8, 6, 20), (87, 22, 110), (187, 55, 84), (249, 142, 9), (252, 250, 176))
 _TILE_PX = 192
 _GAP_PX = 4
+_GAP = 128  # between tiles: neither a light page nor a dark one makes it glare
 _PAPER = 0.16  # display value of what is left out of the comparison
 
 
@@ -91,4 +92,4 @@ def _fitted(display: np.ndarray, tile: tuple[int, int]) -> np.ndarray:
 def _column(above: np.ndarray, below: np.ndarray) -> np.ndarray:
     """Two tiles in a column, with a gap that belongs to each."""
     frame = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
-    return np.concatenate([np.pad(tile, frame, constant_values=255) for tile in (above, below)])
+    return np.concatenate([np.pad(tile, frame, constant_values=_GAP) for tile in (above, below)])
