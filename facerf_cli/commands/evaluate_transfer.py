@@ -156,8 +156,10 @@ def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     for folder, members in groups.items():
         if len(members) < 2:
             raise UsageError(f"{folder}: one photo; give two of a person at least")
+        place = Path(members[0].name).parent.as_posix()
+        person = folder.resolve().name if place == "." else place
         two_by_two = zip(members[::2], members[1::2], strict=False)
-        couples += [_Couple(str(folder), first, second) for first, second in two_by_two]
+        couples += [_Couple(person, first, second) for first, second in two_by_two]
     return {couple.item: couple for couple in couples}
 
 
