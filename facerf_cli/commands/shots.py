@@ -88,10 +88,8 @@ def collect_shots(
         for turn, number, degrees in rotations
     ]
     maps = collect_items(paths, output, MAP_SUFFIXES) if paths else []
-    last_parts = [Path(item.name).name for item in maps]
-    for item, short in zip(maps, last_parts, strict=True):
-        unique = last_parts.count(short) == 1
-        name, frame = split_frame(short if unique else item.name.replace("/", "_"))
+    for item, short in zip(maps, _short_names(maps), strict=True):
+        name, frame = split_frame(short)
         shots += [
             Shot(name + turn, frame + number, item.input_path, degrees) for turn, number, degrees in rotations
         ]
@@ -102,7 +100,7 @@ def collect_shots(
     ]
     shots += map(_lamp_shot, lamps)
     if not shots:
-        raise UsageError("no light: give --envmap, --light or --light-from")
+        raise UsageError("no light: give --envmap or --light, or --light-from a photo")
     names = [shot.name + shot.frame for shot in shots]
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two pictures would be called {min(twice)}; give each light once")
@@ -125,7 +123,19 @@ def photo_lights(entries: Sequence[str], output: Path, options: LightOptions) ->
     """The lights of photos: files, folders or quoted patterns; called as `estimate-light` calls its maps."""
     paths = [path for entry in entries for path in _expand_glob(entry)]
     items = collect_items(paths, output, PHOTO_SUFFIXES) if paths else []
-    return [PhotoLight(f"{item.name.replace('/', '_')}_light", item.input_path, options) for item in items]
+    names = _short_names(items)
+    return [
+        PhotoLight(f"{name}_light", item.input_path, options) for name, item in zip(names, items, strict=True)
+    ]
+
+
+def _short_names(items: Sequence[Item]) -> list[str]:
+    """The last part of each item's name, or, where that is no item's own, all of it."""
+    last_parts = [Path(item.name).name for item in items]
+    return [
+        short if last_parts.count(short) == 1 else item.name.replace("/", "_")
+        for item, short in zip(items, last_parts, strict=True)
+    ]
 
 
 def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
