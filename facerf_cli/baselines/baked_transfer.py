@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.errors import FacerfError
@@ -37,8 +38,9 @@ class TransferSettings:
     order: int = 4
     side: int = 128
     lights: int = 200
-    lamp_samples: int = 2
+    lamp_samples: int = 4
     bounce_samples: int = 16
+    blur_texels: float = 1.0  # against the grain of few samples
 
 
 def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Path | None = None) -> Tensor:
@@ -80,7 +82,9 @@ def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
     both = torch.stack([direct, torch.from_numpy(transport.bounce).float()])
     # Sum over equal cells of 4 pi / L; over pi as the coefficients are of radiance.
     basis = sh_basis(directions, settings.order) * (4 / settings.lights)
-    return torch.einsum("lk,nlij->nkij", basis, both)
+    transfer = torch.einsum("lk,nlij->nkij", basis, both).numpy()
+    blur = settings.blur_texels
+    return torch.from_numpy(gaussian_filter(transfer, (0, 0, blur, blur), mode="nearest"))
 
 
 def _key(vertices_head: Tensor, settings: TransferSettings) -> str:

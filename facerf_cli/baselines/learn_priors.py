@@ -18,7 +18,7 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
 from facerf_cli.stage.appearance.people import draw_people
 from facerf_cli.stage.appearance.skin import paint_skin
-from facerf_cli.stage.appearance.window import CHART_SPAN, Window
+from facerf_cli.stage.appearance.window import CHART_SPAN, Window, mask
 from facerf_cli.stage.sky.skies import draw_sky
 
 SEED = 52017
@@ -27,6 +27,7 @@ DIFFUSE_MODES, GLOSS_MODES, LIGHT_MODES = 50, 8, 160
 LIGHT_ORDER = 8
 _AT_ONCE, _MAP_PX = 50, 64
 _TURNS = 8  # of a map about the vertical
+_TEETH, _DARK = 0.5, 0.06  # as `stage.appearance.skin` has them
 _SHINE = 0.3  # deviation of the logarithm of all of a face's gloss, as photographs differ in it
 
 
@@ -39,9 +40,17 @@ def learn_skin(skins: int = SKINS) -> tuple[LogGaussian, LogGaussian]:
         people = replace(people, random_texture=torch.zeros_like(people.random_texture))
         skin = paint_skin(people, Window(SIDE, CHART_SPAN), generator, painted_eyes=True)
         shine = _SHINE * torch.randn(len(skin.specular), 1, 1, 1, generator=generator)
-        diffuse.append(skin.albedo.log())
+        diffuse.append(_with_mouths(skin.albedo, generator).log())
         gloss.append(skin.specular.log() + shine)
     return _principal(torch.cat(diffuse), DIFFUSE_MODES), _principal(torch.cat(gloss), GLOSS_MODES)
+
+
+def _with_mouths(albedo: Tensor, generator: torch.Generator) -> Tensor:
+    """Lips [B, 3, t, t] as they are when closed, or open on teeth, or on the dark."""
+    inside = mask(Window(SIDE, CHART_SPAN), "mouth", 1.0)
+    kind = torch.randint(3, (len(albedo), 1, 1, 1), generator=generator)
+    between = torch.where(kind == 1, _TEETH, _DARK)
+    return torch.where(kind == 0, albedo, albedo + inside * (between - albedo))
 
 
 def learn_light(maps: int = MAPS) -> LightPrior:

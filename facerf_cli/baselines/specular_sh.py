@@ -29,8 +29,8 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import FaceTexture, Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
 
-DIFFUSE_ORDER, GLOSS_ORDER = 2, 8
-EXPONENT = 30.0  # of the Blinn-Phong lobe
+DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
+EXPONENT = 12.0  # of the Blinn-Phong lobe, which then ends at GLOSS_ORDER
 SETTINGS = SolveSettings()
 DETAIL = 0.5  # of what the prior lacks of the photo
 _NODES = 256  # at which the lobe is integrated

@@ -17,7 +17,7 @@ from facerf_cli.light.sh import cosine_lobe, sh_basis
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.raster.texture import normal_map
 
-SMALL = TransferSettings(order=4, side=32, lights=80, lamp_samples=2, bounce_samples=4)
+SMALL = TransferSettings(order=4, side=32, lights=80, lamp_samples=2, bounce_samples=4, blur_texels=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_the_nose_shadows_what_is_under_it(vertices: Tensor, transfer: Tensor) -
     plain = white(shadowless[None])
     share = lit(white(transfer), 0, 70) / lit(plain, 0, 70).clamp_min(0.05)
     assert float(share[:8, 26:38].mean()) > 0.9  # forehead
-    assert float(share[36:40, 29:35].mean()) < 0.6  # lip below the nose
+    assert float(share[38:41, 29:35].mean()) < 0.6  # lip below the nose
 
 
 def test_the_bounce_adds_light_where_the_face_sees_itself(transfer: Tensor) -> None:
