@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.face import importers
-from facerf_cli.face.importers import SourceModel, carry_over
+from facerf_cli.face.importers.carry import carry_over
+from facerf_cli.face.importers.ict import ict_source as ict_source_of
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 
 SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "shared"))
@@ -33,7 +34,7 @@ def ict_source(shared_data: Path) -> SourceModel:
         for member in tar:
             if Path(member.name).stem in wanted and "FaceXModel/" in member.name:
                 raw[Path(member.name).stem] = tar.extractfile(member).read()
-    return importers._ict_source(archive, raw)
+    return ict_source_of(archive, raw)
 
 
 @pytest.fixture(scope="session")

@@ -36,15 +36,14 @@ def import_model(
     Its mean and bases are resampled on the chart that all of facerf's textures share, so that one checkpoint
     serves every model. The model's licence goes with it.
     """
-    from facerf_cli.face.importers import import_ict_facekit
+    from facerf_cli.face.importers.importing import import_face_model
     from facerf_cli.face.morphable import save_face_model
 
     if output.suffix != ".npz":
         raise UsageError(f"-o {output}: a face model is a file that ends in .npz")
     if output.exists() and not overwrite:
         raise UsageError(f"{output} is there already; give --overwrite to replace it")
-    importers = {"ict-facekit": import_ict_facekit}
-    model = importers[kind](source)
+    model = import_face_model(kind, source)
     with atomic_path(output) as temporary:
         save_face_model(temporary, model)
     log.info(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facerf_cli import __version__
 from facerf_cli.errors import UsageError
-from facerf_cli.face.importers import EXPRESSION_STD
+from facerf_cli.face.importers.source import EXPRESSION_STD
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import GRID
 from facerf_cli.files.atomic import atomic_path

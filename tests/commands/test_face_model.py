@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.face import importers
+from facerf_cli.face.importers import importing
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.main import main
 
@@ -15,7 +15,7 @@ Capture = pytest.CaptureFixture[str]
 def imported(monkeypatch: pytest.MonkeyPatch) -> MorphableModel:
     """What the importer gives here, whatever it is given: the built-in model."""
     model = load_face_model("builtin")
-    monkeypatch.setattr(importers, "import_ict_facekit", lambda path: model)
+    monkeypatch.setattr(importing, "import_face_model", lambda *_: model)
     return model
 
 

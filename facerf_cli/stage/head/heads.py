@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from facerf_cli.face.head_model import HEAD_PARTS, HeadModel
-from facerf_cli.face.importers import EXPRESSION_STD
+from facerf_cli.face.importers.source import EXPRESSION_STD
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG
 from facerf_cli.raster.texture import vertex_normals

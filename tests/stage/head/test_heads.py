@@ -9,7 +9,8 @@ import torch
 import trimesh
 
 from facerf_cli.face.head_model import HEAD_PARTS
-from facerf_cli.face.importers import _nearest, _skin_uv
+from facerf_cli.face.importers.carried_head import skin_uv
+from facerf_cli.face.importers.registration import nearest_on_mesh
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.camera import Camera
@@ -50,7 +51,7 @@ def test_the_head_and_the_canonical_mesh_agree(ict_model, alpha, jaw):
     canonical = ict_model.vertices(torch.tensor([alpha]), beta(ict_model, jawOpen=jaw)[None])
     surface = trimesh.Trimesh(found.vertices, found.triangles, process=False)
     landmarks = ict_model.landmarks(canonical)[0].numpy()
-    off_m = np.linalg.norm(_nearest(surface, landmarks)[0] - landmarks, axis=-1)
+    off_m = np.linalg.norm(nearest_on_mesh(surface, landmarks)[0] - landmarks, axis=-1)
     assert off_m.max() < 0.001 and np.median(off_m) < 0.0002
 
 
@@ -106,7 +107,7 @@ def test_the_ball_stays_behind_half_shut_lids(ict_model):
     ball = max(surface.split(), key=lambda piece: piece.centroid[0])
     skin = mesh.vertices[mesh.part == 0]
     near = skin[np.linalg.norm(skin - ball.centroid, axis=-1) < 0.025]
-    closest, faces = _nearest(ball, near)
+    closest, faces = nearest_on_mesh(ball, near)
     assert ((near - closest) * ball.face_normals[faces]).sum(-1).min() > -0.0001
 
 
@@ -197,6 +198,6 @@ def test_subdivision_slides_the_texture_along(ict_model):
     mesh = head(ict_model)
     beside = np.abs(np.abs(mesh.uv[:, 0] - 0.5) - 0.3) < 0.08
     cheek = np.flatnonzero((mesh.part == 0) & beside & (np.abs(mesh.uv[:, 1] - 0.6) < 0.2))
-    expected = _skin_uv(mesh.vertices[cheek].astype(np.float64), ict_model.mean.numpy())
+    expected = skin_uv(mesh.vertices[cheek].astype(np.float64), ict_model.mean.numpy())
     off = np.abs(mesh.uv[cheek] - expected)
     assert np.percentile(off, 99) < 0.0006  # 0.1 mm; left where they were they zigzag by five times that

@@ -1,0 +1,117 @@
+"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020)."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.head_model import HEAD_PARTS
+from facerf_cli.face.importers.archives import DAMAGED, members
+from facerf_cli.face.importers.source import EXPRESSION_STD, SourceHead, SourceModel
+from facerf_cli.records import one_line
+
+_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, and of all
+
+_LANDMARKS = (
+    "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 "
+    "268 493 1914 2044 1401 3615 4240 4114 2734 2509 978 4527 4942 4857 1140 2075 1147 "
+    "4269 3360 1507 1542 1537 1528 1518 1511 3742 3751 3756 3721 3725 3732 5708 5695 2081 "
+    "0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 5517 5966"
+)
+LANDMARK_IDS = np.array(_LANDMARKS.split(), dtype=np.int64)  # from its README
+_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
+VERTICES = 26719
+_PARTS = {  # first and last vertex; an eyeball is its sclera, which wraps the iris and bulges as a cornea
+    "skin": ((0, 11247),),
+    "mouth": ((11248, 13293), (14062, 17038)),  # socket; gums and tongue
+    "teeth": ((17039, 21450),),
+    "eye": ((21451, 22220), (23021, 23790)),
+}
+_LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
+
+
+def read_ict_facekit(path: Path) -> SourceModel:
+    """ICT Face Model Light as its authors publish it: `FaceXModel/*.obj` in a folder, a .zip or a .tar.xz."""
+    raw: dict[str, bytes] = {}
+    try:
+        for name, read in members(path):
+            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+                raw[found[1]] = read(_MAX_OBJ_BYTES + 1)
+                if len(raw[found[1]]) > _MAX_OBJ_BYTES or sum(map(len, raw.values())) > _MAX_BYTES:
+                    raise InputError(f"{path}: {name} is too large; this is not ICT-FaceKit")
+    except DAMAGED as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
+        ) from None
+    if "generic_neutral_mesh" not in raw:
+        raise InputError(
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj in it; give ICT-FaceKit's folder or archive"
+        )
+    return ict_source(path, raw)
+
+
+def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
+    """The model of the .obj files' contents by their stems; centimetres there, metres here."""
+    neutral = raw.pop("generic_neutral_mesh")
+    mean = _obj_vertices(path, "generic_neutral_mesh", neutral)
+    identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
+    expressions = sorted(set(raw) - set(identities))
+    if not identities or not expressions:
+        raise InputError(f"{path}: identity or expression shapes are missing from FaceXModel")
+
+    def offsets(stems: list[str]) -> np.ndarray:
+        return np.stack([_obj_vertices(path, stem, raw[stem]) - mean for stem in stems])
+
+    triangles = _obj_triangles(path, neutral)
+    outer = np.zeros(VERTICES, bool)
+    for part in _SKIN:
+        outer[part] = True
+    return SourceModel(
+        name="ict-facekit",
+        licence=_LICENCE,
+        mean=mean,
+        identity=offsets(identities),
+        expression=offsets(expressions) * EXPRESSION_STD,
+        expression_names=tuple(expressions),
+        triangles=triangles[outer[triangles].all(1)],
+        landmarks=mean[LANDMARK_IDS],
+        head=_head(triangles),
+    )
+
+
+def _head(triangles: np.ndarray) -> SourceHead:
+    """Skin, mouth, teeth and eyeballs; the sockets behind the eyes and the film before them are left out."""
+    part = np.full(VERTICES, 255, np.uint8)
+    for name, spans in _PARTS.items():
+        for first, last in spans:
+            part[first : last + 1] = HEAD_PARTS.index(name)
+    eyes = tuple(np.arange(first, last + 1) for first, last in _PARTS["eye"])
+    return SourceHead(triangles[(part[triangles] < 255).all(1)], part, eyes)
+
+
+def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
+    lines = [line[2:] for line in text.splitlines() if line.startswith(b"v ")]
+    try:
+        vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
+    except ValueError:
+        raise InputError(f"{path}: {stem}.obj is damaged; fetch ICT-FaceKit again") from None
+    if vertices_cm.shape != (VERTICES, 3) or not np.isfinite(vertices_cm).all():
+        raise InputError(
+            f"{path}: {stem}.obj has {len(lines)} vertices, not {VERTICES}; fetch ICT-FaceKit again"
+        )
+    return vertices_cm / 100
+
+
+def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
+    triangles = []
+    try:
+        for line in text.splitlines():
+            if line.startswith(b"f "):
+                corners = [int(token.split(b"/")[0]) - 1 for token in line.split()[1:]]
+                triangles += [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
+    except ValueError:
+        triangles = []
+    if not triangles or not 0 <= np.min(triangles) <= np.max(triangles) < VERTICES:
+        raise InputError(f"{path}: the neutral mesh's faces are damaged; fetch ICT-FaceKit again")
+    return np.array(triangles)
