@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     from facerf_cli.stage.data.recipes import Pair
 
 _PAPER_PICTURES = 86  # paper, Table 2
+_NOTES = (
+    "The field is the network's own, not held to a photo.",
+    "si_mse_channels has a scale for each channel: one photo cannot tell red light from red skin.",
+)
+_NOTE_OF_PHOTOS = "Where expressions differ, so does what mouths show: no reflectance knows of it."
 
 Couples = dict[str, "list[tuple[Pair, Pair]]"]
 
@@ -94,10 +99,7 @@ def transfer(
         metrics=("si_mse", "face_distance", "si_mse_channels", "ssim"),
         by=("turn",) if photos else ("turn", "tone"),
         published=TABLE_2_TRANSFER,
-        notes=(
-            "The field is the network's own, not held to a photo.",
-            "si_mse_channels has a scale for each channel: one photo cannot tell red light from red skin.",
-        ),
+        notes=(*_NOTES, _NOTE_OF_PHOTOS) if photos else _NOTES,
     )
     return run_protocol(layout, items, work, options, settings)
 
