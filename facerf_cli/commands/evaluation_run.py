@@ -109,6 +109,7 @@ class _Measure:
 
         rows: list[Row] = []
         wrong: list[str] = []
+        scaled = self.metric.startswith("si_") and self.options.space == "linear"
         keeper, measures = StripKeeper(self.metric), self.options.measures()
         for own in self.compare(item):
             if self.options.pictures:
@@ -117,7 +118,7 @@ class _Measure:
             if wrong:
                 continue  # all that is missing is to be named, at once
             measured = measure(comparison, measures)
-            keeper.offer(measured, partial(strip_of, comparison, self.metric.startswith("si_")))
+            keeper.offer(measured, partial(strip_of, comparison, scaled))
             rows += measured
         _require_whole(item, rows, wrong)
         strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings)

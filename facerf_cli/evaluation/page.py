@@ -94,14 +94,15 @@ def _groups(summary: Summary) -> Iterator[str]:
 
 def _pictures(summary: Summary, chosen: Chosen, jpegs: Mapping[str, bytes]) -> Iterator[str]:
     how, first = shown_as(summary.metrics[0]), escape(summary.methods[0])
-    everything = not (chosen.typical or chosen.best)
+    everything = len(chosen.worst) == summary.pictures
     yield f'<h2 id="worst">{"All cases, the worst first" if everything else "Worst cases"}</h2>'
     if not chosen.worst:
         yield "<p>No pictures were kept.</p>"
         return
     yield (
-        f"<p>By {escape(how.title)} of {first}. All pictures of a case are at the truth's exposure, a "
-        "method's times the scale that Si-MSE compares it at, where that is the metric; grey is left out. "
+        f"<p>By {escape(how.title)} of {first}. Pictures of a case are at the truth's exposure, the seen one "
+        "at its own; a method's is times the scale that Si-MSE of linear values compares it at, where that is "
+        "the metric. Grey is left out. "
         "Predictions are synthetic. images.csv has every picture's figures.</p>"
     )
     yield (

@@ -24,7 +24,7 @@ class CasePicture:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The cases that the page shows; none of them twice."""
+    """The cases that the page shows, none of them twice; where they are few, all are among `worst`."""
 
     worst: tuple[CasePicture, ...]
     typical: tuple[CasePicture, ...]
@@ -49,9 +49,10 @@ def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[KeptStrip], w
 
     cases = [CasePicture(strip, tuple(of_case[strip.case])) for strip in strips if strip.case in of_case]
     cases = sorted(cases, key=lambda case: (-badness(case), case.strip.case))
-    if len(cases) <= worst + TYPICAL + BEST:
+    if len(cases) == summary.pictures <= worst:
         return Chosen(tuple(cases), (), ())
-    shown, rest = cases[:worst], cases[worst:]
+    most = max(1, min(worst, len(cases) - TYPICAL - BEST))
+    shown, rest = cases[:most], cases[most:]
     between, best = rest[:-BEST], rest[-BEST:][::-1]
     cell = summary.groups[0].cells[metric].get(first)
     median = sign * cell.interval.median if cell else 0.0

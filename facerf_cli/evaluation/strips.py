@@ -22,8 +22,9 @@ _PAPER = 0.16  # display value of what is left out of the comparison
 class Strip:
     """Tiles [2 h, (1 + methods) w, 3], bytes for display: a column of source over truth, then the methods'.
 
-    A method's column is its picture over its error. All are shown at the truth's exposure `ev`; `scales` is
-    what each method's picture was multiplied by before, 1 where no scale was sought.
+    A method's column is its picture over its error, at the truth's exposure `ev`; `scales` is what each
+    picture was multiplied by before, 1 where no scale was sought. A source has an exposure of its own; where
+    there is none, the mask stands in its place.
     """
 
     pixels: np.ndarray
@@ -34,22 +35,21 @@ class Strip:
 
 
 def strip_of(comparison: Comparison, scaled: bool) -> Strip:
-    """The strip of a case; `scaled` shows a prediction at the scale that Si-MSE compares it at."""
+    """The strip of a case; `scaled` shows a prediction at the scale that linear Si-MSE compares it at."""
     truth, mask = comparison.truth, comparison.mask
     ev = auto_exposure_ev(truth, mask)
     tile = _tile_size(truth.shape)
-    seen = mask if comparison.source is None else comparison.source
     true = _display(truth, ev)
-    source_ev = ev if comparison.source is None else auto_exposure_ev(comparison.source)
-    first = mask if comparison.source is None else _display(seen, source_ev)
-    columns, scales = [_column(_fitted(first, tile), _fitted(true, tile))], []
+    seen = mask if comparison.source is None else _seen(comparison.source)
+    columns, scales = [_column(_fitted(seen, tile), _fitted(true, tile))], []
     for prediction in comparison.predictions.values():
         scale = best_scale(prediction, truth, mask) if scaled else 1.0
         ours = _display(scale * prediction, ev)
         columns.append(_column(_fitted(_inside(ours, mask), tile), _fitted(_error(ours, true, mask), tile)))
         scales.append(scale)
     methods = tuple(comparison.predictions)
-    return Strip(np.concatenate(columns, 1), methods, ev, tuple(scales), comparison.source is not None)
+    pixels = np.concatenate(columns, 1)[:-_GAP_PX, :-_GAP_PX]
+    return Strip(pixels, methods, ev, tuple(scales), comparison.source is not None)
 
 
 def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
@@ -61,6 +61,11 @@ def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
 def _display(linear: np.ndarray, ev: float) -> np.ndarray:
     """Linear light of any shape as display values 0..1."""
     return linear_to_srgb(np.clip(linear * np.float32(2.0**ev), 0, 1))
+
+
+def _seen(source: np.ndarray) -> np.ndarray:
+    """The source as display values, at its own exposure."""
+    return _display(source, auto_exposure_ev(source))
 
 
 def _inside(display: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -90,6 +95,6 @@ def _fitted(display: np.ndarray, tile: tuple[int, int]) -> np.ndarray:
 
 
 def _column(above: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Two tiles in a column, with a gap that belongs to each."""
+    """Two tiles in a column, each with a gap below and on its right."""
     frame = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
     return np.concatenate([np.pad(tile, frame, constant_values=_GAP) for tile in (above, below)])

@@ -133,6 +133,10 @@ def test_the_worst_come_first_and_the_page_is_bounded() -> None:
     assert len(shown) == WORST + TYPICAL + BEST
     few = choose(summarise(LAYOUT, found[:9]), found[:9], strips(found[:9]))
     assert len(few.worst) == 9 and not few.best
+    some = choose(summarise(LAYOUT, found), found, strips(found[:20]))  # not all strips are kept
+    assert (len(some.worst), len(some.typical), len(some.best)) == (12, 4, 4)
+    assert "Worst cases" in write(summarise(LAYOUT, found), some)
+    assert "All cases, the worst first" in write(summarise(LAYOUT, found[:9]), few)
 
 
 def test_for_a_similarity_the_worst_are_the_lowest() -> None:
@@ -155,7 +159,7 @@ def test_a_strip_shows_what_was_compared() -> None:
     own = replace(own, predictions={"half": 0.5 * own.truth, "none": 0 * own.truth})
     strip = strip_of(own, scaled=True)
     height = round(TILE * own.truth.shape[0] / own.truth.shape[1])
-    assert strip.pixels.shape == (2 * (height + GAP), 3 * (TILE + GAP), 3)
+    assert strip.pixels.shape == (2 * (height + GAP) - GAP, 3 * (TILE + GAP) - GAP, 3)
     assert strip.scales[0] == pytest.approx(2) and strip.scales[1] == 0
     middle = (height + GAP + height // 2, 3 * (TILE + GAP) - GAP - TILE // 2)  # of the last error map
     half = strip.pixels[middle[0], middle[1] - TILE - GAP]
