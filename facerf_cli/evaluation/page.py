@@ -101,9 +101,9 @@ def _pictures(summary: Summary, chosen: Chosen, jpegs: Mapping[str, bytes]) -> I
         return
     yield (
         f"<p>By {escape(how.title)} of {first}. Pictures of a case are at the truth's exposure, the seen one "
-        "at its own; a method's is times the scale that Si-MSE of linear values compares it at, where that is "
-        "the metric. Grey is left out. "
-        "Predictions are synthetic. images.csv has every picture's figures.</p>"
+        "at its own; a method's is times the scale that Si-MSE of linear values compares it at, where that "
+        "is the metric. Grey is left out. Predictions are synthetic. images.csv has every picture's "
+        "figures.</p>"
     )
     yield (
         '<p class="scale"><span>Error</span> 0 <i></i> '
