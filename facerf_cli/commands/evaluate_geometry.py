@@ -89,6 +89,8 @@ def geometry(
         published=TABLE_4,
         notes=(_note(mean_checkpoint),),
     )
+    if not options.dry_run:
+        _mean_methods(forms)  # what is wrong with a checkpoint is said once
     return run_protocol(layout, items, work, options, settings)
 
 

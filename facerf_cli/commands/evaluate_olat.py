@@ -14,6 +14,7 @@ from facerf_cli.commands.evaluation_items import (
     RefitOption,
     SplitOption,
     every_nth,
+    load_before,
     load_methods,
     no_part_of_preset,
     people_items,
@@ -62,7 +63,9 @@ def olat(
     photo = PhotoOptions(settings, face_model=face_model)
     prepared, pairs = read_split(dataset, split, face_model, refit)
     chosen = _paper_pairs(dataset, pairs) if options.preset else every_nth(pairs, every)
-    work = _Olat(MethodOptions.of(photo, options), prepared, chosen, options.keep_eyes, refit, network_alone)
+    methods = MethodOptions.of(photo, options)
+    load_before(methods, options)
+    work = _Olat(methods, prepared, chosen, options.keep_eyes, refit, network_alone)
     layout = Layout(
         name="olat",
         title="Single lights of held-out people",

@@ -13,6 +13,7 @@ from facerf_cli.commands.evaluation_items import (
     RefitOption,
     SplitOption,
     chosen_sources,
+    load_before,
     load_methods,
     no_part_of_preset,
     only_dataset,
@@ -79,6 +80,7 @@ def reconstruction(
         published=TABLE_2_RECONSTRUCTION,
         notes=("The field is the network's own, not held to the photo: it would be exact by construction.",),
     )
+    load_before(methods, options)
     return run_protocol(layout, items, work, options, settings)
 
 

@@ -13,6 +13,7 @@ from facerf_cli.commands.evaluation_items import (
     MethodOptions,
     RefitOption,
     SplitOption,
+    load_before,
     load_methods,
     no_part_of_preset,
     only_dataset,
@@ -81,8 +82,7 @@ def transfer(
     methods = MethodOptions.of(photo, options)
     work: _OfPhotos | _OfPeople
     if photos:
-        couples = _photo_couples(inputs, options.output)
-        _require_enough_photos(couples, options)
+        couples = _preset_couples(_photo_couples(inputs, options.output), options)
         items = list(couples)
         work = _OfPhotos(methods, couples, options.keep_eyes)
     else:
@@ -101,6 +101,7 @@ def transfer(
         published=TABLE_2_TRANSFER,
         notes=(*_NOTES, _NOTE_OF_PHOTOS) if photos else _NOTES,
     )
+    load_before(methods, options)
     return run_protocol(layout, items, work, options, settings)
 
 
@@ -165,11 +166,21 @@ def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     return {couple.item: couple for couple in couples}
 
 
-def _require_enough_photos(couples: Mapping[Item, object], options: EvaluateOptions) -> None:
-    if options.preset and 2 * len(couples) < _PAPER_PICTURES:
+def _preset_couples(couples: dict[Item, _Couple], options: EvaluateOptions) -> dict[Item, _Couple]:
+    """All couples, or a preset's number evenly over people."""
+    from facerf_cli.evaluation.people import evenly
+
+    if not options.preset:
+        return couples
+    if 2 * len(couples) < _PAPER_PICTURES:
         raise UsageError(
             f"{2 * len(couples)} photos in couples, --preset paper measures {_PAPER_PICTURES}; give more"
         )
+    groups: dict[str, list[Item]] = {}
+    for item, couple in couples.items():
+        groups.setdefault(couple.person, []).append(item)
+    chosen = evenly(groups, _PAPER_PICTURES // 2)
+    return {item: couples[item] for members in chosen.values() for item in members}
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,6 +78,12 @@ def load_methods(options: MethodOptions) -> "tuple[Method, ...]":
     )
 
 
+def load_before(methods: MethodOptions, options: EvaluateOptions) -> None:
+    """Load the methods before any item, so that what is wrong with a checkpoint is said once."""
+    if not options.dry_run:
+        load_methods(methods)
+
+
 def is_dataset(path: Path) -> bool:
     """Whether a folder is a prepared dataset."""
     return (path / "dataset.json").is_file()

@@ -68,6 +68,15 @@ def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest
     assert "already finished" in capsys.readouterr().err
 
 
+def test_a_checkpoint_that_is_none_is_said_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["olat", folder, "--against"], ["geometry", folder, "--mean-checkpoint"]):
+        capsys.readouterr()
+        assert run(*map(str, words), PHOTO, "-o", tmp_path / "out") == 1
+        assert len([x for x in capsys.readouterr().err.splitlines() if "astronaut.jpg" in x]) == 1
+
+
 def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
