@@ -1,7 +1,7 @@
 """`facerf convert-light`: a light from one form and other programs' axes to another."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
@@ -46,6 +46,7 @@ class _ConvertLight:
     width_px: int | None
     order: int | None
     lights: str | None
+    signed: bool
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file a form."""
@@ -54,6 +55,7 @@ class _ConvertLight:
     def __call__(self, item: Item) -> Outcome:
         """Read the light and write it."""
         light, attributes = _read(item.input_path, self.from_axes)
+        light = replace(light, signed=self.signed)
         for form in self.forms:
             self._write(item.output(_ENDINGS[form]), light, form, attributes)
         return Outcome(self.outputs_of(item), {"light": str(light)})
@@ -189,6 +191,14 @@ def convert_light(
             show_default="the input's own, else 150",
         ),
     ] = None,
+    signed: Annotated[
+        bool,
+        typer.Option(
+            "--signed",
+            help="Keep the plain series of spherical harmonics, which is negative in places (default: a "
+            "light that can shine, with the same coefficients as nearly as can be).",
+        ),
+    ] = False,
     jobs: JobsOption = 1,
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
@@ -206,7 +216,7 @@ def convert_light(
     if lights is not None:
         parse_directions(lights)  # a wrong one fails the call, not every item
     forms: Any = tuple(dict.fromkeys(to))
-    convert = _ConvertLight(forms, from_axes, width, order, lights)
+    convert = _ConvertLight(forms, from_axes, width, order, lights, signed)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
     code = run_batch("convert-light", inputs, convert, convert.outputs_of, options, settings, _SUFFIXES)

@@ -10,20 +10,26 @@ from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, order_of, rig_coefficients
 from facerf_cli.light.sh_latlong import latlong_coefficients, sh_to_latlong
+from facerf_cli.light.sh_positive import positive_latlong
 from facerf_cli.light.sphere import latlong_solid_angles, rig_directions
 
 DEFAULT_ROWS = 256  # of a map whose size nobody says
 DEFAULT_ORDER = 2  # what the shading of a matte surface shows
-_ROWS_BETWEEN_RIGS = 512
+_ROWS_BETWEEN = 512  # of the map that leads to a rig
 
 
 @dataclass(frozen=True, eq=False)
 class LightForms:
-    """One light: exactly one of a map [H, 2 H, 3], a rig's light, and coefficients [K, 3] is given."""
+    """One light: exactly one of a map [H, 2 H, 3], a rig's light, and coefficients [K, 3] is given.
+
+    A map or a rig of coefficients is a light that can shine, nowhere negative (`light/sh_positive.py`);
+    where `signed`, the plain series.
+    """
 
     envmap: Tensor | None = None
     rig: RigLight | None = None
     coefficients: Tensor | None = None
+    signed: bool = False
 
     def __str__(self) -> str:
         if self.envmap is not None:
@@ -49,19 +55,20 @@ class LightForms:
         if self.rig is not None:
             return rig_to_latlong(self.rig, height)
         assert self.coefficients is not None
-        return sh_to_latlong(self.coefficients, height)
+        drawn = sh_to_latlong if self.signed else positive_latlong
+        return drawn(self.coefficients, height)
 
     def on_rig(self, directions: Tensor | None = None) -> RigLight:
         """The light of a rig of these directions [L, 3]; of its own rig, or of 150, where none are given.
 
-        That of coefficients may be negative. From one rig to another it goes by a smooth map.
+        From one rig to another, or from coefficients that are not signed, it goes by a smooth map.
         """
         if self.rig is not None and (directions is None or torch.equal(directions, self.rig.directions)):
             return self.rig
         directions = rig_directions() if directions is None else directions
-        if self.coefficients is not None:
+        if self.coefficients is not None and self.signed:
             return RigLight(directions, coefficients_to_rig(self.coefficients, directions))
-        envmap = self.latlong(None if self.rig is None else _ROWS_BETWEEN_RIGS)
+        envmap = self.latlong(None if self.envmap is not None else _ROWS_BETWEEN)
         return RigLight(directions, envmap_weights(envmap, directions))
 
     def harmonics(self, order: int | None = None) -> Tensor:

@@ -80,7 +80,7 @@ def test_harmonics_as_json_text_and_maps(tmp_path: Path, capsys: Capture) -> Non
     of_text = read_light(tmp_path / "spot_sfsnet_sh.json").sh
     assert of_text is not None
     torch.testing.assert_close(of_text.coefficients, of_map.coefficients, rtol=0, atol=1e-5)
-    assert convert(tmp_path / "spot_sh.json", tmp_path, "--to", "latlong", "--to", "json") == 0
+    assert convert(tmp_path / "spot_sh.json", tmp_path, "--to", "latlong", "--to", "json", "--signed") == 0
     assert convert(tmp_path / "spot_sh_latlong.exr", tmp_path, "--to", "sh") == 0
     of_drawn = read_light(tmp_path / "spot_sh_latlong_sh.json").sh
     assert of_drawn is not None
@@ -90,6 +90,19 @@ def test_harmonics_as_json_text_and_maps(tmp_path: Path, capsys: Capture) -> Non
     rig = read_light(tmp_path / "spot_sh_light.json")
     brightest_light = rig.directions[rig.weights.sum(1).argmax()]
     assert float(brightest_light @ front) > math.cos(math.radians(15))
+
+
+def test_a_map_of_harmonics_can_shine(tmp_path: Path, capsys: Capture) -> None:
+    assert convert(a_map(tmp_path), tmp_path, "--to", "sh") == 0
+    assert convert(tmp_path / "spot_sh.json", tmp_path, "--to", "latlong", "--to", "json") == 0
+    assert float(pixels(tmp_path / "spot_sh_latlong.exr").min()) >= 0
+    assert float(read_light(tmp_path / "spot_sh_light.json").weights.min()) >= 0
+    assert "negative" not in capsys.readouterr().err
+    assert convert(tmp_path / "spot_sh_latlong.exr", tmp_path, "--to", "sh") == 0
+    before, after = (read_light(tmp_path / f"spot_{name}.json").sh for name in ("sh", "sh_latlong_sh"))
+    assert before is not None and after is not None
+    error = (after.coefficients - before.coefficients).norm() / before.coefficients.norm()
+    assert float(error) < 0.05
 
 
 def test_dprs_example_keeps_its_numbers(tmp_path: Path) -> None:
