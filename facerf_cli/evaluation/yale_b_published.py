@@ -15,7 +15,7 @@ PEERS = ("DPR", "GeomConsistentFR")
 SHOWN = ("copy of the source", *PEERS, "quotient image")  # beside ours
 TOLD_MORE = ("others' mean", "others' Lambert", "quotient image")
 PUBLISHED_SUBJECTS = 21
-_SOURCE = "the benchmark"
+_SOURCE = "Yale B"
 _SAME = f"same pictures, {PUBLISHED_SUBJECTS} people"
 _KNOWS = _SAME + ", told more"
 
@@ -51,13 +51,16 @@ FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = 
 def published() -> tuple[Published, ...]:
     """The rows to stand beside ours."""
     rows: list[Published] = []
+
+    def add(method: str, metric: str, mean: float, group: tuple[str, str], digits: int) -> None:
+        data = _KNOWS if method in TOLD_MORE else _SAME
+        rows.append(Published(method, metric, mean, None, group, _SOURCE, data, digits))
+
     for method in SHOWN:
-        where = _SOURCE, _KNOWS if method in TOLD_MORE else _SAME
         by_column, by_angle = FIGURES[method]
         for column, (si_mse, ssim) in zip(COLUMNS, by_column, strict=True):
-            group = "column", column
-            rows.append(Published(method, "si_mse", si_mse, None, group, *where))
-            rows.append(Published(method, "ssim", ssim, None, group, *where))
+            add(method, "si_mse", si_mse, ("column", column), 4)
+            add(method, "ssim", ssim, ("column", column), 3)
         for (low, high), si_mse in zip(pairwise(ANGLES_DEG), by_angle, strict=True):
-            rows.append(Published(method, "si_mse", si_mse, None, ("angle", f"{low}-{high} deg"), *where))
+            add(method, "si_mse", si_mse, ("angle", f"{low}-{high} deg"), 4)
     return tuple(rows)
