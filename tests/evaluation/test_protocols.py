@@ -1,5 +1,7 @@
 """The protocols' geometry and bookkeeping on a tiny dataset whose truth is known in closed form."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +22,7 @@ from facerf_cli.evaluation.views import View
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.metrics import si_mse
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.stage.data.dataset import Dataset
+from facerf_cli.stage.data.dataset import Dataset, read_dataset
 from facerf_cli.stage.data.recipes import Pair
 from tests.evaluation.method_doubles import BRIGHTEST, Double, PersonOfAlbedo
 from tests.stage.data.dataset_fixture import write_small_dataset
@@ -196,3 +198,18 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     written, _ = person.source(first)
     picture_path(dataset, *first.key).unlink()
     np.testing.assert_array_equal(person.source(first)[0], written)
+
+
+def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(dataset.folder, tmp_path / "d"))
+    content = json.loads((folder / "dataset.json").read_text())
+    for traits, tone in (({"ita_deg": -50}, "dark"), (None, "unknown"), ({"ita_deg": "fair"}, "unknown")):
+        content["subjects"]["0000"]["traits"] = traits
+        if traits is None:
+            del content["subjects"]["0000"]["traits"]
+        (folder / "dataset.json").write_text(json.dumps(content))
+        assert Person(load_face_model(), read_dataset(folder), "0000").facts["tone"] == tone
+    content["subjects"]["0000"]["traits"] = ["dark"]
+    (folder / "dataset.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="traits"):
+        read_dataset(folder)
