@@ -2,6 +2,7 @@
 
 import csv
 import json
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 
 from facerf_cli.commands import evaluate_yale_b
+from facerf_cli.commands.evaluation_items import MethodOptions
+from facerf_cli.commands.options import Settings
+from facerf_cli.commands.photo import PhotoOptions
 from facerf_cli.evaluation import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
-from facerf_cli.stage.data.yale_b import Flash
+from facerf_cli.stage.data.yale_b import Flash, read_yale_b
 from tests.evaluation.toy_sitters import Lambert, Networks, someone
-from tests.stage.data.yale_fixture import write_pgm, write_yale_b
+from tests.stage.data.yale_fixture import ramp, write_pgm, write_yale_b
 
 Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
@@ -110,3 +114,10 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
     out = tmp_path / "out"
     assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--dry-run"]) == 0
     assert "yaleB05.json" in capsys.readouterr().out and not out.exists()
+
+
+def test_the_work_goes_to_other_processes(folder: Path) -> None:
+    methods = MethodOptions(PhotoOptions(Settings()), ("field", "prt"), ())
+    sent = pickle.loads(pickle.dumps(evaluate_yale_b._YaleB(methods, read_yale_b(folder), False)))
+    assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
+    np.testing.assert_array_equal(sent.database.picture("yaleB07", FEW[0]), ramp(0) / np.float32(255))
