@@ -18,7 +18,8 @@ MapAxes = Literal["facerf", "blender", "mitsuba"]
 # - Mitsuba (src/emitters/envmap.cpp, eval: u = atan2(x, -z) / 2 pi, v = acos(y) / pi): the head looks along
 #   its +z, y up, and the map is ours as it stands.
 # - Blender (Cycles' kernel/camera/projection.h, direction_to_equirectangular: u = 0.5 - atan2(y, x) / 2 pi):
-#   the head looks along -Y, Z up, as in its front view; ours, a quarter of the width to the right.
+#   the head looks along -Y, Z up, as in its front view; ours, a quarter of the width to the right. Seen in
+#   Blender 4.5.15 (bpy, Cycles): a white ball under two converted maps is our irradiance to 1 %.
 _GAIN_DEG: dict[MapAxes, float] = {"facerf": 0, "mitsuba": 0, "blender": -90}
 
 _CAMERA_TO_DPR = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
