@@ -35,11 +35,6 @@ if TYPE_CHECKING:
     from facerf_cli.stage.data.recipes import Pair
 
 _PAPER_PICTURES = 86  # paper, Table 2
-_NOTES = (
-    "The field is the network's own, not held to a photo.",
-    "si_mse_channels has a scale for each channel: one photo cannot tell red light from red skin.",
-)
-_NOTE_OF_PHOTOS = "Where expressions differ, so does what mouths show: no reflectance knows of it."
 
 Couples = dict[str, "list[tuple[Pair, Pair]]"]
 
@@ -58,6 +53,12 @@ def transfer(
     options: EvaluateOptions,
     photos: Annotated[
         bool, typer.Option("--photos", help="What is given are photos, two by two or in folders.")
+    ] = False,
+    held_to_photo: Annotated[
+        bool,
+        typer.Option(
+            "--held-to-photo", help="Hold the field to the photo that it is read off, as `relight` does."
+        ),
     ] = False,
     split: SplitOption = "test",
     every: EveryOption = 1,
@@ -84,7 +85,7 @@ def transfer(
     if photos:
         couples = _preset_couples(_photo_couples(inputs, options.output), options)
         items = list(couples)
-        work = _OfPhotos(methods, couples, options.keep_eyes)
+        work = _OfPhotos(methods, couples, options.keep_eyes, held_to_photo)
     else:
         folder = only_dataset(inputs)
         if folder is None:
@@ -92,17 +93,28 @@ def transfer(
         dataset, pairs = read_split(folder, split, face_model, refit)
         chosen = _chosen_couples(folder, pairs, options, every)
         items = people_items(folder, list(chosen), options.output)
-        work = _OfPeople(methods, dataset, chosen, options.keep_eyes, refit)
+        work = _OfPeople(methods, dataset, chosen, options.keep_eyes, refit, held_to_photo)
     layout = Layout(
         name="transfer",
         title="Reflectances of two pictures of a person exchanged",
         metrics=("si_mse", "face_distance", "si_mse_channels", "ssim"),
         by=("turn",) if photos else ("turn", "tone"),
         published=TABLE_2_TRANSFER,
-        notes=(*_NOTES, _NOTE_OF_PHOTOS) if photos else _NOTES,
+        notes=_notes(photos, held_to_photo),
     )
     load_before(methods, options)
     return run_protocol(layout, items, work, options, settings)
+
+
+def _notes(photos: bool, held_to_photo: bool) -> tuple[str, ...]:
+    """What is said beside the figures."""
+    held = "held to the photo that it is read off" if held_to_photo else "the network's own"
+    notes = (
+        f"The field is {held}.",
+        "si_mse_channels has a scale for each channel: one photo cannot tell red light from red skin.",
+    )
+    mouths = "Where expressions differ, so does what mouths show: no reflectance knows of it."
+    return (*notes, mouths) if photos else notes
 
 
 def _chosen_couples(
@@ -190,6 +202,7 @@ class _OfPhotos:
     methods: MethodOptions
     couples: Mapping[Item, _Couple]
     keep_eyes: bool
+    held_to_photo: bool
 
     def __call__(self, item: Item) -> "Iterator[Comparison]":
         from facerf_cli.evaluation.cases import Case
@@ -201,7 +214,7 @@ class _OfPhotos:
             case = Case(f"{own.name}_by_{Path(other.name).name}", couple.person)
             portrait = next(portraits(own, self.methods.photo, self.keep_eyes))[1]
             sides.append(Side(case, portrait.view, portrait.picture, portrait.face))
-        yield from transfer((sides[0], sides[1]), methods)
+        yield from transfer((sides[0], sides[1]), methods, self.held_to_photo)
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,6 +226,7 @@ class _OfPeople:
     couples: "Mapping[str, list[tuple[Pair, Pair]]]"
     keep_eyes: bool
     refit: bool
+    held_to_photo: bool
 
     def __call__(self, item: Item) -> "Iterator[Comparison]":
         from facerf_cli.evaluation.people import Person
@@ -220,4 +234,4 @@ class _OfPeople:
 
         methods = load_methods(self.methods)
         person = Person(methods[0].models.face, self.dataset, item.name, self.keep_eyes, self.refit)
-        return transfer_person(person, self.couples[item.name], methods)
+        return transfer_person(person, self.couples[item.name], methods, self.held_to_photo)

@@ -25,9 +25,9 @@ class Method:
             return Field(self.models, face, explain_photo(self.models, face) if held_to_photo else None)
         return self.explained(fit, face).reflectance
 
-    def explained(self, fit: FaceFit, face: FaceTexture) -> Explained:
-        """Reflectance and light; the field as the network has it, or it would be exact by construction."""
-        return explain(self.kind, self.models, fit, face, held_to_photo=False)
+    def explained(self, fit: FaceFit, face: FaceTexture, held_to_photo: bool = False) -> Explained:
+        """Reflectance and light; a field that is held to its photo gives it back by construction."""
+        return explain(self.kind, self.models, fit, face, held_to_photo)
 
 
 def relit_by(reflectance: Reflectance, explained: Explained, turn: Tensor | None = None) -> Tensor:

@@ -36,10 +36,11 @@ class Side:
 
 
 @torch.no_grad()
-def transfer(sides: Sides, methods: Sequence[Method]) -> Iterator[Comparison]:
-    """Both pictures, each by the other's reflectance."""
+def transfer(sides: Sides, methods: Sequence[Method], held_to_photo: bool = False) -> Iterator[Comparison]:
+    """Both pictures, each by the other's reflectance, which may be held to that other photo."""
     explained = [
-        {method.name: method.explained(side.view.fit, side.face) for method in methods} for side in sides
+        {method.name: method.explained(side.view.fit, side.face, held_to_photo) for method in methods}
+        for side in sides
     ]
     for side, own, other, others in zip(sides, explained, sides[::-1], explained[::-1], strict=True):
         yield _made_of(side, own, other, others)
@@ -77,11 +78,16 @@ def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray)
 
 
 def transfer_person(
-    person: Person, couples: Iterable[tuple[Pair, Pair]], methods: Sequence[Method]
+    person: Person,
+    couples: Iterable[tuple[Pair, Pair]],
+    methods: Sequence[Method],
+    held_to_photo: bool = False,
 ) -> Iterator[Comparison]:
     """Couples of the sources of a person's pairs."""
     for first, second in couples:
-        yield from transfer((_side(person, first, second), _side(person, second, first)), methods)
+        yield from transfer(
+            (_side(person, first, second), _side(person, second, first)), methods, held_to_photo
+        )
 
 
 def _side(person: Person, pair: Pair, other: Pair) -> Side:

@@ -44,7 +44,7 @@ class Double:
     def reflectance(self, fit: FaceFit, face: FaceTexture, held_to_photo: bool) -> Unlit:
         return Unlit(face, self.gain)
 
-    def explained(self, fit: FaceFit, face: FaceTexture) -> Explained:
+    def explained(self, fit: FaceFit, face: FaceTexture, held_to_photo: bool = False) -> Explained:
         weights = torch.tensor([0.1, 0.2, 1.0])[:, None].expand(3, 3) * (1 + len(self.made))
         self.made.append(Explained(Unlit(face, self.gain), RigLight(LIGHTS, weights)))
         return self.made[-1]
