@@ -38,4 +38,5 @@ def with_detail(albedo: Tensor, face: FaceTexture, shading: Tensor, shining: Ten
     floor = floor.clamp_min(1e-9)[:, None, None]
     lit = shading.clamp_min(0) + floor
     lacking = (face.texture - shining + floor * albedo.exp()).clamp_min(1e-9).log() - lit.log() - albedo
-    return albedo + share * face.visible * lacking.clamp(-_MOST_DETAIL, _MOST_DETAIL)
+    finer = albedo + share * face.visible * lacking.clamp(-_MOST_DETAIL, _MOST_DETAIL)
+    return finer.clamp(max=0)  # nothing reflects more than it gets
