@@ -120,4 +120,4 @@ def test_the_work_goes_to_other_processes(folder: Path) -> None:
     methods = MethodOptions(PhotoOptions(Settings()), ("field", "prt"), ())
     sent = pickle.loads(pickle.dumps(evaluate_yale_b._YaleB(methods, read_yale_b(folder), False)))
     assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
-    np.testing.assert_array_equal(sent.database.picture("yaleB07", FEW[0]), ramp(0) / np.float32(255))
+    np.testing.assert_allclose(sent.database.picture("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)
