@@ -13,9 +13,10 @@ from facerf_cli.errors import InputError
 
 _RIDGE = 0.02  # against lights that undo each other, as a share of the picture's norm
 _OUTLIER = 3.0  # a texel further off than this many median errors weighs in inverse proportion
-_ROUNDS = 3  # of reweighting
+_ROUNDS, _ROUNDS_GREY = 3, 5  # of reweighting
 _SMOOTH, _SHORT = 0.1, 0.01  # the grey light of `estimate_smooth_light`, as shares of the picture's norm;
 _SMOOTH_OWN, _SHORT_OWN = 1.0, 0.1  # and what each channel adds to it
+_STANDS_OUT = 3.0  # a light further from its neighbours than this many mean lights may well be a lamp
 _TINY = 1e-12
 _NEIGHBOURHOOD = 1.5  # standard deviation of what is around a light, in mean distances between lights
 _WHITE = 0.95  # of a picture that ends at 1: what was brighter lies, averaged with its neighbours, above this
@@ -118,7 +119,7 @@ def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, cl
 
     Of lights at directions [L, 3], whose pictures [L, 3, N] are to sum to a picture [3, N]. A face fixes few
     numbers of the hundreds sought, and a channel at a time the rest comes out as coloured specks. So first
-    all channels share one grey light in one colour, of which what differs from its neighbours is kept small;
+    all channels share one grey light in one colour, smooth but for lamps that stand out;
     then each channel departs from that, again by what is smooth over the sphere. What is covered or
     misfitted weighs less; where `clipped` [3, N] bool, only being too dark is an error.
     """
@@ -126,24 +127,32 @@ def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, cl
         _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
         for lights, target, white in zip(olats.unbind(1), picture, clipped, strict=True)
     ]
-    roughness = _roughness(directions.double().numpy())
-    grey, colour = _grey_light(channels, roughness)
+    from_near = _from_near(directions.double().numpy())
+    grey, colour = _grey_light(channels, from_near)
+    roughness = from_near.T @ from_near
     own = [channel.near(gain * grey, roughness) for channel, gain in zip(channels, colour, strict=True)]
     return torch.from_numpy(np.stack(own, -1)).float()
 
 
-def _grey_light(channels: "list[_Channel]", roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The light [L] that all channels share, and how much of it each has [3]."""
+def _grey_light(channels: "list[_Channel]", from_near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The light [L] that all channels share, and how much of it each has [3].
+
+    What stands out from its neighbours is held to them the less the more it does (Cauchy's weights), or a
+    lone lamp would be smeared out.
+    """
+    lights = len(from_near)
     power = sum(channel.power for channel in channels)
-    prior = power * (_SMOOTH**2 * roughness + _SHORT**2 * np.eye(len(roughness)))
-    colour = np.array([channel.gain_of(np.ones(len(roughness))) for channel in channels])
+    hold = np.ones(lights)
+    colour = np.array([channel.gain_of(np.ones(lights)) for channel in channels])
     colour /= max(colour.mean(), _TINY)
-    for _ in range(_ROUNDS):
-        gram, moment = prior.copy(), np.zeros(len(prior))
+    for _ in range(_ROUNDS_GREY):
+        gram = power * (_SMOOTH**2 * (from_near.T * hold) @ from_near + _SHORT**2 * np.eye(lights))
+        moment = np.zeros(lights)
         for channel, gain in zip(channels, colour, strict=True):
             gram += gain * gain * channel.gram()
             moment += gain * channel.moment()
         grey = _non_negative(gram, moment)
+        hold = 1 / (1 + (from_near @ grey / max(_STANDS_OUT * grey.mean(), _TINY)) ** 2)
         for channel, gain in zip(channels, colour, strict=True):
             channel.weigh_anew(gain * grey)
         colour = np.array([channel.gain_of(grey) for channel in channels])
@@ -195,10 +204,9 @@ def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
     return np.asarray(nnls(factor.T, solve_triangular(factor, moment, lower=True))[0])
 
 
-def _roughness(directions: np.ndarray) -> np.ndarray:
-    """R [L, L] with w' R w = the squared difference of each light from the mean around it, summed."""
+def _from_near(directions: np.ndarray) -> np.ndarray:
+    """The matrix [L, L] that takes lights' weights to how far each is from the mean of those around it."""
     spacing = math.sqrt(4 * math.pi / len(directions))
     near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
     np.fill_diagonal(near, 0)
-    own = np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)
-    return own.T @ own
+    return np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)

@@ -106,6 +106,18 @@ def test_what_the_face_leaves_open_is_smooth_and_of_one_colour() -> None:
     assert (colour - torch.tensor([0.5, 1 / 3, 1 / 6])).abs().mean() < 0.03
 
 
+def test_a_lone_lamp_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    lamp = int((rig_directions(150) @ torch.tensor([0.6, 0.0, 0.8])).argmax())
+    weights = torch.full((150, 3), 0.004)
+    weights[lamp] += 0.8
+    evidence = lit(shaded_ball(150), weights)
+    around = rig_directions(150) @ rig_directions(150)[lamp] > 0.93  # the lamp and its six neighbours
+    found = evidence.least_squares()[around].sum() / weights[around].sum()
+    monkeypatch.setattr("facerf_cli.light.estimate._STANDS_OUT", 1e9)
+    smeared = evidence.least_squares()[around].sum() / weights[around].sum()
+    assert 0.75 < found < 1.05 and smeared < 0.8 * found
+
+
 def test_a_black_picture_has_no_light() -> None:
     olats, picture = flat(shaded_ball())
     assert estimate_light(olats, picture).abs().max() == 0
