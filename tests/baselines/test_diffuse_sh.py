@@ -4,7 +4,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.baselines.diffuse_sh import CHECKPOINT, Diffuse, load_diffuse_network, refitted
+from facerf_cli.baselines.diffuse_sh import (
+    CHECKPOINT,
+    Diffuse,
+    explain_texture,
+    load_diffuse_network,
+    refitted,
+)
 from facerf_cli.errors import InputError
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.diffuse import shading
@@ -72,3 +78,13 @@ def test_the_light_is_solved_for_in_spite_of_what_is_clipped_or_covered() -> Non
     assert error.median() < 0.02
     kept = refitted(Diffuse(albedo, normals), FaceTexture(lit, visible, normals), true)
     assert torch.allclose(kept, true, atol=1e-3)
+
+
+def test_what_is_shipped_explains_an_evenly_lit_face_by_an_even_light() -> None:
+    network = load_diffuse_network(CHECKPOINT)
+    skin = torch.tensor([0.45, 0.3, 0.22]).view(3, 1, 1).expand(3, 64, 64)
+    normals = F.interpolate(network.mean_normals[None], (64, 64), mode="area")[0]
+    found = explain_texture(network, FaceTexture(skin, torch.ones(64, 64), F.normalize(normals, dim=0)))
+    own = found.reflectance.relit(found.light.directions, found.light.weights[None])[0]
+    assert ((own - skin).abs() / skin).mean() < 0.15
+    assert 0.15 < found.reflectance.albedo.mean() < 0.5
