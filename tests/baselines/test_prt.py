@@ -1,9 +1,11 @@
 """Transfer that is baked: shadows, poses, and the cache."""
 
+import io
 import math
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -101,7 +103,9 @@ def test_a_damaged_file_is_baked_anew(
     baked.baked_transfer(vertices, SMALL, tmp_path)
     (path,) = tmp_path.glob("*.npy")
     whole = path.read_bytes()
-    for broken in (b"", whole[:100], b"\x80\x04pickle", whole[:-7]):
+    other = io.BytesIO()
+    np.save(other, np.zeros((2, 25, 16, 16), np.float16))
+    for broken in (b"", whole[:100], b"\x80\x04pickle", whole[:-7], other.getvalue()):
         path.write_bytes(broken)
         baked.baked_transfer(vertices, SMALL, tmp_path)
         assert len(path.read_bytes()) == len(whole)
