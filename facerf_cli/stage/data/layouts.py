@@ -13,12 +13,16 @@
 Directions are unit vectors of the world toward the light. K is in pixels whose centres lie at index + 0.5.
 world_to_camera has OpenCV's axes (y down, z forward); it becomes DESIGN's (y up, z toward the camera) here
 and nowhere else. Intensities are linear Rec.709 in DESIGN's unit of light; the black level is linear too.
-Without `subjects` whoever has pictures is one.
+Without `subjects` whoever has pictures is one. "ambient": "{subject}/{camera}/ambient.exr", which may be
+missing, names pictures without any lamp; --subtract-ambient takes them away in the black level's place.
+
+Layout 'extended-yale-b': `yale_layout.py`.
 """
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +59,11 @@ class Capture:
     cameras: dict[str, PosedCamera]
     subjects: dict[str, dict[str, Any]]  # traits by subject, sorted
     provenance: dict[str, Any]
+    ambient_pattern: str = (
+        ""  # of pictures without any lamp, with {subject} and {camera}; empty: there are none
+    )
+    subtract_ambient: bool = False
+    marked: Mapping[str, frozenset[str]] = field(default_factory=dict)  # ids of lights that it gives up
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
         """The picture of a subject seen by a camera under one light."""
@@ -67,24 +76,44 @@ class Capture:
         the black level stays negative here, so that sums are not biased.
         """
         path = self.frame_path(subject, camera, self.light_ids[light])
-        picture = read_image(path, self.colour_space, non_finite="zero")
-        pixels = picture.pixels if picture.alpha is None else picture.pixels * picture.alpha[..., None]
+        pixels = _read_picture(path, self.colour_space)
         posed = self.cameras[camera]
         if pixels.shape[:2] != (posed.height_px, posed.width_px):
             raise InputError(
                 f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels; camera {camera} has "
                 f"{posed.width_px} x {posed.height_px}"
             )
-        return (pixels - np.float32(self.black_level)) / self.intensities[light].astype(np.float32)
+        ambient = self.ambient(subject, camera) if self.subtract_ambient else None
+        dark = np.float32(self.black_level) if ambient is None else ambient
+        return (pixels - dark) / self.intensities[light].astype(np.float32)
+
+    def ambient(self, subject: str, camera: str) -> np.ndarray | None:
+        """A subject without any lamp [H, W, 3], black level included; None where none has the right size."""
+        path = self.folder / _filled(self.ambient_pattern, subject=subject, camera=camera)
+        pixels = _read_ambient(path, self.colour_space) if self.ambient_pattern and path.is_file() else None
+        posed = self.cameras[camera]
+        return pixels if pixels is not None and pixels.shape == (posed.height_px, posed.width_px, 3) else None
 
 
-def read_capture(folder: Path, layout: str = "stage") -> Capture:
+def read_capture(folder: Path, layout: str = "stage", subtract_ambient: bool = False) -> Capture:
     """Read a capture's description in one of `LAYOUTS`; no pictures yet."""
     if layout not in LAYOUTS:
         raise UsageError(f"--layout {layout}: not known; there is {', '.join(sorted(LAYOUTS))}")
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    return LAYOUTS[layout](folder)
+    capture = LAYOUTS[layout](folder)
+    if subtract_ambient and not capture.ambient_pattern:
+        raise UsageError(f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' pictures")
+    return replace(capture, subtract_ambient=subtract_ambient)
+
+
+def _read_picture(path: Path, colour_space: str) -> np.ndarray:
+    """A picture [H, W, 3], its colour multiplied by its alpha."""
+    picture = read_image(path, colour_space, non_finite="zero")
+    return picture.pixels if picture.alpha is None else picture.pixels * picture.alpha[..., None]
+
+
+_read_ambient = lru_cache(maxsize=2)(_read_picture)  # one a camera, and every frame needs it
 
 
 def _read_stage(folder: Path) -> Capture:
@@ -113,10 +142,17 @@ def _read_stage(folder: Path) -> Capture:
             else {name: node.table() for name, node in sorted(subjects.entries(MOST_SUBJECTS).items())}
         ),
         provenance={} if (node := root.get("provenance")) is None else node.table(),
+        ambient_pattern="" if (node := root.get("ambient")) is None else _pattern(node, _FIELDS[:2]),
     )
 
 
-LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": _read_stage}
+def _read_yale(folder: Path) -> Capture:
+    from facerf_cli.stage.data.yale_layout import read_yale_capture  # it makes captures, too
+
+    return read_yale_capture(folder)
+
+
+LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": _read_stage, "extended-yale-b": _read_yale}
 
 
 def _colour_space(node: Node) -> str:
@@ -168,25 +204,26 @@ def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
     return u @ vh, matrix[:3, 3]
 
 
-def _pattern(node: Node) -> str:
+def _pattern(node: Node, fields: tuple[str, ...] = _FIELDS) -> str:
     """A relative path that names each field, and leads nowhere else."""
     pattern = node.text()
     parts = pattern.split("/")
-    plain = re.sub(r"\{(subject|camera|light)\}", "", pattern)
+    plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
     if (
-        any(f"{{{field}}}" not in pattern for field in _FIELDS)
+        any(f"{{{field}}}" not in pattern for field in fields)
         or not plain.isprintable()
         or re.search(r"[{}\\:*?]", plain)
         or any(part in ("", ".", "..") for part in parts)
         or len(pattern) > 500
     ):
-        raise node.wrong("a path below the capture with {subject}, {camera} and {light} in it")
+        *first, last = (f"{{{field}}}" for field in fields)
+        raise node.wrong(f"a path below the capture with {', '.join(first)} and {last} in it")
     return pattern
 
 
 def _filled(pattern: str, **names: str) -> str:
-    for field, name in names.items():
-        pattern = pattern.replace(f"{{{field}}}", name)
+    for word, name in names.items():
+        pattern = pattern.replace(f"{{{word}}}", name)
     return pattern
 
 
@@ -195,9 +232,9 @@ def _found_subjects(folder: Path, pattern: str, cameras: list[str], lights: list
     parts = pattern.split("/")
     depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
     expression = re.escape("/".join(parts[: depth + 1]))
-    for field in _FIELDS:
-        first, *rest = expression.split(re.escape(f"{{{field}}}"))
-        named = [f"(?P<{field}>[^/]+)", *[f"(?P={field})"] * (len(rest) - 1)] if rest else []
+    for word in _FIELDS:
+        first, *rest = expression.split(re.escape(f"{{{word}}}"))
+        named = [f"(?P<{word}>[^/]+)", *[f"(?P={word})"] * (len(rest) - 1)] if rest else []
         expression = first + "".join(name + part for name, part in zip(named, rest, strict=True))
     above = _filled("/".join([*parts[:depth], "*"]), camera="*", light="*")
     relatives = (path.relative_to(folder).as_posix() for path in folder.glob(above) if path.name[0] != ".")

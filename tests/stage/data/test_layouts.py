@@ -185,7 +185,7 @@ def test_no_capture_and_no_such_layout(tmp_path: Path) -> None:
         read_capture(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="there is stage"):
+    with pytest.raises(UsageError, match="there is extended-yale-b, stage"):
         read_capture(tmp_path, "multipie")
 
 
