@@ -6,7 +6,7 @@
 Lights are maps, each as it is and turned by 120 degrees, and lamps drawn from a seed: a coloured key light
 and a dim one in front. `texture` relights the face in the chart and estimates from that texture. `picture`
 does what a user would: `facerf relight`, its 8-bit PNG into `facerf estimate-light`, which finds and fits the
-face anew.
+face anew; where the detector takes something else for the face the case is said and left out.
 
 - angle: between the brightest directions (`light/brightest.py`), in degrees.
 - weights: |estimate - truth| / |truth| over the 150 lights' rgb weights. How bright a light is cannot be told
@@ -33,6 +33,7 @@ from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.photo import PhotoOptions, fit_faces, load_models_once, read_photo
 from facerf_cli.commands.photo_light import LIGHT_FEATURES
+from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import read_image
 from facerf_cli.files.light_files import read_light
 from facerf_cli.light.brightest import brightest_direction
@@ -57,6 +58,7 @@ TURNS_DEG = (0, 120)  # evenly spaced from 0, as --rotate FROM:TO:N has them
 LAMPS, FILL = 6, 0.15
 MEASURES = ("angle", "weights", "weights scaled", "SH", "SH scaled")
 RIG = rig_directions()
+_MOVED_PX = 30.0  # further from where it was, it is another face
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,10 +178,19 @@ def through_picture(
         for exr in relit.glob("*.exr"):
             exr.unlink()
         _run("estimate-light", str(relit), "-o", str(out), "--width", "64", *how)
+        where = _face_centre_px(photo)
         for light in lights:
             name = f"{photo.stem}_{light.name}"
+            if np.linalg.norm(_face_centre_px(relit / f"{name}.png") - where) > _MOVED_PX:
+                print(f"picture {photo.stem} {light.name}: the detector took something else for the face")
+                continue
             found = read_light(out / f"{name}_light.json").weights
             yield light, found / 2 ** exposures_ev[name]
+
+
+def _face_centre_px(photo: Path) -> np.ndarray:
+    """Of the face that the verbs take, [2]."""
+    return find_faces(read_image(photo).pixels, str(photo))[0].landmarks_px.mean(0)
 
 
 def _run(*line: str) -> None:

@@ -1,5 +1,6 @@
 """The light of a photo as verbs ask for it: by least squares over the field, or a baseline's own."""
 
+import logging
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.photo import FittedFace, PhotoOptions, fit_faces, load_models_once, read_photo
 from facerf_cli.commands.values import parse_directions
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,8 +23,10 @@ if TYPE_CHECKING:
     from facerf_cli.light.rig_light import RigLight
     from facerf_cli.network.features import Layered
 
+log = logging.getLogger(LOGGER_NAME)
 Refine = Literal["none", "features"]
 LIGHT_FEATURES = Path(facerf_cli.__file__).parent / "assets" / "light_features.safetensors"
+_UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
 MOST_LIGHTS = 1024  # that are solved for; beyond it non-negative least squares take minutes
 
 
@@ -89,10 +93,18 @@ def estimate_light_of(
         raise InputError(f"{path}: {error}") from None
     azel = [round(float(angle), 1) for angle in direction_to_azel(brightest_direction(estimate.light))]
     clipped, mask = estimate.evidence.clipped, estimate.evidence.mask
+    residual = estimate.evidence.residual(estimate.explained)
+    if residual > _UNEXPLAINED:
+        log.warning(
+            "%s: no light explains this face well (%.0f %% is left over); look at _light.png: perhaps the "
+            "fit is off or something else was taken for a face",
+            path,
+            100 * residual,
+        )
     facts = {
         "reflectance": options.reflectance,
         "brightest_azel_deg": azel,
-        "residual": round(estimate.evidence.residual(estimate.explained), 4),
+        "residual": round(residual, 4),
         "clipped": round(float(clipped.any(0).sum() / mask.sum()), 4),
         "texels": int(mask.sum()),
     }
