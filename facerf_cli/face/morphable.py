@@ -101,7 +101,7 @@ def _read(path: Path) -> MorphableModel:
     try:
         if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
             raise ValueError("it is no .npz")
-        _require_bounded(path)
+        require_bounded(path)
         with np.load(path, allow_pickle=False) as file:
             return _from_arrays(path, {key: file[key] for key in file.files})
     except _DAMAGED as error:
@@ -111,8 +111,8 @@ def _read(path: Path) -> MorphableModel:
         ) from None
 
 
-def _require_bounded(path: Path) -> None:
-    """Look at what the arrays claim before room is made for them."""
+def require_bounded(path: Path) -> None:
+    """Look at what an .npz's arrays claim before room is made for them; a ValueError where it is too much."""
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             with archive.open(entry) as file:

@@ -6,16 +6,21 @@ import trimesh
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.head_model import HEAD_PARTS, HeadModel
-from facerf_cli.face.importers.registration import nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.registration import nearest_on_mesh
 from facerf_cli.face.importers.source import SourceHead, SourceModel
-from facerf_cli.face.topology import LANDMARKS_M, chart_uv, grid_triangles, grid_uv
+from facerf_cli.face.topology import chart_uv, grid_triangles, grid_uv
 
 _LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and the angle at which eye textures show it
 
 
-def carried_head(source: SourceModel, head: SourceHead, canonical: np.ndarray) -> HeadModel:
-    """The source's own head in the head frame, its skin in the chart of the canonical mean [V, 3]."""
-    rotation, translation = rigid_alignment(source.landmarks, LANDMARKS_M)
+def carried_head(
+    source: SourceModel,
+    head: SourceHead,
+    canonical: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> HeadModel:
+    """The source's own head, turned to the head frame; its skin in the chart of the canonical mean [V, 3]."""
     mean = source.mean @ rotation.T + translation
     uv = chart_uv(mean)
     skin = np.flatnonzero(head.part == HEAD_PARTS.index("skin"))

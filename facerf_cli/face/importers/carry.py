@@ -2,31 +2,64 @@
 
 import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.importers.carried_head import carried_head
+from facerf_cli.face.importers.find_landmarks import find_landmarks
 from facerf_cli.face.importers.registration import register, rigid_alignment
 from facerf_cli.face.importers.source import SourceModel
-from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS
+
+_HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # beyond these, a length is in another unit
 
 
 def carry_over(source: SourceModel) -> MorphableModel:
-    """Carry a model to the canonical topology: its landmarks warp the chart, rays find its surface."""
-    rotation, translation = rigid_alignment(source.landmarks, LANDMARKS_M)
+    """Carry a model to the canonical topology: its landmarks warp the chart, rays find its surface.
+
+    A model without expressions is given the built-in model's, whose vertices are the same.
+    """
+    side_m = np.ptp(source.mean[np.unique(source.triangles)], 0).max()
+    _require_size("its mean's largest side is", side_m, _HEAD_M)
+    landmarks = landmarks_of(source)
+    eyes_m = np.linalg.norm(landmarks[OUTER_EYE_CORNERS[0]] - landmarks[OUTER_EYE_CORNERS[1]])
+    _require_size("its eyes' outer corners lie apart", eyes_m, _EYES_M)
+    rotation, translation = rigid_alignment(landmarks, LANDMARKS_M)
     mean = source.mean @ rotation.T + translation
-    corners, weights = register(mean, source.triangles, source.landmarks @ rotation.T + translation)
+    corners, weights = register(mean, source.triangles, landmarks @ rotation.T + translation)
+    rows = np.arange(0, corners.size + 1, 3)
+    onto_grid = csr_matrix((weights.ravel(), corners.ravel(), rows), (len(corners), len(mean)))
 
     def carried(field: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(
-            np.einsum("...vkc,vk->...vc", field[..., corners, :], weights).astype(np.float32)
-        )
+        return torch.from_numpy((onto_grid @ field).astype(np.float32))
 
+    def carried_basis(basis: np.ndarray) -> torch.Tensor:
+        return torch.stack([carried(shape @ rotation.T) for shape in basis])
+
+    builtin = load_face_model()
+    has_expressions = len(source.expression) > 0
+    on_grid = carried(mean)
     return MorphableModel(
         name=source.name,
-        licence=source.licence,
-        mean=carried(mean),
-        identity=carried(source.identity @ rotation.T),
-        expression=carried(source.expression @ rotation.T),
-        expression_names=source.expression_names,
-        head=None if source.head is None else carried_head(source, source.head, carried(mean).numpy()),
+        licence=source.licence + ("" if has_expressions else f"; expressions: {builtin.licence}"),
+        mean=on_grid,
+        identity=carried_basis(source.identity),
+        expression=carried_basis(source.expression) if has_expressions else builtin.expression,
+        expression_names=source.expression_names if has_expressions else builtin.expression_names,
+        head=None
+        if source.head is None
+        else carried_head(source, source.head, on_grid.numpy(), rotation, translation),
     )
+
+
+def landmarks_of(source: SourceModel) -> np.ndarray:
+    """The 68 points [68, 3] on the source's mean: those that are known, the rest by the shape of the face."""
+    if len(source.known) == 68:
+        return np.stack([source.known[number] for number in range(68)])
+    return find_landmarks(source.mean, source.triangles, source.known)
+
+
+def _require_size(what: str, length_m: float, between_m: tuple[float, float]) -> None:
+    if not between_m[0] < length_m < between_m[1]:
+        raise InputError(f"{what} {1000 * length_m:.4g} mm; is it in the unit of its publication?")

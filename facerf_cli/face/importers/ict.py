@@ -75,7 +75,7 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
         expression=offsets(expressions) * EXPRESSION_STD,
         expression_names=tuple(expressions),
         triangles=triangles[outer[triangles].all(1)],
-        landmarks=mean[LANDMARK_IDS],
+        known=dict(enumerate(mean[LANDMARK_IDS])),
         head=_head(triangles),
     )
 

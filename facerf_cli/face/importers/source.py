@@ -1,10 +1,11 @@
 """What an importer makes of a publisher's files, before it is carried to the canonical topology."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 EXPRESSION_STD = 0.3  # of a full blendshape: the spread that a coefficient of 1 stands for
+_MAX_VERTICES, _MAX_TRIANGLES = 120_000, 240_000
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,8 @@ class SourceHead:
 class SourceModel:
     """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
 
-    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface,
-    landmarks [68, 3]: where the 68 points lie on the mean.
+    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface; known:
+    where those of the 68 landmarks that the publisher names lie on the mean, by number.
     """
 
     name: str
@@ -35,5 +36,17 @@ class SourceModel:
     expression: np.ndarray
     expression_names: tuple[str, ...]
     triangles: np.ndarray
-    landmarks: np.ndarray
+    known: dict[int, np.ndarray] = field(default_factory=dict)
     head: SourceHead | None = None
+
+
+def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:
+    """A ValueError unless these are a mesh: mean [N, 3], finite, and triangles [F, 3] of its vertices."""
+    if mean.ndim != 2 or mean.shape[1] != 3 or not 100 <= len(mean) <= _MAX_VERTICES:
+        raise ValueError(f"its mean has shape {list(mean.shape)}, not [N, 3]")
+    if not np.isfinite(mean).all():
+        raise ValueError("its mean holds values that are not finite")
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or not 1 <= len(triangles) <= _MAX_TRIANGLES:
+        raise ValueError(f"its triangles have shape {list(triangles.shape)}, not [F, 3]")
+    if triangles.min() < 0 or triangles.max() >= len(mean):
+        raise ValueError("its triangles name vertices that it does not have")

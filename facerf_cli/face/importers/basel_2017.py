@@ -1,0 +1,155 @@
+"""Basel Face Model 2017 and 2019 (Gerig et al., 'Morphable Face Models - An Open Framework').
+
+HDF5 in statismo's layout: under `shape` and `expression`, `model/mean` [3 N] in millimetres,
+`model/pcaBasis` [3 N, K] of unit length and `model/pcaVariance` [K]; `shape/representer/cells` [3, F]; the
+expressions' mean is a displacement, and belongs to the neutral face (as eos reads them, Apache-2.0).
+`metadata/landmarks/json` names points on the mean, which scalismo writes as a list of `id` and `coordinates`.
+"""
+
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.face.importers.source import SourceModel, require_mesh
+from facerf_cli.records import one_line
+
+_MAX_ENTRIES, _MAX_SHAPES, _MAX_TEXT = 120_000_000, 500, 1 << 20
+_LICENCE = "Basel Face Model {year}, (c) University of Basel; non-commercial use, by its licence agreement"
+_YEARS = {"basel-2017": "2017", "basel-2019": "2019"}
+_ON_MEAN_M = 0.003  # a named point further from the surface is inside the head, as a pupil's may be
+# The names that mean a point of the 68; 'right' is the person's right, which is the picture's left.
+_LANDMARKS = {
+    "center.chin.tip": 8,
+    "center.nose.tip": 30,
+    "right.nose.wing.tip": 31,
+    "center.nose.attachement_to_philtrum": 33,
+    "left.nose.wing.tip": 35,
+    "right.eye.corner_outer": 36,
+    "right.eye.corner_inner": 39,
+    "left.eye.corner_inner": 42,
+    "left.eye.corner_outer": 45,
+    "right.lips.corner": 48,
+    "right.lips.philtrum_ridge": 50,
+    "center.lips.upper.outer": 51,
+    "left.lips.philtrum_ridge": 52,
+    "left.lips.corner": 54,
+    "center.lips.lower.outer": 57,
+    "center.lips.upper.inner": 62,
+    "center.lips.lower.inner": 66,
+}
+
+
+def read_basel_2017(path: Path, kind: str = "basel-2017") -> SourceModel:
+    """The model of a `model2017-1_*.h5` or `model2019_*.h5`; an InputError for what is none.
+
+    h5py comes with the extra `face-models`; a FacerfError says so where it is missing.
+    """
+    h5py = _h5py()
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the Basel Face Model's .h5")
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return _source(file, kind)
+    except (ValueError, KeyError, TypeError, IndexError, OSError, RuntimeError, RecursionError) as error:
+        raise InputError(
+            f"{path}: not a Basel Face Model {_YEARS[kind]} ({one_line(str(error))[:160]}); "
+            "give its .h5 as it was downloaded"
+        ) from None
+
+
+def _h5py() -> Any:
+    """The package, which the type checker need not know."""
+    try:
+        return importlib.import_module("h5py")
+    except ImportError:
+        raise FacerfError(
+            "Basel Face Models of 2017 and 2019 need h5py; run pip install 'facerf[face-models]'"
+        ) from None
+
+
+def _source(file: Any, kind: str) -> SourceModel:
+    mean, identity = _linear_model(file, "shape")
+    shift, expression = _linear_model(file, "expression")
+    triangles = _numbers(file, "shape/representer/cells").astype(np.int64).T
+    if shift.shape != mean.shape:
+        raise ValueError(f"its expressions have {len(shift)} vertices, its shapes {len(mean)}")
+    mean = mean + shift
+    require_mesh(mean, triangles)
+    return SourceModel(
+        name=kind,
+        licence=_LICENCE.format(year=_YEARS[kind]),
+        mean=mean,
+        identity=identity,
+        expression=expression,
+        expression_names=tuple(f"expression_{index:03d}" for index in range(len(expression))),
+        triangles=triangles,
+        known=_known(file, mean, shift),
+    )
+
+
+def _linear_model(file: Any, group: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mean [N, 3] in metres, and basis [K, N, 3] in metres a deviation."""
+    mean, basis, variance = (
+        _numbers(file, f"{group}/model/{name}") for name in ("mean", "pcaBasis", "pcaVariance")
+    )
+    mean, variance = mean.ravel(), variance.ravel()
+    if basis.shape != (len(mean), len(variance)) or len(mean) % 3 or not 1 <= len(variance) <= _MAX_SHAPES:
+        raise ValueError(f"{group}/model/pcaBasis has shape {list(basis.shape)}")
+    if not np.allclose(np.linalg.norm(basis[:, 0].astype(np.float64)), 1, atol=0.01):
+        raise ValueError(f"{group}/model/pcaBasis is not of unit length")
+    if (variance < 0).any():
+        raise ValueError(f"{group}/model/pcaVariance is negative")
+    scaled = basis * (np.sqrt(variance) / 1000)
+    return mean.reshape(-1, 3) / 1000, scaled.T.reshape(len(variance), -1, 3)
+
+
+def _numbers(file: Any, name: str) -> np.ndarray:
+    """A dataset of the file itself: no links to other files, and no more than there is room for."""
+    dataset = _dataset(file, name)
+    if dataset.dtype.kind not in "fiu" or dataset.size > _MAX_ENTRIES or dataset.ndim > 2:
+        raise ValueError(f"{name} is {dataset.dtype} of shape {list(dataset.shape)}")
+    values = dataset[()]
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} holds values that are not finite")
+    return values.astype(np.float64) if values.ndim < 2 else values
+
+
+def _dataset(file: Any, name: str) -> Any:
+    h5py = _h5py()
+    at = file
+    for part in name.split("/"):
+        link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
+        if link is None:
+            raise ValueError(f"it lacks {name}")
+        if not isinstance(link, h5py.HardLink):
+            raise ValueError(f"{name} leads elsewhere")
+        at = at[part]
+    if not isinstance(at, h5py.Dataset) or at.external or at.is_virtual:
+        raise ValueError(f"{name} is no dataset of this file")
+    return at
+
+
+def _known(file: Any, mean: np.ndarray, shift: np.ndarray) -> dict[int, np.ndarray]:
+    """The named points on the mean [N, 3], by their number among the 68; none where the file has no names."""
+    try:
+        dataset = _dataset(file, "metadata/landmarks/json")
+    except ValueError:
+        return {}
+    if dataset.size != 1 and dataset.nbytes > _MAX_TEXT:
+        raise ValueError("metadata/landmarks/json is too long")
+    text = np.asarray(dataset[()]).tobytes() if dataset.dtype.kind in "Su" else dataset[()]
+    known = {}
+    for entry in json.loads(text.decode("utf-8") if isinstance(text, bytes) else text):
+        number = _LANDMARKS.get(str(entry["id"]))
+        point = np.array(entry["coordinates"], dtype=np.float64) / 1000
+        if number is None or point.shape != (3,) or not np.isfinite(point).all():
+            continue
+        neutral = mean - shift  # they are marked on the shapes' own mean
+        nearest = np.linalg.norm(neutral - point, axis=-1).argmin()
+        if np.linalg.norm(neutral[nearest] - point) < _ON_MEAN_M:
+            known[number] = mean[nearest]
+    return known

@@ -1,0 +1,119 @@
+"""FLAME (Li et al., 'Learning a model of facial shape and expression from 4D scans', SIGGRAPH Asia 2017).
+
+Its files, 2019 to 2023, hold `v_template` [5023, 3] in metres, `f` [9976, 3], and `shapedirs` [5023, 3, 400]:
+300 shapes of identity and 100 of expression, each scaled by its standard deviation (as smplx, DECA and others
+read them). A mouth opens by turning the jaw, which is no shape there: `posedirs`, `weights` and `J_regressor`
+make three shapes of it here.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.importers.flame_landmarks import read_embedding
+from facerf_cli.face.importers.npz import read_npz
+from facerf_cli.face.importers.source import SourceModel, require_mesh
+from facerf_cli.files.inert_arrays import array_of
+from facerf_cli.files.inert_pickle import read_inert_pickle
+from facerf_cli.records import one_line
+
+IDENTITIES = 300  # the shapes after them are expressions
+_MAX_SHAPES = 500
+_LICENCE = (
+    "FLAME, (c) Max-Planck-Gesellschaft; under the licence that its download came with "
+    "(flame.is.tue.mpg.de; non-commercial research, unless that says otherwise)"
+)
+_JAW, _JOINTS = 2, 5  # of the joints: root, neck, jaw and two eyes
+_JAW_STD_RAD = 0.1  # a coefficient of 3 opens a mouth by 17 degrees
+_JAW_SHAPES = {
+    "jaw_open": (1, 0, 0),
+    "jaw_turn": (0, 0.3, 0),
+    "jaw_roll": (0, 0, 0.3),
+}  # axes, by their spread
+
+
+def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
+    """FLAME from its .pkl or an .npz of the same arrays, or from a folder with one.
+
+    Args:
+        path: `generic_model.pkl`, `flame2023.pkl` and their like; of a folder, the one such file in it.
+        landmarks: where the 68 points lie (`flame_landmarks`); a `landmark_embedding.npy` beside the model
+            is found by itself. Without, they are found by their shape.
+    """
+    path = _model_file(path)
+    found = landmarks or path.with_name("landmark_embedding.npy")
+    try:
+        raw = read_npz(path) if path.suffix == ".npz" else read_inert_pickle(path)
+        if not isinstance(raw, dict):
+            raise ValueError(f"it holds a {type(raw).__name__}, not a table of arrays")
+        source = _source({key: value for key, value in raw.items() if isinstance(key, str)})
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))[:160]
+        raise InputError(f"{path}: not a FLAME model ({reason}); download it again") from None
+    if landmarks or found.is_file():
+        source.known.update(read_embedding(found, source.mean, source.triangles))
+    return source
+
+
+def _model_file(path: Path) -> Path:
+    if not path.is_dir():
+        if path.suffix not in (".pkl", ".npz") or not path.is_file():
+            raise InputError(f"{path}: give FLAME's .pkl, an .npz of the same arrays, or the folder of one")
+        return path
+    models = [file for file in sorted(path.iterdir()) if file.suffix in (".pkl", ".npz")]
+    models = [file for file in models if not any(word in file.name.lower() for word in ("embedding", "mask"))]
+    if len(models) != 1:
+        names = ", ".join(file.name for file in models[:6]) or "none"
+        raise InputError(f"{path}: give one of FLAME's .pkl files by name (here: {names})")
+    return models[0]
+
+
+def _source(raw: Mapping[str, Any]) -> SourceModel:
+    mean = array_of(raw["v_template"]).astype(np.float64)
+    triangles = array_of(raw["f"]).astype(np.int64)
+    shapes = array_of(raw["shapedirs"])
+    require_mesh(mean, triangles)
+    if shapes.ndim != 3 or shapes.shape[:2] != mean.shape or not 1 <= shapes.shape[2] <= _MAX_SHAPES:
+        raise ValueError(f"shapedirs has shape {list(shapes.shape)}, not [{len(mean)}, 3, 400]")
+    if not np.isfinite(shapes).all():
+        raise ValueError("shapedirs holds values that are not finite")
+    bases = np.moveaxis(shapes, -1, 0).astype(np.float32)
+    jaw = _jaw_shapes(mean, raw)
+    names = tuple(f"expression_{index:03d}" for index in range(len(bases[IDENTITIES:])))
+    return SourceModel(
+        name="flame",
+        licence=_LICENCE,
+        mean=mean,
+        identity=bases[:IDENTITIES],
+        expression=np.concatenate([bases[IDENTITIES:], *jaw.values()]),
+        expression_names=names + tuple(jaw),
+        triangles=triangles,
+    )
+
+
+def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """The jaw's turns by one deviation about each axis [1, N, 3] (linear blend skinning, FLAME's equation 2).
+
+    None where the file has no skeleton; a ValueError where it is not FLAME's.
+    """
+    keys = ("posedirs", "weights", "J_regressor")
+    if not all(key in raw for key in keys):
+        return {}
+    corrections, weights, regressor = (array_of(raw[key]).astype(np.float64) for key in keys)
+    wanted = ((*mean.shape, 9 * (_JOINTS - 1)), (len(mean), _JOINTS), (_JOINTS, len(mean)))
+    for key, array, shape in zip(keys, (corrections, weights, regressor), wanted, strict=True):
+        if array.shape != shape or not np.isfinite(array).all():
+            raise ValueError(f"{key} has shape {list(array.shape)}, not {list(shape)}, or is not finite")
+    joint, weight = regressor[_JAW] @ mean, weights[:, _JAW, None]
+    own = slice(9 * (_JAW - 1), 9 * _JAW)  # corrections are by the entries of every turn but the root's
+    shapes = {}
+    for name, axis in _JAW_SHAPES.items():
+        turn = Rotation.from_rotvec(_JAW_STD_RAD * np.array(axis, float)).as_matrix()
+        corrected = mean + corrections[..., own] @ (turn - np.eye(3)).ravel()
+        skinned = corrected + weight * ((corrected - joint) @ (turn - np.eye(3)).T)
+        shapes[name] = (skinned - mean)[None].astype(np.float32)
+    return shapes
