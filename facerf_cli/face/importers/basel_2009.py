@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.io
+from scipy.io.matlab import MatReadError
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import SourceModel, require_mesh
@@ -20,7 +21,17 @@ _MAX_BYTES, _MAX_ENTRIES, _MAX_SHAPES = 1 << 30, 120_000_000, 500
 _LICENCE = "Basel Face Model 2009, (c) University of Basel; non-commercial use, by its licence agreement"
 _NAMES = ("shapeMU", "shapePC", "shapeEV", "tl")
 _NUMBERS = ("single", "double", "int32", "uint32", "int64", "uint64")
-_DAMAGED = (ValueError, TypeError, KeyError, IndexError, OSError, EOFError, zlib.error, NotImplementedError)
+_DAMAGED = (
+    NotImplementedError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    OSError,
+    EOFError,
+    zlib.error,
+    MatReadError,
+)
 
 _VERTICES = 53490
 # MPEG-4 feature points that are among the 68, counted from 0: eos's ibug_to_bfm.txt (Apache-2.0).

@@ -20,10 +20,10 @@ def carry_over(source: SourceModel) -> MorphableModel:
 
     A model without expressions is given the built-in model's, whose vertices are the same.
     """
-    side_m = np.ptp(source.mean[np.unique(source.triangles)], 0).max()
+    side_m = float(np.ptp(source.mean[np.unique(source.triangles)], 0).max())
     _require_size("its mean's largest side is", side_m, _HEAD_M)
     landmarks = landmarks_of(source)
-    eyes_m = np.linalg.norm(landmarks[OUTER_EYE_CORNERS[0]] - landmarks[OUTER_EYE_CORNERS[1]])
+    eyes_m = float(np.linalg.norm(landmarks[OUTER_EYE_CORNERS[0]] - landmarks[OUTER_EYE_CORNERS[1]]))
     _require_size("its eyes' outer corners lie apart", eyes_m, _EYES_M)
     rotation, translation = rigid_alignment(landmarks, LANDMARKS_M)
     mean = source.mean @ rotation.T + translation

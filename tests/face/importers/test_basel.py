@@ -1,0 +1,261 @@
+"""The Basel models' files, with the structure they are published with, made from the built-in face."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.face.importers import basel_2009, basel_2017
+from facerf_cli.face.importers.basel_2009 import read_basel_2009
+from facerf_cli.face.importers.basel_2017 import read_basel_2017
+from facerf_cli.face.importers.carry import carry_over, landmarks_of
+from facerf_cli.face.importers.importing import import_face_model
+from facerf_cli.face.morphable import load_face_model
+from tests.face.importers.heads import Head, head, off_mm
+
+h5py = pytest.importorskip("h5py")
+
+SHAPES, EXPRESSIONS = 199, 100
+NAMES = {number: name for name, number in basel_2017._LANDMARKS.items()}
+
+
+@pytest.fixture(scope="module")
+def face() -> Head:
+    return head(60, 60, turn_deg=4)
+
+
+def orthonormal(shapes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """A basis [3 N, count] of unit length and deviations [count] that say the same as shapes [K, N, 3]."""
+    basis = np.zeros((shapes[0].size, count), np.float32)
+    deviations = np.zeros((count, 1), np.float32)
+    for index, shape in enumerate(shapes):
+        deviations[index] = np.linalg.norm(shape)
+        basis[:, index] = shape.ravel() / deviations[index]
+    basis[0, len(shapes) :] = 1
+    return basis, deviations
+
+
+def mat(face: Head) -> dict[str, Any]:
+    """`01_MorphableModel.mat`: micrometres, deviations, triangles from 1 on and the wrong way round."""
+    basis, deviations = orthonormal(face.shapes * 1e6, SHAPES)
+    column = (face.mean * 1e6).reshape(-1, 1).astype(np.float32)
+    return {
+        "shapeMU": column,
+        "shapePC": basis,
+        "shapeEV": deviations,
+        "texMU": column * 0,
+        "texPC": basis * 0,
+        "texEV": deviations * 0,
+        "tl": (face.triangles[:, [0, 2, 1]] + 1).astype(np.float64),
+        "segbin": np.zeros((len(face.mean), 4), np.uint8),
+        "segMM": np.zeros((3, 3)),
+        "segMB": np.zeros((3, 3)),
+    }
+
+
+def written_mat(path: Path, arrays: dict[str, Any]) -> Path:
+    scipy.io.savemat(path, arrays, do_compression=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def shift(face: Head) -> np.ndarray:
+    """The mean of the expressions: a displacement of the mouth."""
+    around = np.exp(-((np.linalg.norm(face.mean - face.landmarks[62], axis=-1) / 0.02) ** 2))
+    return 0.001 * around[:, None] * [0.0, -1, 0]
+
+
+def h5(path: Path, face: Head, shift: np.ndarray, **changes: Any) -> Path:
+    """`model2017-1_*.h5`: statismo's groups, millimetres, and scalismo's landmarks."""
+    neutral = face.mean - shift
+    basis, deviations = orthonormal(face.shapes * 1000, SHAPES)
+    moved, spread = orthonormal(face.shapes[:1] * 500, EXPRESSIONS)
+    marks = [
+        {"coordinates": (1000 * neutral[_nearest(face, number)]).tolist(), "id": name}
+        for number, name in NAMES.items()
+    ]
+    inside = [{"coordinates": (1000 * face.mean.mean(0)).tolist(), "id": "center.nose.tip"}]
+    tables: dict[str, Any] = {
+        "shape/model/mean": (1000 * neutral).ravel().astype("f4"),
+        "shape/model/pcaBasis": basis,
+        "shape/model/pcaVariance": (deviations**2).ravel(),
+        "shape/model/noiseVariance": np.zeros(1, "f4"),
+        "shape/representer/cells": face.triangles.T.astype("i4"),
+        "shape/representer/points": (1000 * neutral).T.astype("f4"),
+        "expression/model/mean": (1000 * shift).ravel().astype("f4"),
+        "expression/model/pcaBasis": moved,
+        "expression/model/pcaVariance": (spread**2).ravel(),
+        "color/model/mean": np.zeros(face.mean.size, "f4"),
+        "metadata/landmarks/json": json.dumps(
+            [*marks, {"coordinates": [0, 0, 0], "id": "left.ear"}, *inside]
+        ),
+        **changes,
+    }
+    with h5py.File(path, "w") as file:
+        for name, values in tables.items():
+            if isinstance(values, (h5py.SoftLink, h5py.ExternalLink)):
+                file[name] = values
+            elif values is not None:
+                file.create_dataset(name, data=values)
+    return path
+
+
+def _nearest(face: Head, number: int) -> int:
+    return int(np.linalg.norm(face.mean - face.landmarks[number], axis=-1).argmin())
+
+
+def test_basel_2009_is_read_in_metres_and_deviations(face: Head, tmp_path: Path) -> None:
+    (tmp_path / "PublicMM1").mkdir()
+    written_mat(tmp_path / "PublicMM1" / "01_MorphableModel.mat", mat(face))
+    source = read_basel_2009(tmp_path)  # the folder, as it unpacks
+    np.testing.assert_allclose(source.mean, face.mean, atol=1e-7)
+    assert source.identity.shape == (SHAPES, len(face.mean), 3) and len(source.expression) == 0
+    np.testing.assert_allclose(source.identity[: len(face.shapes)], face.shapes, atol=1e-8)
+    assert source.triangles.min() == 0 and source.triangles.max() == len(face.mean) - 1
+    assert source.known == {}  # its vertices are numbered otherwise than the published ones
+
+
+def test_basel_2009_becomes_a_model_with_the_built_in_expressions(face: Head, tmp_path: Path) -> None:
+    arrays = mat(face)
+    arrays = {**arrays, "shapePC": arrays["shapePC"][:, :5], "shapeEV": arrays["shapeEV"][:5]}
+    model = import_face_model("basel-2009", written_mat(tmp_path / "01_MorphableModel.mat", arrays))
+    builtin = load_face_model()
+    assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
+    assert model.expression_names == builtin.expression_names
+    assert "Basel" in model.licence and builtin.licence in model.licence
+
+
+def test_the_published_mesh_of_2009_has_its_landmarks() -> None:
+    mean = np.arange(53490 * 3).reshape(-1, 3)
+    known = basel_2009._known(mean)
+    assert len(known) == 18 and set(known) <= set(range(17, 68))
+    assert known[30][0] == 3 * 8319 and known[54][0] == 3 * 11714
+
+
+@pytest.mark.parametrize("kind", ["basel-2017", "basel-2019"])
+def test_basel_2017_is_read_in_metres_and_deviations(
+    face: Head, shift: np.ndarray, tmp_path: Path, kind: str
+) -> None:
+    source = read_basel_2017(h5(tmp_path / "model.h5", face, shift), kind)
+    assert source.name == kind and kind[-4:] in source.licence
+    np.testing.assert_allclose(source.mean, face.mean, atol=1e-7)
+    np.testing.assert_array_equal(source.triangles, face.triangles)
+    np.testing.assert_allclose(source.identity[: len(face.shapes)], face.shapes, atol=1e-8)
+    np.testing.assert_allclose(source.expression[0], face.shapes[0] / 2, atol=1e-8)
+    assert source.expression.shape[0] == EXPRESSIONS and len(source.expression_names) == EXPRESSIONS
+    assert set(source.known) == set(NAMES)
+    for number, point in source.known.items():
+        np.testing.assert_allclose(point, face.mean[_nearest(face, number)], atol=1e-7)
+
+
+def test_basel_2017_s_names_help_to_find_the_other_landmarks(tmp_path: Path) -> None:
+    face = head(120, 120, turn_deg=4)  # finer, for a name lies on a vertex
+    source = read_basel_2017(h5(tmp_path / "model.h5", face, face.mean * 0))
+    off = 1000 * np.linalg.norm(landmarks_of(source) - face.landmarks, axis=-1)
+    others = [number for number in range(68) if number not in NAMES]
+    assert off[others].mean() < 1.0 and off[others].max() < 2.5
+    model = carry_over(source)
+    assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
+    assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS
+
+
+def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_path: Path) -> None:
+    text = json.dumps([{"coordinates": (1000 * (face.mean - shift)[7]).tolist(), "id": "center.nose.tip"}])
+    for written in (np.bytes_(text.encode()), np.frombuffer(text.encode(), np.uint8)):
+        path = h5(tmp_path / "model.h5", face, shift, **{"metadata/landmarks/json": written})
+        assert set(read_basel_2017(path).known) == {30}
+    path = h5(tmp_path / "model.h5", face, shift, **{"metadata/landmarks/json": None})
+    assert read_basel_2017(path).known == {}
+
+
+def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(FacerfError, match=r"pip install 'facerf\[face-models\]'"):
+        read_basel_2017(tmp_path / "model.h5")
+
+
+WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
+    "no mean": (lambda m: {**m, "shapeMU": "text"}, "shapeMU is a char"),
+    "no basis": (lambda m: {key: value for key, value in m.items() if key != "shapePC"}, "it lacks shapePC"),
+    "a basis of another mesh": (
+        lambda m: {**m, "shapePC": np.zeros((9, 199))},
+        r"shapePC has shape \[9, 199",
+    ),
+    "a cell": (lambda m: {**m, "tl": np.array([[1, "a"]], dtype=object)}, "tl is a cell"),
+    "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "shapeEV is a struct"),
+    "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
+    "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "not finite"),
+    "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "the unit of its"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_MAT)
+def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path, case: str) -> None:
+    change, message = WRONG_MAT[case]
+    path = written_mat(tmp_path / "a.mat", change(mat(face)))
+    with pytest.raises(InputError, match=message) as refused:
+        import_face_model("basel-2009", path)
+    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["shapeMU"] = [1.0]
+    with (tmp_path / "a.mat").open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    (tmp_path / "b.mat").write_bytes(b"no matrix at all" * 20)
+    (tmp_path / "c.mat").write_bytes(b"")
+    for name in "abc":
+        with pytest.raises(InputError, match="not a Basel Face Model 2009") as refused:
+            read_basel_2009(tmp_path / f"{name}.mat")
+        assert "\n" not in str(refused.value)
+    with pytest.raises(InputError, match="no such file"):
+        read_basel_2009(tmp_path)
+
+
+WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
+    "no mean": ({"shape/model/mean": None}, "it lacks shape/model/mean"),
+    "no expressions": (
+        {f"expression/model/{name}": None for name in ("mean", "pcaBasis", "pcaVariance")},
+        "it lacks expression/model",
+    ),
+    "text for numbers": ({"shape/model/mean": "text"}, "shape/model/mean is object"),
+    "a basis of another mesh": ({"shape/model/pcaBasis": np.zeros((9, 199))}, r"pcaBasis has shape \[9"),
+    "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "not of unit length"),
+    "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
+    "triangles beyond": ({"shape/representer/cells": np.full((3, 9), 99999)}, "does not have"),
+    "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "not finite"),
+    "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "leads elsewhere"),
+    "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "leads elsewhere"),
+    "names that are none": ({"metadata/landmarks/json": "[1, 2"}, "not a Basel Face Model 2017"),
+    "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
+    "metres": ({"shape/model/mean": np.zeros(10800)}, "the unit of its"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_H5)
+def test_what_is_not_basel_2017_is_refused_in_one_line(
+    face: Head, shift: np.ndarray, tmp_path: Path, case: str
+) -> None:
+    changes, message = WRONG_H5[case]
+    path = h5(tmp_path / "a.h5", face, shift, **changes)
+    with pytest.raises(InputError, match=message) as refused:
+        import_face_model("basel-2017", path)
+    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_huge_claim_takes_no_room(tmp_path: Path, face: Head, shift: np.ndarray) -> None:
+    path = h5(tmp_path / "a.h5", face, shift, **{"shape/model/pcaBasis": None})
+    with h5py.File(path, "a") as file:
+        file.create_dataset("shape/model/pcaBasis", (10**9, 199), "f4", chunks=(1000, 199))
+    with pytest.raises(InputError, match="pcaBasis is float32 of shape"):
+        read_basel_2017(path)
+    (tmp_path / "b.h5").write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(InputError, match="not a Basel Face Model 2017"):
+        read_basel_2017(tmp_path / "b.h5")
