@@ -23,6 +23,7 @@ from facerf_cli.commands.doctor import doctor
 from facerf_cli.commands.envmap import envmap
 from facerf_cli.commands.estimate_light import estimate_light
 from facerf_cli.commands.fit_geometry import fit_geometry
+from facerf_cli.commands.machines import with_machines
 from facerf_cli.commands.options import DeviceName, Settings
 from facerf_cli.commands.predict_olat import predict_olat
 from facerf_cli.commands.prepare_dataset import prepare_dataset
@@ -98,7 +99,7 @@ def _global_options(
 
 
 for _verb in VERBS:
-    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(_verb)
+    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_machines(_verb))
 for _name, _group in GROUPS.items():
     app.add_typer(_group, name=_name)
 

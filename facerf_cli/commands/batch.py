@@ -12,6 +12,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,13 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.commands.options import Settings
-from facerf_cli.commands.workers import in_processes
+from facerf_cli.commands.options import Settings, Shard
+from facerf_cli.commands.workers import spread
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.records import LOGGER_NAME, STDERR, json_line, one_line, unexpected
 
-REPORT_NAME = "report.jsonl"
+REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -36,7 +37,7 @@ class BatchOptions:
     output: Path
     overwrite: bool = False
     dry_run: bool = False
-    jobs: int = 1
+    jobs: int = 1  # 0, with `--ray`: as many as there are processors
 
 
 @dataclass(frozen=True)
@@ -83,31 +84,57 @@ def run_items(
 ) -> int:
     """Work through the items and give the exit code: 0 all done, 1 some failed.
 
-    Raises `UsageError` (exit 2) where the output folder cannot be used. With `jobs` > 1 `process` runs in
-    spawned processes and must be picklable.
+    With `--shard` through this process's share of them, which has a report of its own. Raises `UsageError`
+    (exit 2) where the output folder cannot be used. With `jobs` > 1 or `--ray` `process` runs in other
+    processes and must be picklable.
     """
+    items = settings.shard.share(items)
     finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
     done = set(finished)
     todo = [item for item in items if item not in done]
     if options.dry_run:
         return _say_what_would_be_done(todo, finished, outputs_of)
-    report = _open_report(options.output / REPORT_NAME, verb, todo, finished, outputs_of)
+    report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if finished:
         advice = "--overwrite makes them anew, as other options would have them"
         log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
-    work = _Work(process)
-    parallel = options.jobs > 1 and len(todo) > 1
-    results = in_processes(work, todo, options.jobs, _broken) if parallel else map(work, todo)
+    recover = _Recover(outputs_of, options.overwrite)
     failures = 0
-    for result in _with_progress(results, len(todo), verb, settings):
-        if result.stops_the_run is not None:
-            raise result.stops_the_run
-        with report.open("a", encoding="utf-8") as stream:
-            stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
-        failures += _tell(result)
+    with closing(spread(_Work(process), todo, options.jobs, settings, _broken, recover)) as results:
+        for result in _with_progress(results, len(todo), verb, settings):
+            if result.stops_the_run is not None:
+                raise result.stops_the_run
+            with report.open("a", encoding="utf-8") as stream:
+                stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
+            failures += _tell(result)
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
     return 1 if failures else 0
+
+
+def report_name(shard: Shard) -> str:
+    """The report's name; shards that work at the same time have one each."""
+    return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
+
+
+def sums_up(
+    items: Sequence[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> bool:
+    """Whether a verb that ends with something of all items, not of each, is to make that now.
+
+    Without `--shard` always. A shard does when the items of all shards are finished, so the last one does;
+    not with `--overwrite`, for an earlier run's outputs look the same.
+    """
+    if settings.shard.of == 1:
+        return True
+    left = len(items) if options.overwrite else sum(not _is_finished(outputs_of(item)) for item in items)
+    if left:
+        state = "may be unfinished" if options.overwrite else f"({left}) are unfinished"
+        log.info("items %s, so nothing is summed up; a run without --shard and --overwrite does that", state)
+    return not left
 
 
 @dataclass(frozen=True)
@@ -150,6 +177,18 @@ def _broken(item: Item, error: Exception) -> _Result:
     return _Result(item, 0.0, error=f"{item.input_path}: {advice} ({error})")
 
 
+@dataclass(frozen=True)
+class _Recover:
+    """The result of an item that was finished when its worker was lost; None where it is to be done again."""
+
+    outputs_of: Callable[[Item], Sequence[Path]]
+    overwrite: bool  # then an earlier run's outputs cannot be told from the lost worker's
+
+    def __call__(self, item: Item) -> _Result | None:
+        outputs = self.outputs_of(item)
+        return None if self.overwrite or not _is_finished(outputs) else _Result(item, 0.0, Outcome(outputs))
+
+
 def _is_finished(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.exists() for path in outputs)
 
@@ -171,8 +210,16 @@ def _open_report(
     finished: list[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
 ) -> Path:
-    """Start the report: older rows stay, but for those of items that are about to be made anew."""
+    """Start the report: older rows stay, but for those of items that are about to be made anew.
+
+    A run without `--shard` takes over the rows of the shards that were before it.
+    """
     rows = {(row.get("verb"), row.get("item")): row for row in _rows_of(path)}
+    for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
+        for row in _rows_of(shard):
+            key = row.get("verb"), row.get("item")
+            if key not in rows or rows[key].get("status") == "failed":
+                rows[key] = row
     for item in todo:
         rows.pop((verb, item.name), None)
     for item in finished:

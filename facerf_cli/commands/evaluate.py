@@ -13,6 +13,7 @@ from facerf_cli.commands.evaluate_transfer import transfer
 from facerf_cli.commands.evaluate_yale_b import WITHOUT as NOT_OF_YALE_B
 from facerf_cli.commands.evaluate_yale_b import yale_b
 from facerf_cli.commands.evaluation_options import with_shared_options
+from facerf_cli.commands.machines import with_machines
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' pictures.")
 
@@ -29,5 +30,5 @@ PROTOCOLS: tuple[tuple[Callable[..., int], tuple[str, ...]], ...] = (
 _EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
 
 for _function, _left_out in PROTOCOLS:
-    _command = with_shared_options(_function, _left_out)
+    _command = with_machines(with_shared_options(_function, _left_out))
     app.command(epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})(_command)

@@ -15,6 +15,7 @@ from facerf_cli.records import json_line
 
 # Settings that change no figure, wherever they stand.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
+_WITHOUT_EFFECT |= {"shard", "ray"}
 
 
 def evaluation_key(

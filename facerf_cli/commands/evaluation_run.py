@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
+from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.commands.evaluation_key import evaluation_key, networks_of
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.inputs import Item
@@ -53,7 +53,7 @@ def run_protocol(
     code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
     if code:
         log.error("no summary is written while pictures are missing; finished ones are kept, so run it again")
-    elif not options.dry_run:
+    elif not options.dry_run and sums_up(items, work.outputs_of, batch, settings):
         _finish(protocol, items, work)
     return code
 

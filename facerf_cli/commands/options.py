@@ -1,8 +1,9 @@
 """The options that verbs share, so that each is named, explained and read once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
@@ -11,18 +12,43 @@ from facerf_cli.errors import UsageError
 if TYPE_CHECKING:
     import torch
 
+T = TypeVar("T")
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 
 
 @dataclass(frozen=True)
+class Shard:
+    """Which of the items are this process's: every `of`th, from number `number` on, which counts from 1."""
+
+    number: int = 1
+    of: int = 1
+
+    @staticmethod
+    def parse(text: str | None) -> "Shard":
+        """`K/N`; all items where nothing is given. UsageError for what is no such share."""
+        if text is None:
+            return Shard()
+        number, slash, of = text.partition("/")
+        if not (slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+            raise UsageError(f"--shard {text}: give K/N with K from 1 to N, as 3/8")
+        return Shard(int(number), int(of))
+
+    def share(self, items: Sequence[T]) -> Sequence[T]:
+        """This process's items."""
+        return items[self.number - 1 :: self.of]
+
+
+@dataclass(frozen=True)
 class Settings:
-    """The global options; `ctx.obj` in every verb."""
+    """The global options, and which items are worked on where; `ctx.obj` in every verb."""
 
     verbosity: int = 0  # -1 errors only, 0 notes and warnings, 1 everything and tracebacks
     log_json: bool = False
     device: DeviceName = "auto"
     checkpoint: Path | None = None  # None: the one in assets/
     seed: int = 0
+    shard: Shard = Shard()
+    ray: str | None = None  # None: this machine, without Ray
 
 
 def settings_of(context: typer.Context) -> Settings:
@@ -64,6 +90,25 @@ DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="Say what would be read and written; write nothing.")
 ]
 JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Pictures worked on at a time.")]
+ShardOption = Annotated[
+    str | None,
+    typer.Option(
+        "--shard",
+        metavar="K/N",
+        help="Every Nth item only, from the Kth on; the other shards are for other machines.",
+        show_default="all items",
+    ),
+]
+RayOption = Annotated[
+    str | None,
+    typer.Option(
+        "--ray",
+        metavar="ADDRESS",
+        help="Work as tasks of Ray: HOST:PORT of a cluster's head, auto, or local for this machine; --jobs "
+        "tasks at a time, by default one a processor, and with --device cuda one a GPU.",
+        show_default=False,
+    ),
+]
 InputColourspaceOption = Annotated[
     str | None,
     typer.Option(

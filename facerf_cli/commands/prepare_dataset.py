@@ -4,11 +4,11 @@ import logging
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
+from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import (
     DryRunOption,
@@ -16,24 +16,49 @@ from facerf_cli.commands.options import (
     OverwriteOption,
     settings_of,
 )
+from facerf_cli.commands.prepare_findings import (
+    CheckOnly,
+    check,
+    check_all,
+    collect_findings,
+    require_sound,
+    show_rows,
+    write_findings,
+)
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
     from facerf_cli.stage.data.layouts import Capture
+    from facerf_cli.stage.data.selection import Selection
     from facerf_cli.stage.data.splits import Split
 
+Checks = Literal["on", "off", "only"]
 _CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """Which capture, and how it is read; settings only."""
+
+    folder: Path
+    layout: str
+    subtract_ambient: bool
+
+    def opened(self) -> "Capture":
+        """The capture's description, once a process; it is an input of the whole run."""
+        return _capture(self)
 
 
 @dataclass(frozen=True)
 class _Prepare:
     """Prepares one subject; settings only."""
 
-    capture: Path
-    layout: str
+    given: _Given
+    checks: Checks
+    strict: bool
     face_model: str
     crop_px: int
     folder: Path
@@ -43,31 +68,43 @@ class _Prepare:
         """A subject's files."""
         from facerf_cli.stage.data.prepare import subject_outputs
 
-        return subject_outputs(_capture(self.capture, self.layout), item.name, self.folder)
+        return subject_outputs(self.given.opened(), item.name, self.folder)
 
     def __call__(self, item: Item) -> Outcome:
         """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
         from facerf_cli.stage.data.prepare import prepare_subject
         from facerf_cli.stage.threads import one_thread
 
-        capture, model = _capture(self.capture, self.layout), _face_model(self.face_model)
+        capture, model = self.given.opened(), _face_model(self.face_model)
         with one_thread():
-            record = prepare_subject(capture, item.name, model, self.folder, self.crop_px, self.key)
+            chosen = self._choose(capture, item.name)
+            record = prepare_subject(
+                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.strict
+            )
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
         worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
         facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
         facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
+        facts |= {"lights": len(chosen.lights)}
         return Outcome(self.outputs_of(item), facts)
+
+    def _choose(self, capture: "Capture", subject: str) -> "Selection":
+        """The frames that are sound; an InputError where that is not enough, or anything with --strict."""
+        from facerf_cli.stage.data.selection import select_frames
+
+        findings = check(capture, subject) if self.checks == "on" else []
+        write_findings(self.folder, subject, findings)
+        require_sound(subject, findings, self.strict)
+        return select_frames(capture, subject, findings, self.strict)
 
 
 @cache
-def _capture(folder: Path, layout: str) -> "Capture":
-    """The capture's description, once a process; it is an input of the whole run."""
+def _capture(given: _Given) -> "Capture":
     from facerf_cli.stage.data.layouts import read_capture
 
     try:
-        return read_capture(folder, layout)
+        return read_capture(given.folder, given.layout, given.subtract_ambient)
     except InputError as error:
         raise UsageError(str(error)) from None
 
@@ -83,15 +120,37 @@ def _face_model(name: str) -> "MorphableModel":
 def prepare_dataset(
     context: typer.Context,
     capture: Annotated[
-        Path, typer.Argument(metavar="CAPTURE", help="Folder with stage.json.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="CAPTURE", help="Folder with stage.json, or as --layout says.", show_default=False
+        ),
     ],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="DATASET", help="Folder for the data.", show_default=False),
     ],
     layout: Annotated[
-        str, typer.Option(metavar="NAME", help="How the capture lies on disk; 'stage' is with stage.json.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="How the capture lies on disk: stage (with stage.json), or extended-yale-b (that database, "
+            "cropped, as it is distributed).",
+        ),
     ] = "stage",
+    subtract_ambient: Annotated[
+        bool,
+        typer.Option("--subtract-ambient", help="Subtract each camera's picture without lamps, if it has one."),
+    ] = False,
+    checks: Annotated[
+        Checks,
+        typer.Option(
+            help="Look for faults in the frames first: broken frames are left out, errors stop a subject. "
+            "only: tell what is found, and prepare nothing.",
+        ),
+    ] = "on",
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Any finding, missing frame or unseen face stops its subject.")
+    ] = False,
     split: Annotated[
         str,
         typer.Option(
@@ -111,6 +170,10 @@ def prepare_dataset(
     to all of a subject's cameras; DATASET gets olat/SUBJECT/CAMERA.exr (stacks that `facerf relight` takes),
     fits, a sheet a subject, index.html to look through, and dataset.json at the end. A second run goes on
     where the first was cut off.
+
+    A light whose frame is missing or broken in one camera is left out of that subject's stacks, a camera that
+    lacks most frames or does not see the face is left out, and dataset.json says so; with less than half of
+    the lights left, or less than 10, a subject fails. findings.jsonl has what the checks found.
     """
     from facerf_cli.stage.data.dataset import DATASET_FILE, LARGEST_CROP_PX
     from facerf_cli.stage.data.description import preparation_key
@@ -120,18 +183,23 @@ def prepare_dataset(
     drawn = Split.parse(split)
     if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:
         raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    found = _capture(capture, layout)
+    given = _Given(capture, layout, subtract_ambient)
+    found = given.opened()
     _check_subjects(found, output, drawn)
+    items = [Item(found.folder / name, output / name, name) for name in found.subjects]
+    if checks == "only" and not dry_run:
+        raise typer.Exit(check_all(CheckOnly(given.opened), items, output, jobs, strict, settings))
     model_sha256 = _model_digest(face_model)
     key = preparation_key(found, model_sha256, crop)
     _check_earlier(found, output, key, overwrite)
-    work = _Prepare(capture, layout, face_model, crop, output, key)
-    items = [Item(found.folder / name, output / name, name) for name in found.subjects]
+    work = _Prepare(given, checks, strict, face_model, crop, output, key)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     if overwrite and not dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
+    elif not dry_run:
+        _forget_mended(found, output)
     code = run_items("prepare-dataset", items, work, work.outputs_of, options, settings)
-    if not dry_run:
+    if not dry_run and sums_up(items, work.outputs_of, options, settings):
         _finish(work, found, drawn, settings.seed, model_sha256)
     raise typer.Exit(code)
 
@@ -142,6 +210,8 @@ def _check_subjects(capture: "Capture", output: Path, split: "Split") -> None:
         raise UsageError(f"{capture.folder}: no subjects found (pictures are at {capture.pattern})")
     if output.resolve() == capture.folder.resolve():
         raise UsageError(f"-o {output}: is the capture itself; give another folder")
+    if marked := sum(map(len, capture.marked.values())):
+        log.info("%s: %d pictures that are marked as damaged (.bad) are left out", capture.folder, marked)
     left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
     if left:
         log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
@@ -168,6 +238,18 @@ def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) 
         )
 
 
+def _forget_mended(capture: "Capture", output: Path) -> None:
+    """Have the subjects made anew that lacked frames which have come since."""
+    from facerf_cli.stage.data.dataset import record_path
+    from facerf_cli.stage.data.prepare import prepared_subjects
+    from facerf_cli.stage.data.selection import is_mended
+
+    for subject, record in prepared_subjects(capture, output).items():
+        if is_mended(capture, subject, record.get("missing", ())):
+            log.info("%s: frames that it lacked are there now; it is made anew", subject)
+            record_path(output, subject).unlink()
+
+
 def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model_sha256: str) -> None:
     """Write the page and `dataset.json` of the subjects that are finished, and prepared as this run would."""
     from facerf_cli.files.atomic import atomic_path
@@ -179,12 +261,14 @@ def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model
 
     found = prepared_subjects(capture, work.folder).items()
     records = {subject: record for subject, record in found if record.get("prepared") == work.key}
+    findings = collect_findings(work.folder, capture.subjects)
+    show_rows([row for rows in findings.values() for row in rows])
     if not records:
         return
     model = _face_model(work.face_model)
     dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
     with atomic_path(work.folder / "index.html") as temporary:
-        text = index_page(dataset, records)
+        text = index_page(dataset, records, findings)
         temporary.write_text(
             text, encoding="utf-8", errors="replace"
         )  # folders may have any bytes for a name

@@ -181,6 +181,6 @@ def relight(
         load_models_once(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch("relight", inputs, work, work.outputs_of, options, settings)
-    if ball and not dry_run:
+    if ball and not dry_run and settings.shard.number == 1:
         write_balls(shots, output, exposure_ev, overwrite)
     raise typer.Exit(max(code, int(len(shots) < len(asked))))

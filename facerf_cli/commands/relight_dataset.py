@@ -1,7 +1,7 @@
 """`facerf relight-dataset`: subjects of a prepared dataset under environment maps, as pairs to train on."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,7 @@ from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
 from facerf_cli.commands.inputs import Item, collect_items
 from facerf_cli.commands.options import DryRunOption, OverwriteOption, Settings, settings_of
 from facerf_cli.commands.shots import MAP_SUFFIXES
-from facerf_cli.commands.workers import in_processes
+from facerf_cli.commands.workers import spread
 from facerf_cli.errors import UsageError
 from facerf_cli.records import STDERR
 
@@ -118,7 +118,7 @@ class _Relight:
 
 @dataclass(frozen=True)
 class _Spread:
-    """`map` with a bar, in processes where there are several jobs."""
+    """`map` with a bar, by as many workers as were asked for."""
 
     jobs: int
     settings: Settings
@@ -126,8 +126,11 @@ class _Spread:
     def __call__(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
         from rich.progress import track
 
-        several = self.jobs > 1 and len(items) > 1
-        results: Iterable[Any] = in_processes(work, items, self.jobs, _died) if several else map(work, items)
+        if self.settings.shard.of > 1:  # shards would get in each other's way
+            raise UsageError(
+                "--shard: the pairs are not drawn; give this line once with --lazy and no --shard"
+            )
+        results = spread(work, items, self.jobs, self.settings, _died)
         shown = STDERR.is_terminal and self.settings.verbosity >= 0 and not self.settings.log_json
         return iter(track(results, "maps", len(items), console=STDERR, transient=True, disable=not shown))
 

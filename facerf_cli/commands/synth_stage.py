@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from facerf_cli.commands.batch import BatchOptions, Outcome, run_items
+from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import DryRunOption, OutputOption, OverwriteOption, settings_of
 from facerf_cli.errors import UsageError
@@ -65,7 +65,7 @@ def synth_stage(
         open_capture(output, stage)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_items("synth-stage", items, photograph, photograph.outputs_of, options, settings)
-    if not dry_run:
+    if not dry_run and sums_up(items, photograph.outputs_of, options, settings):
         close_capture(output, stage)
     raise typer.Exit(code)
 

@@ -1,12 +1,18 @@
 """Whole files or none: an output is written under a temporary name beside its place, then renamed."""
 
+import hashlib
 import os
+import platform
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
+
+_ABANDONED_S = 24 * 3600  # what no machine has written to for so long, nobody is writing
 
 
 @contextmanager
@@ -15,9 +21,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     The temporary name keeps the suffix (writers choose their format by it) and is hidden, so that a walk over
     the folder does not take it for an input. Missing parent folders are made, and what a killed process left
-    of the same output is removed.
+    of the same output is removed. Machines that share the folder may write the same output at once.
     """
-    temporary = path.with_name(f".{path.stem}.part-{os.getpid()}{path.suffix}")
+    temporary = path.with_name(f".{path.stem}.part-{_machine()}-{os.getpid()}{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(path)
@@ -33,12 +39,28 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _remove(temporary)
 
 
+@cache
+def _machine() -> str:
+    """What tells this machine from others that write to the same folder: they count processes of their own."""
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
 def _remove_leftovers(path: Path) -> None:
     before, after = f".{path.stem}.part-", path.suffix
     for name in os.listdir(path.parent):
-        owner = name[len(before) : len(name) - len(after)]
-        if name.startswith(before) and name.endswith(after) and owner.isdecimal() and not _runs(int(owner)):
+        machine, _, owner = name[len(before) : len(name) - len(after)].partition("-")
+        ours = name.startswith(before) and name.endswith(after) and owner.isdecimal()
+        if ours and _is_abandoned(path.with_name(name), machine, int(owner)):
             _remove(path.with_name(name))
+
+
+def _is_abandoned(leftover: Path, machine: str, owner: int) -> bool:
+    if machine == _machine():
+        return not _runs(owner)
+    try:
+        return time.time() - leftover.stat().st_mtime > _ABANDONED_S
+    except OSError:  # its owner has taken it away
+        return False
 
 
 def _runs(process: int) -> bool:

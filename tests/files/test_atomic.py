@@ -1,12 +1,13 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.atomic import _machine, atomic_path
 
 
 def _dead_process() -> int:
@@ -16,10 +17,13 @@ def _dead_process() -> int:
 
 
 def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) -> None:
-    dead, alive = _dead_process(), os.getppid()
+    dead, alive, elsewhere = (f"{_machine()}-{_dead_process()}", f"{_machine()}-{os.getppid()}", "0123abcd-1")
     (tmp_path / f".a.part-{dead}.exr").write_text("half")
     (tmp_path / f".folder.part-{dead}").mkdir()
+    (tmp_path / f".a.part-{elsewhere}2.exr").write_text("of a machine that has been off for a week")
+    os.utime(tmp_path / f".a.part-{elsewhere}2.exr", (0, time.time() - 7 * 86400))
     kept = [
+        tmp_path / f".a.part-{elsewhere}.exr",
         tmp_path / f".a.part-{alive}.exr",
         tmp_path / f".ab.part-{dead}.exr",
         tmp_path / f".a.part-{dead}.txt",
