@@ -41,7 +41,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @cache
 def _machine() -> str:
-    """What tells this machine from others that write to the same folder: they count processes of their own."""
+    """What tells this machine from others that write to the same folder and count processes anew."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
