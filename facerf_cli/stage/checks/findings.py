@@ -1,7 +1,7 @@
 """What the checks of a capture say: findings, each about a subject, a camera or one frame.
 
-An error stops its subject, unless it `leaves_out` a frame: then the frame alone is to be left out of the stack,
-and the subject goes on without it. A warning stops nothing.
+An error stops its subject, unless it `leaves_out` a frame: then the frame alone is to be left out of the
+stack, and the subject goes on without it. A warning stops nothing.
 """
 
 from collections.abc import Iterable, Mapping

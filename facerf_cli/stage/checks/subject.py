@@ -1,0 +1,121 @@
+"""All checks of a subject's frames, before any work is put into it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from facerf_cli.stage.checks.black import check_black
+from facerf_cli.stage.checks.clipped import check_clipped
+from facerf_cli.stage.checks.duplicates import check_duplicates, same_frames, seen_before
+from facerf_cli.stage.checks.face_normals import find_face_normals
+from facerf_cli.stage.checks.fields import check_fields
+from facerf_cli.stage.checks.findings import Finding
+from facerf_cli.stage.checks.frames import CameraFrames, read_frames
+from facerf_cli.stage.checks.gamma import Curve, check_gamma, fit_exponent
+from facerf_cli.stage.checks.missing import check_missing
+from facerf_cli.stage.checks.motion import check_motion
+from facerf_cli.stage.checks.order import check_frames_order, check_rig, check_rig_roughly
+from facerf_cli.stage.checks.readable import check_readable
+from facerf_cli.stage.checks.stereo import Stereo, lit_pixels, photometric_stereo
+from facerf_cli.stage.checks.unlit import check_unlit
+from facerf_cli.stage.data.layouts import Capture
+
+_LEAST_FRAMES = 8  # fewer say nothing of what another should look like
+_LEAST_LIT_PX = 100
+_FACE_TRIES = 3  # cameras that are searched for the face; each costs a second or more where there is none
+
+
+@dataclass(frozen=True)
+class CheckSettings:
+    """What the checks go by."""
+
+    side_px: int = 96  # the longer side of the small frames that the checks share
+
+
+_USUAL = CheckSettings()
+
+
+def check_subject(capture: Capture, subject: str, settings: CheckSettings = _USUAL) -> list[Finding]:
+    """Findings about a subject's frames, errors first; each frame is read once, one camera is held at a time.
+
+    Held are `settings.side_px` squared values a light. Raises nothing that a user can cause: what cannot be
+    read is a finding.
+    """
+    checks = _Checks(capture, subject, settings)
+    found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
+    found += check_gamma(subject, checks.curves)
+    if not checks.rig_known:
+        found += checks.rough
+    return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
+
+
+class _Checks:
+    """What the checks of a subject's cameras carry from one to the next."""
+
+    def __init__(self, capture: Capture, subject: str, settings: CheckSettings) -> None:
+        self.capture, self.subject, self.settings = capture, subject, settings
+        self.curves: list[Curve] = []
+        self.rough: list[Finding] = []  # of the rig, without a face to compare
+        self.rig_known = False
+        self._digests: dict[str, str] = {}
+        self._face_tries = _FACE_TRIES
+
+    def of_camera(self, camera: str) -> list[Finding]:
+        """All findings about a camera."""
+        found = list(check_missing(self.capture, self.subject, camera))
+        frames, unread = read_frames(self.capture, self.subject, camera, self.settings.side_px)
+        found += check_readable(frames, unread)
+        for check in (check_black, check_clipped, check_fields):
+            found += check(frames)
+        found += seen_before(frames, self._digests)
+        names = (f"{camera}/{light}" for light in frames.light_ids)
+        self._digests |= {of.digest: name for of, name in zip(frames.figures, names, strict=True)}
+        doubles = {frames.light_ids[row] for rows in same_frames(frames) for row in rows}
+        sound = frames.less(left_out(found) | doubles)
+        stereo = fit_stereo(sound)
+        found += check_duplicates(frames, stereo)
+        sound = frames.less(left_out(found))
+        if stereo is None:
+            return found
+        found += check_unlit(sound, stereo)
+        sound = frames.less(left_out(found))
+        return found + self._of_shading(sound)
+
+    def _of_shading(self, frames: CameraFrames) -> list[Finding]:
+        """Findings about frames that are whole and lit, as far as shading tells."""
+        stereo = fit_stereo(frames)
+        if stereo is None:
+            return []
+        found = list(check_frames_order(frames, stereo))
+        if not found:  # otherwise normals are not to be trusted
+            self._look_at_rig(frames, stereo, found)
+        found += check_motion(frames.less(left_out(found)), stereo)
+        curve = fit_exponent(frames.less(left_out(found)), stereo.lit)
+        self.curves += [] if curve is None else [curve]
+        return found
+
+    def _look_at_rig(self, frames: CameraFrames, stereo: Stereo, found: list[Finding]) -> None:
+        """Hold the rig against the face until a camera has shown one."""
+        if self.rig_known:
+            return
+        self.rough += check_rig_roughly(frames, stereo)
+        if self._face_tries:
+            self._face_tries -= 1
+            face = find_face_normals(frames, self.capture.cameras[frames.camera])
+            if face is not None:
+                self.rig_known = True
+                found += check_rig(frames, stereo, face)
+
+
+def left_out(findings: Iterable[Finding]) -> set[str]:
+    """The lights whose frames are broken, of one camera's findings."""
+    return {found.light for found in findings if found.leaves_out}
+
+
+def fit_stereo(frames: CameraFrames) -> Stereo | None:
+    """Photometric stereo of the frames; None where they are too few, or nothing is lit."""
+    lit = lit_pixels(frames.grey) if len(frames.light_ids) >= _LEAST_FRAMES else np.zeros((1, 1), bool)
+    if lit.sum() < _LEAST_LIT_PX:
+        return None
+    return photometric_stereo(frames.grey[:, lit].astype(float), frames.directions, lit)
