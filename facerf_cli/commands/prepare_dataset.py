@@ -139,7 +139,7 @@ def prepare_dataset(
     ] = "stage",
     subtract_ambient: Annotated[
         bool,
-        typer.Option("--subtract-ambient", help="Subtract each camera's picture without lamps, if it has one."),
+        typer.Option("--subtract-ambient", help="Subtract each camera's picture without lamps, if there."),
     ] = False,
     checks: Annotated[
         Checks,

@@ -1,10 +1,10 @@
 """OLAT stacks: one multi-part OpenEXR, half floats, a part a light; any program that reads EXR opens them.
 
 Part k is named `light000` and so on and says its light's direction (`facerf:direction`, a unit vector toward
-the light in camera space). A last part, `source`, holds what the lights were predicted from: the photo's
-texture (or its render), how well each pixel was seen, and normals in camera space. The first part's
-`facerf:olat` is JSON: the kind of stack, the head's rotation and the fit, so that a stack can be relit
-without its photo.
+the light in camera space). Where lights of a stage's rig are missing, so are their numbers. A last part,
+`source`, holds what the lights were predicted from: the photo's texture (or its render), how well each pixel
+was seen, and normals in camera space. The first part's `facerf:olat` is JSON: the kind of stack, the head's
+rotation and the fit, so that a stack can be relit without its photo.
 """
 
 import json
@@ -47,6 +47,7 @@ class StackHeader:
     layout_version: int  # of the UV chart
     fit: dict[str, np.ndarray]  # `face.fit.fit_to_arrays`
     metadata: dict[str, Any] = field(default_factory=dict)  # provenance
+    rig_lights: tuple[int, ...] = ()  # the parts' numbers in their rig, to write; () counts them from 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +126,8 @@ def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
     height, width = header.seen.shape
     attributes: Attributes = header.metadata
     specs = []
-    for number, direction in enumerate(header.directions.tolist()):
+    numbers = header.rig_lights or range(len(header.directions))
+    for number, direction in zip(numbers, header.directions.tolist(), strict=True):
         spec = _part(width, height, f"light{number:03d}", ("R", "G", "B"), attributes)
         spec.attribute(_DIRECTION, oiio.TypeDesc("vector"), tuple(direction))
         spec.attribute("facerf:light", number)

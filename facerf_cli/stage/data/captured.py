@@ -70,7 +70,9 @@ class Captured:
         The albedo of real skin is not known: the exposure is taken from the face under a constant map of
         radiance 1 in its place, which is the albedo less what other parts of the face hide of the map.
         """
-        faces = [self._draw_face(self.dataset.subjects[int(head)], lights, generator) for head in heads]
+        subjects = [self.dataset.subjects[int(head)] for head in heads]
+        lights = min(lights, *(len(self.dataset.lights_of(subject)) for subject in subjects))
+        faces = [self._draw_face(subject, lights, generator) for subject in subjects]
         visible = torch.stack([face.source.visible for face in faces])
         source, target = photograph(
             torch.stack([face.texture for face in faces]),

@@ -1,13 +1,15 @@
 """Prepared light-stage data on disk (DESIGN, 'Files'): what is where, and reading what is said of it.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
+    findings.jsonl             what the checks of the capture found (`stage/checks/findings.py`)
     olat/SUBJECT/CAMERA.exr    an OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
     fits/SUBJECT/CAMERA.npz    its fit (`face/fit.py`)
     fits/SUBJECT.json          what is known of the subject's fit; written last of its files
     sheets/SUBJECT.jpg, index.html, report.jsonl
 
 Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera), the world as the
-capture has it; each stack holds its lights in its own crop's camera space.
+capture has it; each stack holds its lights in its own crop's camera space. A subject that lacks lights says
+which it has (`lights`, in the order of its stacks' parts) and why not the others (`left_out`).
 """
 
 from collections.abc import Iterable
@@ -42,11 +44,21 @@ class Dataset:
     normalisation: dict[str, Any]  # colour space from and to, black level, gain of each light
     provenance: dict[str, Any]
     traits: dict[str, dict[str, Any]] = field(default_factory=dict)  # of a subject, where the capture has any
+    # Of the subjects that lack some: which lights (places in light_ids, ascending) their stacks hold.
+    fewer_lights: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def subjects(self) -> tuple[str, ...]:
         """All subjects that were prepared, sorted."""
         return tuple(self.cameras)
+
+    def lights_of(self, subject: str) -> tuple[int, ...]:
+        """The lights in a subject's stacks, in the order of the parts: places in `light_ids`."""
+        return self.fewer_lights.get(subject) or self._all_lights
+
+    @cached_property
+    def _all_lights(self) -> tuple[int, ...]:
+        return tuple(range(len(self.light_ids)))
 
     def split_of(self, subject: str) -> str:
         """'train', 'validation', 'test', or '' for a subject that is in none."""
@@ -95,18 +107,19 @@ def read_dataset(folder: Path) -> Dataset:
     directions = np.array([light["direction_world"].unit() for light in lights]).reshape(-1, 3)
     if not lights:
         raise root["rig"]["lights"].wrong("a light at least")
-    cameras = _prepared_cameras(root)
+    cameras, light_ids = _prepared_cameras(root), unique_ids(lights)
     dataset = Dataset(
         folder=folder,
         face_model=root["face_model"].text(),
         crop_px=root["crop_px"].whole(1, LARGEST_CROP_PX),
-        light_ids=tuple(unique_ids(lights)),
+        light_ids=tuple(light_ids),
         directions_world=directions,
         splits=_read_splits(root["splits"], set(cameras)),
         cameras=cameras,
         normalisation=root["normalisation"].table(),
         provenance=root["provenance"].table(),
         traits=_read_traits(root, cameras),
+        fewer_lights=_read_lights(root, cameras, light_ids),
     )
     for subject, ids in cameras.items():
         for camera in ids:
@@ -121,6 +134,20 @@ def _read_traits(root: Node, subjects: Iterable[str]) -> dict[str, dict[str, Any
     nodes = root["subjects"].entries(MOST_SUBJECTS)
     found = {subject: nodes[subject].get("traits") for subject in subjects}
     return {subject: traits.table() if traits else {} for subject, traits in found.items()}
+
+
+def _read_lights(root: Node, subjects: Iterable[str], light_ids: list[str]) -> dict[str, tuple[int, ...]]:
+    """The lights of the subjects that lack some; entries without `lights` have all."""
+    nodes = root["subjects"].entries(MOST_SUBJECTS)
+    places = {name: place for place, name in enumerate(light_ids)}
+    lights = {}
+    for subject in subjects:
+        if found := nodes[subject].get("lights"):
+            named = [node.text() for node in found.items(MOST_LIGHTS)]
+            if not named or [name for name in light_ids if name in named] != named:
+                raise found.wrong("some of the rig's lights, in its order")
+            lights[subject] = tuple(places[name] for name in named)
+    return lights
 
 
 def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:

@@ -62,7 +62,10 @@ def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
     if record is None:
         return {"status": "failed"}
     known = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-    return {"status": "done", **known, "cameras": list(record["cameras"])}
+    less = {
+        name: record[name] for name in ("lights", "left_out", "dropped", "ambient_kept") if name in record
+    }
+    return {"status": "done", **known, "cameras": list(record["cameras"]), **less}
 
 
 def _calibration(capture: Capture) -> dict[str, Any]:
@@ -86,6 +89,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "from": capture.colour_space,
             "to": _COLOUR_SPACE,
             "black_level": capture.black_level,
+            **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             "gain": dict(gains),
             "non_finite": "set to 0",
             "negative": "set to 0 after the crop",

@@ -1,6 +1,6 @@
 """A page to look through prepared data with: every subject's sheet, split and fit; plain HTML, no scripts."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -19,13 +19,23 @@ _COLUMNS = (
 )
 
 
-def index_page(dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> str:
-    """The page for the content of `dataset.json` and the records of its finished subjects."""
+Rows = Sequence[Mapping[str, Any]]
+
+
+def index_page(
+    dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], findings: Mapping[str, Rows]
+) -> str:
+    """The page for the content of `dataset.json`, records of its finished subjects, rows of findings."""
     title = f"{dataset['capture']}: {len(records)} of {len(dataset['subjects'])} subjects"
-    return html_page(title, _STYLE, _lines(title, dataset, records))
+    return html_page(title, _STYLE, _lines(title, dataset, records, findings))
 
 
-def _lines(title: str, dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+def _lines(
+    title: str,
+    dataset: Mapping[str, Any],
+    records: Mapping[str, Mapping[str, Any]],
+    findings: Mapping[str, Rows],
+) -> Iterator[str]:
     yield f"<h1>{escape(title)}</h1>"
     split_of = {name: split for split, names in dataset["splits"].items() for name in names}
     counts = ", ".join(f"{len(names)} {split}" for split, names in dataset["splits"].items())
@@ -33,6 +43,20 @@ def _lines(title: str, dataset: Mapping[str, Any], records: Mapping[str, Mapping
     yield f"<p>{escape(_COLUMNS)}</p>"
     for subject in dataset["subjects"]:
         yield from _subject(subject, split_of.get(subject, "in no split"), records.get(subject))
+        yield from _findings(findings.get(subject, ()))
+
+
+def _findings(rows: Rows) -> Iterator[str]:
+    """The table of a subject's findings."""
+    if not rows:
+        return
+    yield "<table>\n<tr><th>finding</th><th>where</th><th></th></tr>"
+    for row in rows:
+        place = "/".join(str(row[key]) for key in ("camera", "light") if row.get(key))
+        kind = "poor" if row.get("severity") == "error" else "fair"
+        cells = [f"<td>{escape(str(text))}</td>" for text in (row.get("check"), place, row.get("words"))]
+        yield f'<tr class="{kind}">{"".join(cells)}</tr>'
+    yield "</table>"
 
 
 def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iterator[str]:
@@ -41,7 +65,12 @@ def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iter
     if record is None:
         yield '<p class="failed">failed; report.jsonl says why</p>'
         return
-    yield f"<p>{escape(split)}</p>\n<table>\n<tr><th>camera</th><th>error, % of the eyes' distance</th></tr>"
+    yield f"<p>{escape(split)}</p>"
+    for key, words in (("left_out", "lights"), ("dropped", "cameras")):
+        if reasons := record.get(key):
+            text = "; ".join(f"{name} ({why})" for name, why in reasons.items())
+            yield f'<p class="fair">left out of the {words}: {escape(text)}</p>'
+    yield "<table>\n<tr><th>camera</th><th>error, % of the eyes' distance</th></tr>"
     for camera, fit in record["cameras"].items():
         stack = f'<a href="olat/{name}/{escape(camera)}.exr">{escape(camera)}</a>'
         found = f"{100 * fit['error_iod']:.1f} {fit['quality']}" if fit["face_found"] else "no face found"

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.light.envmap import rotated_weights
+from facerf_cli.light.envmap import rotated_weights, texel_integrals
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.map_files import read_map_file
 from facerf_cli.stage.sky.skies import ProceduralMaps, draw_sky
@@ -54,15 +54,16 @@ class MapWork:
     """A map, the lights that it is weighed over, and how it is turned."""
 
     name: str
-    directions: Tensor  # [L, 3] in the map's axes: `map_directions`
+    directions: Tensor  # [L, 3] of the whole rig in the map's axes: `map_directions`
     rotations_deg: tuple[float, ...]
+    lights: tuple[tuple[int, ...], ...] = ()  # which of the rig's each rotation is weighed over; () all
 
 
 @dataclass(frozen=True, eq=False)
 class MapWeights:
     """The lights' weights under a map that is turned, times 2 to the power of `exposure_ev`."""
 
-    weights: np.ndarray  # [R, L, 3]
+    weights: np.ndarray  # [R, L, 3]; with fewer lights theirs come first, in their order, and then zeros
     exposure_ev: int
 
 
@@ -76,12 +77,25 @@ def weigh_map(work: MapWork) -> Weighed:
     except InputError as error:
         return str(error)
     with one_thread():
-        weights = rotated_weights(envmap, work.directions, (0.0, *work.rotations_deg))
-    mean = float(weights[0].double().sum(0).mean()) / 4  # of the radiance: pi sum(w) is its integral
-    if not mean > 0:
-        return f"{work.name}: there is no light in this map"
+        mean = float(texel_integrals(envmap, 1, 1).mean()) / (4 * math.pi)  # of the radiance
+        if not mean > 0:
+            return f"{work.name}: there is no light in this map"
+        weights = _weights(envmap, work)
     exposure_ev = -round(math.log2(mean))
-    return MapWeights((weights[1:] * 2.0**exposure_ev).numpy(), exposure_ev)
+    return MapWeights((weights * 2.0**exposure_ev).numpy(), exposure_ev)
+
+
+def _weights(envmap: Tensor, work: MapWork) -> Tensor:
+    """Weights [R, L, 3], not exposed: the cells are those of the lights that there are."""
+    everything = tuple(range(len(work.directions)))
+    lights = work.lights or (everything,) * len(work.rotations_deg)
+    weights = torch.zeros(len(lights), len(everything), 3)
+    for chosen in dict.fromkeys(lights):
+        rows = [row for row, other in enumerate(lights) if other == chosen]
+        directions = work.directions[list(chosen)]
+        turned = rotated_weights(envmap, directions, [work.rotations_deg[row] for row in rows])
+        weights[rows, : len(chosen)] = turned
+    return weights
 
 
 def map_directions(dataset: Dataset) -> Tensor:
@@ -112,11 +126,12 @@ def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
     """The rotation [3, 3] that takes the world's lights to a stack's, seen from the head."""
     path = dataset.stack_path(subject, camera)
     header = read_olat_header(path)
-    if len(header.directions) != len(dataset.directions_world):
+    in_world = dataset.directions_world[list(dataset.lights_of(subject))]
+    if len(header.directions) != len(in_world):
         raise InputError(
-            f"{path}: {len(header.directions)} lights, the dataset has {len(dataset.directions_world)}; "
+            f"{path}: {len(header.directions)} lights, the dataset has {len(in_world)}; "
             "run prepare-dataset again"
         )
     in_head = header.directions @ header.rotation
-    u, _, vt = np.linalg.svd(in_head.T @ dataset.directions_world)
+    u, _, vt = np.linalg.svd(in_head.T @ in_world)
     return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)

@@ -2,6 +2,8 @@
 
     relit/weights-KEY.npy   the weights of every row of pairs.jsonl [rows, L, 3]; KEY is that file's digest
 
+A row's weights are those of its subject's lights; where it lacks some of the rig's L, zeros fill the row up.
+
 The weights follow from the rows and the maps, and are made anew where they are missing.
 """
 
@@ -85,7 +87,7 @@ def _weights_path(dataset: Dataset, pairs_text: bytes) -> Path:
 
 
 def load_pairs(dataset: Dataset) -> dict[str, tuple[list[Pair], np.ndarray]]:
-    """Each subject's pairs and their weights [rows, L, 3] float32, mapped from the disk.
+    """Each subject's pairs and their weights [rows, L, 3] float32, mapped from the disk; L are its lights.
 
     The exposures are in the weights. Empty where the dataset has no pairs. What was read stays in memory
     until pairs.jsonl changes.
@@ -114,7 +116,10 @@ def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], 
     for row, pair in enumerate(pairs):
         rows_of[pair.subject].append(row)
     return {
-        subject: (pairs[rows[0] : rows[-1] + 1], weights[rows[0] : rows[-1] + 1])
+        subject: (
+            pairs[rows[0] : rows[-1] + 1],
+            weights[rows[0] : rows[-1] + 1, : len(key.dataset.lights_of(subject))],
+        )
         for subject, rows in rows_of.items()
     }
 
@@ -149,7 +154,7 @@ def _write_weights(dataset: Dataset, weights: np.ndarray, pairs_text: bytes) -> 
 
 
 def weigh_pairs(dataset: Dataset, pairs: list[Pair], spread: Spread = map) -> tuple[np.ndarray, list[Pair]]:
-    """Weights [rows, L, 3] and the pairs with their exposures; each map is read once.
+    """Weights [rows, L, 3], as they are on disk, and the pairs with their exposures; a map is read once.
 
     `spread` calls a function on many items, in order, as `map` does: in processes, or with a bar.
     """
@@ -158,7 +163,12 @@ def weigh_pairs(dataset: Dataset, pairs: list[Pair], spread: Spread = map) -> tu
         rows_of[pair.envmap].append(row)
     directions = map_directions(dataset)
     work = [
-        MapWork(name, directions, tuple(pairs[row].rotate_deg for row in rows))
+        MapWork(
+            name,
+            directions,
+            tuple(pairs[row].rotate_deg for row in rows),
+            tuple(dataset.lights_of(pairs[row].subject) for row in rows),
+        )
         for name, rows in rows_of.items()
     ]
     weights = np.zeros((len(pairs), len(directions), 3), np.float32)
@@ -181,9 +191,10 @@ def weigh_pairs(dataset: Dataset, pairs: list[Pair], spread: Spread = map) -> tu
 
 def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
     """The lights' weights [L, 3] of one pair, from its map; what `load_pairs` holds."""
-    result = weigh_map(MapWork(pair.envmap, map_directions(dataset), (pair.rotate_deg,)))
+    lights = dataset.lights_of(pair.subject)
+    result = weigh_map(MapWork(pair.envmap, map_directions(dataset), (pair.rotate_deg,), (lights,)))
     if isinstance(result, str):
         raise InputError(result)
     if result.exposure_ev != pair.exposure_ev:
         raise InputError(f"{pair.envmap}: not the map that the pair was made with")
-    return torch.from_numpy(result.weights[0])
+    return torch.from_numpy(result.weights[0, : len(lights)])

@@ -1,12 +1,14 @@
 """From a capture to prepared data, a subject at a time: landmarks, one head, crops, OLAT stacks, a sheet.
 
 Pictures are read one by one, twice: once for the fully lit sum that the face is found on, once for the stack.
-Never more than one camera's sum is held.
+Never more than one camera's sum is held. What goes in is a `Selection`; a camera that turns out not to see
+the face is left out, too.
 """
 
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from facerf_cli.report import contact_sheet
 from facerf_cli.stage.data.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.stage.data.documents import read_document, write_document
 from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.selection import Selection
 from facerf_cli.stage.data.sheets import lights_shown, sheet_tiles
 from facerf_cli.stage.data.stacks import constant_weights, stack_header
 
@@ -38,33 +41,51 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
-    """All files of a subject; the last of them is written last."""
-    paths = [place(folder, subject, camera) for camera in capture.cameras for place in (stack_path, fit_path)]
-    return [*paths, sheet_path(folder, subject), record_path(folder, subject)]
+    """All files of a subject, by its record if it has one; the last of them is written last."""
+    record = record_path(folder, subject)
+    cameras = read_document(record, "")["cameras"].table() if record.exists() else capture.cameras
+    paths = [place(folder, subject, camera) for camera in cameras for place in (stack_path, fit_path)]
+    return [*paths, sheet_path(folder, subject), record]
 
 
 def prepare_subject(
-    capture: Capture, subject: str, model: MorphableModel, folder: Path, crop_px: int, key: str
+    capture: Capture,
+    subject: str,
+    chosen: Selection,
+    model: MorphableModel,
+    folder: Path,
+    crop_px: int,
+    key: str,
+    strict: bool = False,
 ) -> dict[str, Any]:
-    """Write a subject's stacks, fits, sheet and record; give the record. `key` is of `preparation_key`."""
+    """Write a subject's stacks, fits, sheet and record; give the record. `key` is of `preparation_key`.
+
+    With `strict` a camera that does not see the face is an error.
+    """
     record_path(folder, subject).unlink(missing_ok=True)
-    landmarks = [_find_landmarks(capture, subject, camera) for camera in capture.cameras]
+    view = _Subject(capture, subject, chosen.lights, model)
+    landmarks = [_find_landmarks(view, camera) for camera in chosen.cameras]
     with _concerning(subject):
-        joint = fit_views(model, list(capture.cameras.values()), landmarks)
-    cameras, rows = {}, []
-    for camera, landmarks_px, error_iod in zip(capture.cameras, landmarks, joint.error_iod, strict=True):
+        joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
+    cameras, rows, dropped = {}, [], dict(chosen.dropped)
+    for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
         seen_px = None if error_iod is None else landmarks_px  # lost ones are as good as none
         error_iod = joint.mean_error_iod if error_iod is None else error_iod
-        posed = capture.cameras[camera]
-        with _concerning(f"{subject}/{camera}"):
-            fit, off_iod = fit_in_crop(model, joint, posed, seen_px, error_iod, crop_px)
-        rows.append(_write_camera(capture, subject, camera, model, joint, fit, folder))
+        try:
+            fit, off_iod = fit_in_crop(model, joint, capture.cameras[camera], seen_px, error_iod, crop_px)
+            header = _header(view, camera, joint, fit)
+        except InputError as error:
+            dropped[camera] = str(error)
+            continue
+        rows.append(_write_camera(view, camera, fit, header, folder))
         cameras[camera] = {
             "face_found": seen_px is not None,
             "error_iod": round(error_iod, 5),
             "quality": fit.quality,
             "crop_off_iod": round(off_iod, 5),
         }
+    chosen = replace(chosen, dropped=dropped)
+    _settle_dropped(subject, chosen, folder, bool(cameras), strict)
     write_display(sheet_path(folder, subject), contact_sheet(np.concatenate(rows), len(rows[0])))
     record = {
         "prepared": key,
@@ -72,9 +93,54 @@ def prepare_subject(
         "quality": quality_of(joint.mean_error_iod),
         "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
         "cameras": cameras,
+        **_record_of_less(view, chosen),
     }
     write_document(record_path(folder, subject), record)
     return record
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """Whom the work is about, the lights of their stacks (places in the capture's), and the face model."""
+
+    capture: Capture
+    name: str
+    lights: tuple[int, ...]
+    model: MorphableModel
+
+    @property
+    def directions_world(self) -> np.ndarray:
+        """Toward the lights [L, 3]."""
+        return self.capture.directions_world[list(self.lights)]
+
+
+def _settle_dropped(subject: str, chosen: Selection, folder: Path, any_left: bool, strict: bool) -> None:
+    """Say what is left out, and remove what an earlier run wrote of it; raise where that cannot be."""
+    if chosen.dropped and (strict or not any_left):
+        reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
+        advice = "without --strict the others would do" if any_left else "no camera is left"
+        raise InputError(f"{subject}: {reasons}; {advice}")
+    if words := chosen.in_words():
+        log.warning("%s: %s", subject, words)
+    for camera in chosen.dropped:
+        stack_path(folder, subject, camera).unlink(missing_ok=True)
+        fit_path(folder, subject, camera).unlink(missing_ok=True)
+
+
+def _record_of_less(view: _Subject, chosen: Selection) -> dict[str, Any]:
+    """What a record says where a subject lacks lights or cameras: the ids of its lights, in their order."""
+    capture = view.capture
+    entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
+    if chosen.left_out:
+        entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
+        entries |= {"left_out": chosen.left_out}
+    if capture.subtract_ambient:
+        without = [camera for camera in chosen.cameras if capture.ambient(view.name, camera) is None]
+        entries |= {"ambient_kept": without}
+        if without:
+            words = "no ambient picture of the camera's size; nothing is subtracted"
+            log.warning("%s/%s: %s", view.name, ", ".join(without), words)
+    return {name: entry for name, entry in entries.items() if entry}
 
 
 @contextmanager
@@ -86,68 +152,66 @@ def _concerning(name: str) -> Iterator[None]:
         raise InputError(f"{name}: {error}") from None
 
 
-def _find_landmarks(capture: Capture, subject: str, camera: str) -> np.ndarray | None:
+def _find_landmarks(view: _Subject, camera: str) -> np.ndarray | None:
     """Landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
-    weights = constant_weights(capture.directions_world)
-    posed = capture.cameras[camera]
+    weights = constant_weights(view.directions_world)
+    posed = view.capture.cameras[camera]
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
-    for light, weight in enumerate(weights):
-        lit += weight * capture.frame(subject, camera, light)
+    for light, weight in zip(view.lights, weights, strict=True):
+        lit += weight * view.capture.frame(view.name, camera, light)
     faces = detect_landmarks(to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 
-def _write_camera(
-    capture: Capture,
-    subject: str,
-    camera: str,
-    model: MorphableModel,
-    joint: JointFit,
-    fit: FaceFit,
-    folder: Path,
-) -> np.ndarray:
-    """Write a camera's stack and fit; give its tiles [6, h, w, 3] of the sheet."""
-    posed = capture.cameras[camera]
+def _header(view: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> StackHeader:
+    """The header of a camera's stack, its source still black; an InputError where it sees no face."""
+    posed = view.capture.cameras[camera]
     # Through the head, so that lights turn with the normals.
     world_to_crop = fit.rotation.double() @ joint.rotation.mT
-    directions = capture.directions_world @ world_to_crop.numpy().T
+    directions = view.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)
     metadata = {
         "Software": f"facerf {__version__}",
         "facerf:version": __version__,
-        "facerf:input": f"{subject}/{camera}",
-        "facerf:face_model": model.name,
-        "facerf:face_model_licence": model.licence,
+        "facerf:input": f"{view.name}/{camera}",
+        "facerf:face_model": view.model.name,
+        "facerf:face_model_licence": view.model.licence,
     }
-    header = stack_header(model, fit, directions, source, inside, metadata)
+    header = stack_header(view.model, fit, directions, source, inside, metadata)
     if not header.seen.any():
-        raise InputError(f"{subject}/{camera}: the camera does not see the face; take it out of stage.json")
-    shown: dict[int, np.ndarray] = dict.fromkeys(lights_shown(directions), source)
-    crops = _crops(capture, subject, camera, fit.crop, header, shown)
-    write_olat_stack(stack_path(folder, subject, camera), header, crops)
-    with atomic_path(fit_path(folder, subject, camera)) as temporary:
+        raise InputError("the camera does not see the face")
+    complete = len(view.lights) == len(view.capture.light_ids)
+    return header if complete else replace(header, rig_lights=view.lights)
+
+
+def _write_camera(view: _Subject, camera: str, fit: FaceFit, header: StackHeader, folder: Path) -> np.ndarray:
+    """Write a camera's stack and fit; give its tiles [6, h, w, 3] of the sheet."""
+    shown: dict[int, np.ndarray] = dict.fromkeys(lights_shown(header.directions), header.source)
+    crops = _crops(view, camera, fit.crop, header, shown)
+    write_olat_stack(stack_path(folder, view.name, camera), header, crops)
+    with atomic_path(fit_path(folder, view.name, camera)) as temporary:
         save_fit(temporary, fit)
-    return sheet_tiles(header, fit, model, shown)
+    return sheet_tiles(header, fit, view.model, shown)
 
 
 def _crops(
-    capture: Capture, subject: str, camera: str, crop: Crop, header: StackHeader, shown: dict[int, np.ndarray]
+    view: _Subject, camera: str, crop: Crop, header: StackHeader, shown: dict[int, np.ndarray]
 ) -> Iterator[Tensor]:
-    """A camera's pictures in the crop [1, 3, S, S], one by one; `shown` keeps those whose numbers it has.
+    """A camera's pictures in the crop [1, 3, S, S], one by one; `shown` keeps those whose places it has.
 
     The header's source fills up on the way; `write_olat_stack` writes it last. Only here, where the crop has
     averaged noise, do values below the black level become 0.
     """
     clipped = 0
-    for light, weight in enumerate(constant_weights(header.directions)):
-        picture = np.maximum(crop.apply(capture.frame(subject, camera, light)), 0)
+    for place, weight in enumerate(constant_weights(header.directions)):
+        picture = np.maximum(crop.apply(view.capture.frame(view.name, camera, view.lights[place])), 0)
         np.add(header.source, weight * picture, out=header.source)
-        if light in shown:
-            shown[light] = picture
+        if place in shown:
+            shown[place] = picture
         clipped += int((picture > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(picture).permute(2, 0, 1)[None]
-    _say_what_halves_lose(f"{subject}/{camera}", clipped, float(header.source.max()))
+    _say_what_halves_lose(f"{view.name}/{camera}", clipped, float(header.source.max()))
 
 
 def _say_what_halves_lose(name: str, clipped: int, lit: float) -> None:

@@ -39,7 +39,7 @@ class Pair:
     rotate_deg: float
     exposure_ev: int
     target_camera: str
-    target_light: int  # of the rig, from 0
+    target_light: int  # the part of the target camera's stack, from 0
 
     @staticmethod
     def from_row(row: dict[str, object]) -> "Pair":
@@ -62,7 +62,7 @@ def draw_pairs(dataset: Dataset, maps: Sequence[str], per_subject: int, seed: in
 
 
 def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, index: int) -> Pair:
-    """A function of (seed, subject, index), the subject's cameras and the list of maps."""
+    """A function of (seed, subject, index), the subject's cameras and lights, and the list of maps."""
     name = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:8], "little")
     random = np.random.default_rng([seed, name, index])
     cameras = dataset.cameras[subject]
@@ -78,7 +78,7 @@ def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, in
         rotate_deg=round(float(random.uniform(0, 360)), 2),
         exposure_ev=0,
         target_camera=source if same else others[int(random.integers(len(others)))],
-        target_light=int(random.integers(len(dataset.light_ids))),
+        target_light=int(random.integers(len(dataset.lights_of(subject)))),
     )
 
 
@@ -118,7 +118,7 @@ def _check_pair(dataset: Dataset, pair: Pair) -> None:
         raise ValueError("another dataset's cameras")
     if pair.split != dataset.split_of(pair.subject):
         raise ValueError("another split's subject")
-    if not 0 <= pair.target_light < len(dataset.light_ids) or pair.index < 0:
+    if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)) or pair.index < 0:
         raise ValueError("a number that cannot be")
     if not math.isfinite(pair.rotate_deg):
         raise ValueError("an angle that cannot be")
