@@ -20,7 +20,7 @@ BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 _MAX_COEFFICIENTS = 500
 _MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
-_DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
+DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True, eq=False)  # caches know it by identity
@@ -104,7 +104,7 @@ def _read(path: Path) -> MorphableModel:
         require_bounded(path)
         with np.load(path, allow_pickle=False) as file:
             return _from_arrays(path, {key: file[key] for key in file.files})
-    except _DAMAGED as error:
+    except DAMAGED as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
         raise InputError(
             f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"

@@ -33,13 +33,24 @@ _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 log = logging.getLogger(LOGGER_NAME)
 
 
+def file_sha256(path: Path) -> str:
+    """A file's SHA-256 in 64 hex digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 @dataclass(frozen=True)
 class Published:
-    """A file that someone publishes: its address, its digest in 64 hex digits, the most bytes it may have."""
+    """A file that someone publishes: its address, its digest in 64 hex digits, the most bytes it may have.
+
+    `digest` is what of the file has that digest: of an archive that its server packs anew now and then, such
+    as GitHub's, the contents (a damaged file's digest may be any other text).
+    """
 
     url: str
     sha256: str
     size_limit: int
+    digest: Callable[[Path], str] = file_sha256
 
     @property
     def name(self) -> str:
@@ -197,10 +208,7 @@ def _progress(name: str, begin: int, total: int | None) -> Iterator[Callable[[in
 
 
 def _is_whole(published: Published, path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() == published.sha256
+    return path.is_file() and published.digest(path) == published.sha256
 
 
 def _size(path: Path) -> int:

@@ -1,6 +1,8 @@
 """ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020)."""
 
+import hashlib
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -33,22 +35,39 @@ _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 
 def read_ict_facekit(path: Path) -> SourceModel:
     """ICT Face Model Light as its authors publish it: `FaceXModel/*.obj` in a folder, a .zip or a .tar.xz."""
-    raw: dict[str, bytes] = {}
-    try:
-        for name, read in members(path):
-            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
-                raw[found[1]] = read(_MAX_OBJ_BYTES + 1)
-                if len(raw[found[1]]) > _MAX_OBJ_BYTES or sum(map(len, raw.values())) > _MAX_BYTES:
-                    raise InputError(f"{path}: {name} is too large; this is not ICT-FaceKit")
-    except DAMAGED as error:
-        raise InputError(
-            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
-        ) from None
+    raw = dict(_objs(path))
     if "generic_neutral_mesh" not in raw:
         raise InputError(
             f"{path}: no FaceXModel/generic_neutral_mesh.obj in it; give ICT-FaceKit's folder or archive"
         )
     return ict_source(path, raw)
+
+
+def ict_content_sha256(path: Path) -> str:
+    """What `sha256sum *.obj | LC_ALL=C sort -k2 | sha256sum` prints in FaceXModel; '' if it is damaged."""
+    try:
+        digests = {f"{stem}.obj": hashlib.sha256(text).hexdigest() for stem, text in _objs(path)}
+    except InputError:
+        return ""
+    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
+    """The .obj files by their stems; an InputError where they cannot be read or are too large."""
+    total = 0
+    try:
+        for name, read in members(path):
+            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+                text = read(_MAX_OBJ_BYTES + 1)
+                total += len(text)
+                if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
+                    raise InputError(f"{path}: {name} is too large; this is not ICT-FaceKit")
+                yield found[1], text
+    except DAMAGED as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
+        ) from None
 
 
 def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:

@@ -1,17 +1,14 @@
 """Arrays of other people's .npz files, without pickles and with bounds."""
 
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.morphable import require_bounded
+from facerf_cli.face.morphable import DAMAGED, require_bounded
 from facerf_cli.files.inert_arrays import InertArray
 from facerf_cli.records import one_line
-
-_DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
 
 
 def read_npz(path: Path) -> dict[str, InertArray]:
@@ -22,7 +19,7 @@ def read_npz(path: Path) -> dict[str, InertArray]:
         require_bounded(path)
         with np.load(path, allow_pickle=False) as file:
             return {key: InertArray(file[key]) for key in file.files}
-    except _DAMAGED as error:
+    except DAMAGED as error:
         raise InputError(
             f"{path}: cannot be read ({one_line(str(error))[:160]}); an .npz of plain arrays is wanted"
         ) from None

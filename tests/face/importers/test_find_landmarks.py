@@ -1,0 +1,60 @@
+"""Landmarks found by the shape of a face, against those that ICT-FaceKit's authors name."""
+
+import numpy as np
+import pytest
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.importers.basel_2017 import _LANDMARKS
+from facerf_cli.face.importers.find_landmarks import find_landmarks
+from facerf_cli.face.importers.ict import LANDMARK_IDS
+from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.topology import MIRROR_68
+from tests.face.importers.heads import head
+
+
+@pytest.fixture(scope="module")
+def someone(ict_source: SourceModel) -> np.ndarray:
+    """A person that the built-in model has not seen [N, 3]."""
+    return ict_source.mean + 1.5 * ict_source.identity[0] - 1.5 * ict_source.identity[1]
+
+
+@pytest.mark.parametrize(
+    ("named", "mean_mm", "most_mm"), [((), 1.5, 4.0), (tuple(_LANDMARKS.values()), 1.2, 3.0)]
+)
+def test_they_lie_where_the_authors_see_them(
+    ict_source: SourceModel, someone: np.ndarray, named: tuple[int, ...], mean_mm: float, most_mm: float
+) -> None:
+    truth = someone[LANDMARK_IDS]
+    found = find_landmarks(someone, ict_source.triangles, {number: truth[number] for number in named})
+    off_mm = 1000 * np.linalg.norm(found - truth, axis=-1)
+    others = [number for number in range(68) if number not in named]
+    print(f"{off_mm[others].mean():.2f} mm on average, {off_mm[others].max():.2f} at most")
+    assert off_mm[others].mean() < mean_mm and off_mm[others].max() < most_mm
+    assert not off_mm[list(named)].any()
+
+
+def test_a_face_that_is_turned_is_found_by_a_few_names() -> None:
+    face = head(70, 70, turn_deg=50)
+    known = {number: face.landmarks[number] for number in (8, 30, 36, 45)}
+    off_mm = 1000 * np.linalg.norm(find_landmarks(face.mean, face.triangles, known) - face.landmarks, axis=-1)
+    assert off_mm.mean() < 1.0
+
+
+def test_the_winding_of_triangles_does_not_matter() -> None:
+    face = head(70, 70)
+    found = [find_landmarks(face.mean, face.triangles[:, order], {}) for order in ([0, 1, 2], [0, 2, 1])]
+    np.testing.assert_allclose(*found, atol=1e-5)
+
+
+def test_a_mirrored_face_has_mirrored_landmarks() -> None:
+    face = head(70, 70)
+    flip = np.array([-1.0, 1, 1])
+    found, mirrored = (find_landmarks(mean, face.triangles, {}) for mean in (face.mean, face.mean * flip))
+    assert np.linalg.norm(mirrored[MIRROR_68] * flip - found, axis=-1).mean() < 0.0007
+
+
+def test_where_no_face_is_none_is_found() -> None:
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.1, 0.1, 40))
+    plane = np.stack([x.ravel(), np.zeros(x.size), y.ravel()], -1)
+    with pytest.raises(InputError, match="no face is found"):
+        find_landmarks(plane, head(40, 40).triangles, {})
