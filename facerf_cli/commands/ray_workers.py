@@ -114,7 +114,7 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         raise UsageError(f"--ray {address}: {_first_sentence(error)}") from error
     finally:
         signal.signal(signal.SIGTERM, ours)  # Ray sets one of its own
-    # A thread of Ray's tells standard output, which is for results, of workers that died; so do we, elsewhere.
+    # A thread of Ray's tells standard output, which is for results, of workers that died; so do we.
     importlib.import_module("ray._private.worker").print_to_stdstream = lambda *_, **__: None
 
 
