@@ -31,9 +31,9 @@ class Selection:
         """What is left out, for a line; empty where nothing is."""
         parts = []
         if self.left_out:
-            parts.append(f"{len(self.left_out)} lights left out ({_some(self.left_out)})")
+            parts.append(f"{_count(self.left_out, 'light')} left out ({_some(self.left_out)})")
         if self.dropped:
-            parts.append(f"{len(self.dropped)} cameras left out ({_some(self.dropped)})")
+            parts.append(f"{_count(self.dropped, 'camera')} left out ({_some(self.dropped)})")
         return ", ".join(parts)
 
 
@@ -94,6 +94,10 @@ def is_mended(capture: Capture, subject: str, missing: Iterable[str]) -> bool:
     """Whether any of the frames, as in `Selection.missing`, has come since."""
     frames = (name.split("/") for name in missing)
     return any(capture.frame_path(subject, camera, light).is_file() for camera, light in frames)
+
+
+def _count(things: Mapping[str, str], word: str) -> str:
+    return f"1 {word}" if len(things) == 1 else f"{len(things)} {word}s"
 
 
 def _some(reasons: Mapping[str, str]) -> str:
