@@ -16,6 +16,7 @@ from facerf_cli.files.images import read_image
 from facerf_cli.stage.data.layouts import Capture
 
 _FACE_PX = 512  # the longer side of the picture that the face is found on
+_BRIGHT = 0.2  # of the brightest blocks
 _AT_THE_TOP = 1 - 1e-5  # of a frame's maximum: what a clipped value may lose in arithmetic
 
 
@@ -27,7 +28,7 @@ class FrameFigures:
     highest: float  # of all values
     share_highest: float  # of the pixels that have the highest value in some channel
     spread: float  # highest less lowest
-    comb: float  # how odd and even rows differ, over the mean
+    comb: float  # how odd and even rows differ, over what they have in common
     comb_ratio: float  # over how odd and even columns differ
 
 
@@ -133,29 +134,34 @@ def _measure(pixels: np.ndarray) -> FrameFigures:
     """Figures of a full picture [H, W, 3]."""
     highest, grey = float(pixels.max()), pixels.mean(-1)
     rows, columns = comb(grey), comb(grey.T)
-    mean = max(float(grey.mean()), 1e-9)
     top = (pixels >= highest * _AT_THE_TOP).any(-1) if highest > 0 else np.zeros(1)
     return FrameFigures(
-        digest=hashlib.sha256(np.ascontiguousarray(pixels)).hexdigest(),
+        digest=hashlib.sha256(pixels.tobytes()).hexdigest(),
         highest=highest,
         share_highest=float(top.mean()),
         spread=highest - float(pixels.min()),
-        comb=rows / mean,
-        comb_ratio=rows / max(columns, 1e-6 * mean),
+        comb=rows,
+        comb_ratio=rows / max(columns, 1e-6),
     )
 
 
 def comb(grey: np.ndarray) -> float:
-    """How much odd rows of a picture [H, W] differ from even ones, the mean over blocks of 8 x 4 pixels.
+    """How much odd rows of a picture [H, W] differ from even ones, over their mean, in the median bright block.
 
     A row's departure from the mean of its neighbours, its sign turned every other row, adds up over a block
-    only if rows alternate. Blocks are small, for pictures scaled or turned after they were taken alternate in
-    step for a few rows only.
+    of 8 x 4 pixels only if rows alternate. Blocks are small, for pictures scaled or turned after they were
+    taken alternate in step for a few rows only.
     """
     departure = grey[1:-1] - (grey[:-2] + grey[2:]) / 2
     departure = departure * np.where(np.arange(len(departure)) % 2, -1, 1)[:, None]
-    height, width = departure.shape[0] // 8, departure.shape[1] // 4
-    if not height or not width:
+    if len(departure) < 8 or departure.shape[1] < 4:
         return 0.0
-    blocks = departure[: height * 8, : width * 4].reshape(height, 8, width, 4).mean((1, 3))
-    return float(np.abs(blocks).mean())
+    mean = _blocks(grey[1:-1])
+    bright = mean > max(_BRIGHT * float(np.percentile(mean, 95)), 0)
+    return float(np.median(np.abs(_blocks(departure))[bright] / mean[bright])) if bright.any() else 0.0
+
+
+def _blocks(plane: np.ndarray) -> np.ndarray:
+    """Means of whole blocks of 8 x 4 pixels."""
+    height, width = plane.shape[0] // 8, plane.shape[1] // 4
+    return plane[: height * 8, : width * 4].reshape(height, 8, width, 4).mean((1, 3))

@@ -21,6 +21,7 @@ _LEAST_PEAK = 0.5  # of a perfect match: below it the frame's own shadows decide
 _IN_FRONT = 0.3  # cosine of lamp and camera axis: others leave most of the face dark
 # Without motion, synthetic frames are found moved by 0.2 small pixels in the median and 0.5 at most.
 _MOVED_PX = 1.0
+_LEAST_GAIN = 0.1  # of a perfect match: what a shift that far must win
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +37,11 @@ def measure_motion(frames: CameraFrames, stereo: Stereo) -> Motion:
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
     front = frames.directions[:, 2] > _IN_FRONT
-    moved, peaks = np.zeros((len(front), 2)), np.zeros(len(front))
+    moved, peaks, gain = np.zeros((len(front), 2)), np.zeros(len(front)), np.zeros(len(front))
     for row in np.flatnonzero(front):
-        moved[row], peaks[row] = register(orientation(frames.grey[row]), orientation(predicted[row]))
+        seen, guess = (orientation(picture) * stereo.lit for picture in (frames.grey[row], predicted[row]))
+        moved[row], peaks[row], gain[row] = register(seen, guess)
+    moved[(gain < _LEAST_GAIN) & (np.hypot(*moved.T) > _MOVED_PX)] = 0
     trusted = front & (peaks > _LEAST_PEAK)
     return Motion(np.where(trusted[:, None], moved, 0), trusted)
 
@@ -52,8 +55,11 @@ def orientation(picture: np.ndarray) -> np.ndarray:
     return (right + 1j * down) / (length + np.percentile(length, 60) + 1e-12)
 
 
-def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float]:
-    """How far one orientation field lies from another [2] (down, right), and how well they match in 0..1."""
+def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """How far one orientation field lies from another [2] (down, right); how well they match then, in 0..1.
+
+    The last figure is how much better that is than without a shift.
+    """
     height, width = moved.shape
     window = np.outer(np.hanning(height), np.hanning(width))
     a, b = moved * window, still * window
@@ -64,7 +70,7 @@ def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float]:
     norm = np.sqrt((np.abs(a) ** 2).sum() * (np.abs(b) ** 2).sum()) + 1e-12
     row, column = (int(index) for index in np.unravel_index(near.argmax(), near.shape))
     shift = np.array([_vertex(near[:, column], row), _vertex(near[row], column)]) - reach
-    return shift, float(near[row, column] / norm)
+    return shift, float(near[row, column] / norm), float((near[row, column] - near[reach, reach]) / norm)
 
 
 def _vertex(values: np.ndarray, place: int) -> float:

@@ -17,6 +17,7 @@ _BRIGHT_SHARE = 0.2  # of a pixel's brightest frames: what is darker is taken fo
 _LIT_SHARE = 0.1  # of the brightest pixels: what never gets as bright is background
 _BEHIND = -0.5  # cosine to the camera's axis: the head is in the way of lamps further behind
 _BELOW = -0.7  # sine of elevation: the body is in the way of lamps further below
+_ABOVE, _OVERHEAD = 0.85, 0.3  # and hair or brow in that of lamps further above that are not in front as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +43,9 @@ class Stereo:
 
 
 def reaches_face(directions: np.ndarray) -> np.ndarray:
-    """Which lamps [L, 3], in camera space, neither the head nor the body can hide from the face [L]."""
-    return (directions[:, 2] > _BEHIND) & (directions[:, 1] > _BELOW)
+    """Which lamps [L, 3], in camera space, neither head, hair nor body can hide from the face [L]."""
+    _, up, front = directions.T
+    return (front > _BEHIND) & (up > _BELOW) & ~((up > _ABOVE) & (front < _OVERHEAD))
 
 
 def lit_pixels(grey: np.ndarray) -> np.ndarray:
