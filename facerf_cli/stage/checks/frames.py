@@ -92,8 +92,8 @@ def read_frames(
             continue
         places.append(place)
         figures.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
-        greys.append(_small(pixels, size))
-        lit += _small(pixels, lit_size)
+        greys.append(small(pixels, size))
+        lit += small(pixels, lit_size)
     rows = np.array(places, int)
     frames = CameraFrames(
         subject=subject,
@@ -124,7 +124,7 @@ def _decodes(capture: Capture, subject: str, camera: str, light: str) -> bool:
     return True
 
 
-def _small(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def small(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """The mean of the channels, each small pixel the mean of its area."""
     grey = torch.from_numpy(pixels.mean(-1, dtype=np.float32))
     return F.interpolate(grey[None, None], size, mode="area")[0, 0].numpy()
@@ -146,7 +146,7 @@ def _measure(pixels: np.ndarray) -> FrameFigures:
 
 
 def comb(grey: np.ndarray) -> float:
-    """How much odd rows of a picture [H, W] differ from even ones, over their mean, in the median bright block.
+    """How much odd rows of a picture [H, W] differ from even ones, over their mean, median of bright blocks.
 
     A row's departure from the mean of its neighbours, its sign turned every other row, adds up over a block
     of 8 x 4 pixels only if rows alternate. Blocks are small, for pictures scaled or turned after they were

@@ -11,13 +11,13 @@ _NO_LAMP = ("ambient", "dark", "black", "room", "background")  # frames that sta
 
 
 def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Finding]:
-    """Frames of a camera that are missing, one by one, or the whole camera; extra files in one warning."""
+    """Frames of a camera that are missing, one by one; a whole camera, or extra files, in one warning."""
     paths = {light: capture.frame_path(subject, camera, light) for light in capture.light_ids}
-    missing = [light for light, path in paths.items() if not path.exists()]
+    missing = [light for light, path in paths.items() if not path.is_file()]
     if len(missing) == len(paths):
         example = next(iter(paths.values()))
-        words = f"no frame of this camera is there ({example}, ...); mend the pattern or the folder"
-        yield Finding("error", "missing", subject, words, camera)
+        words = f"no frame of this camera is there ({example}, ...); is the pattern right?"
+        yield Finding("warning", "missing", subject, words, camera)
         missing = []
     for light in missing:
         yield Finding("error", "missing", subject, f"{paths[light]}: no such file", camera, light, {}, True)

@@ -10,6 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from facerf_cli.stage.checks.frames import CameraFrames
+
+_LEAST_FRAMES = 8  # fewer say nothing of what another should look like
+_LEAST_LIT_PX = 100
 _ROUNDS = 6
 _RIDGE = 1e-3
 _LEAST_COSINE = 0.15  # of lamp and normal: nearer to grazing, matt is no good model
@@ -69,3 +73,11 @@ def photometric_stereo(values: np.ndarray, directions: np.ndarray, lit: np.ndarr
         facing = directions @ fitted[:, :3].T > _LEAST_COSINE * np.linalg.norm(fitted[:, :3], axis=1)
         weights = facing / (1 + (residual / (2 * spread)) ** 2)
     return Stereo(fitted[:, :3], np.maximum(fitted[:, 3], 0), lit)
+
+
+def fit_stereo(frames: CameraFrames) -> Stereo | None:
+    """Photometric stereo of the frames; None where they are too few, or nothing is lit."""
+    lit = lit_pixels(frames.grey) if len(frames.light_ids) >= _LEAST_FRAMES else np.zeros((1, 1), bool)
+    if lit.sum() < _LEAST_LIT_PX:
+        return None
+    return photometric_stereo(frames.grey[:, lit].astype(float), frames.directions, lit)

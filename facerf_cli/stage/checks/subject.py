@@ -3,8 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
+from facerf_cli.stage.checks.additivity import added_exponent
 from facerf_cli.stage.checks.black import check_black
 from facerf_cli.stage.checks.clipped import check_clipped
 from facerf_cli.stage.checks.duplicates import check_duplicates, same_frames, seen_before
@@ -17,12 +16,10 @@ from facerf_cli.stage.checks.missing import check_missing
 from facerf_cli.stage.checks.motion import check_motion
 from facerf_cli.stage.checks.order import check_frames_order, check_rig, check_rig_roughly
 from facerf_cli.stage.checks.readable import check_readable
-from facerf_cli.stage.checks.stereo import Stereo, lit_pixels, photometric_stereo
+from facerf_cli.stage.checks.stereo import Stereo, fit_stereo
 from facerf_cli.stage.checks.unlit import check_unlit
 from facerf_cli.stage.data.layouts import Capture
 
-_LEAST_FRAMES = 8  # fewer say nothing of what another should look like
-_LEAST_LIT_PX = 100
 _FACE_TRIES = 3  # cameras that are searched for the face; each costs a second or more where there is none
 
 
@@ -91,7 +88,8 @@ class _Checks:
         if not found:  # otherwise normals are not to be trusted
             self._look_at_rig(frames, stereo, found)
         found += check_motion(frames.less(left_out(found)), stereo)
-        curve = fit_exponent(frames.less(left_out(found)), stereo.lit)
+        curve = added_exponent(self.capture, frames)
+        curve = curve or fit_exponent(frames.less(left_out(found)), stereo.lit)
         self.curves += [] if curve is None else [curve]
         return found
 
@@ -111,11 +109,3 @@ class _Checks:
 def left_out(findings: Iterable[Finding]) -> set[str]:
     """The lights whose frames are broken, of one camera's findings."""
     return {found.light for found in findings if found.leaves_out}
-
-
-def fit_stereo(frames: CameraFrames) -> Stereo | None:
-    """Photometric stereo of the frames; None where they are too few, or nothing is lit."""
-    lit = lit_pixels(frames.grey) if len(frames.light_ids) >= _LEAST_FRAMES else np.zeros((1, 1), bool)
-    if lit.sum() < _LEAST_LIT_PX:
-        return None
-    return photometric_stereo(frames.grey[:, lit].astype(float), frames.directions, lit)

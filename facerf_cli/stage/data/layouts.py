@@ -34,6 +34,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
 from facerf_cli.stage.data.documents import Node, read_document, unique_ids
+from facerf_cli.stage.data.moved import moved
 
 STAGE_FILE, STAGE_FORMAT = "stage.json", "facerf-stage-1"
 MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
@@ -64,6 +65,8 @@ class Capture:
     )
     subtract_ambient: bool = False
     marked: Mapping[str, frozenset[str]] = field(default_factory=dict)  # ids of lights that it gives up
+    # Pixels down and right that take a frame back to where the head was, by subject, camera and light.
+    shifts: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
         """The picture of a subject seen by a camera under one light."""
@@ -85,7 +88,8 @@ class Capture:
             )
         ambient = self.ambient(subject, camera) if self.subtract_ambient else None
         dark = np.float32(self.black_level) if ambient is None else ambient
-        return (pixels - dark) / self.intensities[light].astype(np.float32)
+        shift_px = self.shifts.get((subject, camera, self.light_ids[light]), (0.0, 0.0))
+        return moved((pixels - dark) / self.intensities[light].astype(np.float32), *shift_px)
 
     def ambient(self, subject: str, camera: str) -> np.ndarray | None:
         """A subject without any lamp [H, W, 3], black level included; None where none has the right size."""
