@@ -96,7 +96,7 @@ class _FitGeometry:
         overlay = draw_fit(picture.pixels, face.fit, face_model(self.photo))
         write_display(path("_overlay.jpg"), overlay, metadata=metadata)
         with atomic_path(path("_fit.npz")) as temporary:
-            save_fit(temporary, face.fit)
+            save_fit(temporary, face.fit, metadata)
 
     def _mesh(self, face: FittedFace, texture_srgb: "np.ndarray", metadata: dict[str, Any]) -> "TexturedMesh":
         """The fitted mesh in the head's own frame; the fit holds its pose."""

@@ -223,10 +223,10 @@ def fit_from_arrays(arrays: Mapping[str, np.ndarray]) -> FaceFit:
     return FaceFit(str(arrays["model"]), crop, error_iod=error_iod, **tensors)
 
 
-def save_fit(path: Path, fit: FaceFit) -> None:
-    """Write a fit as .npz without pickles."""
+def save_fit(path: Path, fit: FaceFit, metadata: Mapping[str, str | int] | None = None) -> None:
+    """Write a fit as .npz without pickles; `metadata` beside it, such as where it comes from."""
     with path.open("wb") as file:
-        np.savez(file, **fit_to_arrays(fit))  # type: ignore[arg-type]
+        np.savez(file, **{**(metadata or {}), **fit_to_arrays(fit)})  # type: ignore[arg-type]
 
 
 def load_fit(path: Path) -> FaceFit:

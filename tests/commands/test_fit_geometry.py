@@ -49,6 +49,12 @@ def fit_of(fitted: Path) -> FaceFit:
     return load_fit(fitted / "astronaut_fit.npz")
 
 
+def test_the_fit_says_whose_model_it_is_of(fitted: Path) -> None:
+    with np.load(fitted / "astronaut_fit.npz", allow_pickle=False) as file:
+        assert str(file["facerf:face_model"]) == str(file["model"]) == "builtin"
+        assert str(file["facerf:face_model_licence"]) == load_face_model().licence
+
+
 @pytest.mark.parametrize("kind", ["glb", "obj"])
 def test_the_mesh_seen_by_the_fit_is_the_photo(fitted: Path, kind: str) -> None:
     fit = fit_of(fitted)
