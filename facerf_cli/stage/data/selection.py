@@ -28,10 +28,10 @@ class Selection:
     missing: tuple[str, ...] = ()  # camera/light of the frames that are not there
 
     def in_words(self) -> str:
-        """What is left out, for a line; empty where nothing is."""
+        """What is left out without being marked, for a line; empty where nothing is."""
         parts = []
-        if self.left_out:
-            parts.append(f"{_count(self.left_out, 'light')} left out ({_some(self.left_out)})")
+        if lights := {light: why for light, why in self.left_out.items() if MARKED not in why}:
+            parts.append(f"{_count(lights, 'light')} left out ({_some(lights)})")
         if self.dropped:
             parts.append(f"{_count(self.dropped, 'camera')} left out ({_some(self.dropped)})")
         return ", ".join(parts)

@@ -1,5 +1,6 @@
 """A tiny prepared dataset without its capture: built-in heads by Lambert's law, fits of the true geometry."""
 
+from collections.abc import Collection, Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -38,11 +39,12 @@ def write_small_dataset(
     lights: int = 20,
     crop_px: int = 64,
     seed: int = 0,
+    lacking: Mapping[str, Collection[int]] | None = None,
 ) -> Dataset:
     """Write `counts` subjects for training, validation and test, and read the dataset back.
 
     Every subject has its own shape and skin, and is exactly where its fit says; no shadows. The world is the
-    head's own frame.
+    head's own frame. Subjects in `lacking` have stacks without those lights.
     """
     model = load_face_model()
     generator = torch.Generator().manual_seed(seed)
@@ -50,12 +52,14 @@ def write_small_dataset(
     subjects = [f"{index:04d}" for index in range(sum(counts))]
     ids = [f"C{index}" for index in range(cameras)]
     turns = [pose_to_rotation(yaw_deg, 0, 0) for yaw_deg in YAW_DEG[:cameras]]
+    lacks = {subject: (lacking or {}).get(subject, ()) for subject in subjects}
+    kept = {subject: [i for i in range(lights) if i not in lacks[subject]] for subject in subjects}
     for subject in subjects:
         alpha = 0.4 * torch.randn(len(model.identity), generator=generator)
         albedo = draw_skin(1, 128, generator).albedo[0]
         for camera, rotation in zip(ids, turns, strict=True):
             fit = _true_fit(model, alpha, rotation, crop_px)
-            _write_one(folder, subject, camera, model, fit, albedo, world)
+            _write_one(folder, subject, camera, model, fit, albedo, world[kept[subject]])
     ends = np.cumsum([0, *counts]).tolist()
     parts = zip(SPLITS, pairwise(ends), strict=True)
     content = {
@@ -74,7 +78,11 @@ def write_small_dataset(
         "cameras": [{"id": camera} for camera in ids],
         "normalisation": {"from": "lin_rec709", "to": "lin_rec709", "black_level": 0.0},
         "splits": {split: subjects[first:last] for split, (first, last) in parts},
-        "subjects": {subject: {"status": "done", "traits": {}, "cameras": ids} for subject in subjects},
+        "subjects": {
+            subject: {"status": "done", "traits": {}, "cameras": ids}
+            | ({"lights": [f"L{index:03d}" for index in kept[subject]]} if lacks[subject] else {})
+            for subject in subjects
+        },
         "provenance": {"synthetic": True},
     }
     write_document(folder / DATASET_FILE, content)

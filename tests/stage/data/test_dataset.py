@@ -62,6 +62,12 @@ def changed(small: Path, folder: Path, change: dict[str, Any]) -> Path:
     return folder
 
 
+def lights_said(lights: list[str]) -> dict[str, Any]:
+    """A change: the lights that a subject is said to have."""
+    subjects = {"0000": {"status": "done", "cameras": ["C0"], "lights": lights}}
+    return {"subjects": subjects, "splits": {"train": [], "validation": [], "test": []}}
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -76,6 +82,9 @@ def changed(small: Path, folder: Path, change: dict[str, Any]) -> Path:
         ({"subjects": {"0000": {"status": "done", "cameras": ["C7"]}}}, "C7"),
         ({"subjects": {"0000": {"status": "done", "cameras": []}}}, "a camera at least"),
         ({"subjects": []}, "an object"),
+        (lights_said(["L001", "L000"]), "its order"),
+        (lights_said(["L099"]), "rig's lights"),
+        (lights_said([]), "rig's lights"),
     ],
 )
 def test_what_is_wrong_is_said(small: Path, tmp_path: Path, change: dict[str, Any], said: str) -> None:
