@@ -205,3 +205,11 @@ def test_what_holds_no_numbers_says_so(tmp_path: Path) -> None:
     for value in ({"a": OrderedDict(b=1)}, {"a": "text"}, {"a": None}, {"a": {1, 2}}):
         with pytest.raises(ValueError, match="where numbers should"):
             array_of(read_inert_pickle(written(tmp_path / "a.pkl", pickle.dumps(value)))["a"])
+
+
+def test_an_operation_of_chumpy_is_kept_but_not_worked_out(tmp_path: Path) -> None:
+    data = b"\x80\x02}X\x01\x00\x00\x00acchumpy.reordering\nSelect\n)\x81}X\x01\x00\x00\x00xK\x01sbs."
+    found = read_inert_pickle(written(tmp_path / "a.pkl", data))
+    assert found["a"].name == "chumpy.reordering.Select" and found["a"].state == {"x": 1}
+    with pytest.raises(ValueError, match=r"a chumpy\.reordering\.Select stands where numbers should"):
+        array_of(found["a"])

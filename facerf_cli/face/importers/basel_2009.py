@@ -20,7 +20,7 @@ from facerf_cli.records import one_line
 _MAX_BYTES, _MAX_ENTRIES, _MAX_SHAPES = 1 << 30, 120_000_000, 500
 _LICENCE = "Basel Face Model 2009, (c) University of Basel; non-commercial use, by its licence agreement"
 _NAMES = ("shapeMU", "shapePC", "shapeEV", "tl")
-_NUMBERS = ("single", "double", "int32", "uint32", "int64", "uint64")
+_NUMBERS = ("single", "double", "int16", "uint16", "int32", "uint32", "int64", "uint64")
 _DAMAGED = (
     NotImplementedError,
     ValueError,

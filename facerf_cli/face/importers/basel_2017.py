@@ -139,11 +139,11 @@ def _known(file: Any, mean: np.ndarray, shift: np.ndarray) -> dict[int, np.ndarr
         dataset = _dataset(file, "metadata/landmarks/json")
     except ValueError:
         return {}
-    if dataset.size != 1 and dataset.nbytes > _MAX_TEXT:
+    if dataset.nbytes > _MAX_TEXT:
         raise ValueError("metadata/landmarks/json is too long")
-    text = np.asarray(dataset[()]).tobytes() if dataset.dtype.kind in "Su" else dataset[()]
+    text = dataset[()]
     known = {}
-    for entry in json.loads(text.decode("utf-8") if isinstance(text, bytes) else text):
+    for entry in json.loads(text if isinstance(text, (str, bytes)) else np.asarray(text).tobytes()):
         number = _LANDMARKS.get(str(entry["id"]))
         point = np.array(entry["coordinates"], dtype=np.float64) / 1000
         if number is None or point.shape != (3,) or not np.isfinite(point).all():
