@@ -29,7 +29,7 @@ from facerf_cli.light.refine import RefinedLight, refine_light
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.features import Layered
-from facerf_cli.network.inputs import exposure_of
+from facerf_cli.network.inputs import colour_cast, exposure_of
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.saved import load_networks
 from facerf_cli.raster.camera import Camera
@@ -241,7 +241,9 @@ def predict_olat(
     batch = max(1, min(most, memory_bytes // bytes_per_light))
     normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
     normals = normals[None].to(device)
-    source = (face.texture[None], face.normals[None], face.visible[None, None])
+    visible = face.visible[None, None]
+    texture = face.texture[None] / colour_cast(face.texture[None], visible)
+    source = (texture, face.normals[None], visible)
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
         encoded = models.network.encode(*(tensor.to(device) for tensor in source))
     for chunk in torch.split(lights, batch):

@@ -7,6 +7,10 @@ from torch import Tensor
 MEAN_RADIANCE = 0.25  # of the visible face after exposure is taken out
 _LIT = 0.02  # keeps the root's slope finite in the dark
 
+# Of log(red / green) and log(blue / green) of training's sources, each face's mean: 192 draws of a bank.
+_CAST_MEAN, _CAST_COVARIANCE = (0.318, -0.214), ((0.094, -0.038), (-0.038, 0.081))
+_ORDINARY_CAST = 2.0  # standard deviations, within which a cast is left to the network
+
 
 def to_root(radiance: Tensor) -> Tensor:
     """What the default form predicts and its loss compares: nearly the square root, 0 at 0."""
@@ -26,6 +30,24 @@ def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
     radiance = (texture.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
     exposure = radiance / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) / MEAN_RADIANCE
     return exposure.clamp_min(1e-6)
+
+
+def colour_cast(texture: Tensor, visible: Tensor) -> Tensor:
+    """What to divide linear textures [B, 3, T, T] by, where light has coloured them beyond training's photos.
+
+    [B, 3, 1, 1], positive; the mean radiance stays. Exactly 1 for ordinary photos and grey ones. A face
+    further from training's mean colour than `_ORDINARY_CAST` is brought inside, by the inverse of its
+    distance: the stranger the colour, the surer it is the light's. visible [B, 1, T, T] in 0..1.
+    """
+    mean = ((texture * visible).sum((2, 3)) / visible.sum((2, 3)).clamp_min(1e-6)).clamp_min(1e-6).double()
+    chroma = (mean[:, [0, 2]] / mean[:, 1:2]).log() - mean.new_tensor(_CAST_MEAN)
+    spread = torch.linalg.cholesky(mean.new_tensor(_CAST_COVARIANCE))
+    distance = torch.linalg.solve_triangular(spread, chroma.T, upper=False).norm(dim=0)
+    inside = (_ORDINARY_CAST / distance.clamp_min(1e-6)) ** 2
+    excess = chroma * (1 - inside).clamp_min(0)[:, None]
+    cast = torch.stack([excess[:, 0], torch.zeros_like(excess[:, 0]), excess[:, 1]], 1).exp()
+    cast = cast * (mean / cast).mean(1, keepdim=True) / mean.mean(1, keepdim=True)
+    return cast.to(texture)[..., None, None]
 
 
 def resize(x: Tensor, side: int) -> Tensor:
