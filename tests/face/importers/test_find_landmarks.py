@@ -5,10 +5,10 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.basel_2017 import _LANDMARKS
-from facerf_cli.face.importers.find_landmarks import find_landmarks
+from facerf_cli.face.importers.find_landmarks import _missed, find_landmarks
 from facerf_cli.face.importers.ict import LANDMARK_IDS
 from facerf_cli.face.importers.source import SourceModel
-from facerf_cli.face.topology import MIRROR_68
+from facerf_cli.face.topology import LANDMARKS_M, MIRROR_68
 from tests.face.importers.heads import head
 
 
@@ -31,6 +31,15 @@ def test_they_lie_where_the_authors_see_them(
     print(f"{off_mm[others].mean():.2f} mm on average, {off_mm[others].max():.2f} at most")
     assert off_mm[others].mean() < mean_mm and off_mm[others].max() < most_mm
     assert not off_mm[list(named)].any()
+
+
+def test_what_the_known_ones_are_missed_by_moves_their_neighbours_too() -> None:
+    points, shift = LANDMARKS_M, np.array([0.002, -0.001, 0.001])
+    everywhere = _missed(points, {number: points[number] + shift for number in (8, 30, 36, 45, 51)})
+    np.testing.assert_allclose(everywhere, np.broadcast_to(shift, (68, 3)), atol=1e-9)
+    lips = {number: points[number] + shift * (number == 51) for number in (8, 30, 36, 45, 51)}
+    moved = np.linalg.norm(_missed(points, lips), axis=-1) / np.linalg.norm(shift)
+    assert moved[51] == pytest.approx(1) and moved[62] > 0.7 and moved[19] < 0.2
 
 
 def test_a_face_that_is_turned_is_found_by_a_few_names() -> None:
