@@ -28,11 +28,13 @@ LOCAL = "local"
 _ATTEMPTS = 3  # at an item whose workers are lost
 _PATIENCE_S = 10
 _STORE_BYTES = 256 << 20  # of shared memory; what goes through it is settings
-# Before Ray is imported: nothing is sent home or announced, and a wrong address is given up within seconds.
+# Before Ray is imported: nothing is sent home or announced, a wrong address is given up in half a minute, and
+# the workers of this machine are as nice as `--jobs`' are (Ray's own 15 starves them beside other programs).
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_METRICS_COLLECTION": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "1",
+    "RAY_worker_niceness": "0",
     "RAY_NUM_REDIS_GET_RETRIES": "2",
     "RAY_py_gcs_connect_timeout_s": "5",
 }

@@ -108,6 +108,17 @@ def kill_the_victim(notes: Path) -> None:
     os.kill(int((notes / "victim").read_text()), signal.SIGKILL)
 
 
+def ends(process: int) -> bool:
+    """Whether a process that nobody waits for is gone in a while."""
+    for _ in range(300):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
 @needs_ray
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_worker_is_killed_when_it_has_written(
@@ -152,8 +163,7 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
     os.killpg(process.pid, signal.SIGINT)  # what a terminal does
     assert process.communicate(timeout=40)[1].rstrip().endswith("KeyboardInterrupt")
     assert process.returncode != 0 and not list((tmp_path / "out").rglob(".*"))
-    with pytest.raises(ProcessLookupError):
-        os.kill(int((tmp_path / "victim").read_text()), 0)
+    assert ends(int((tmp_path / "victim").read_text()))
 
 
 @needs_ray

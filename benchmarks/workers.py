@@ -1,0 +1,110 @@
+"""Pictures a second of a folder verb by its workers: --jobs 1, --jobs 2, two shards at once, and --ray local.
+
+    python benchmarks/workers.py [--pictures 12] [--rounds 2] [--ways jobs-1 jobs-2 shards ray-1 ray-2]
+
+`facerf relight` of copies of examples/astronaut.jpg under one lamp, as a command each, one thread a worker.
+Two rates: of the whole command, start and end of its workers included; and between its workers' first
+pictures and the last one, which is what a long run comes to. The best of the rounds, which take turns, is
+shown; so is the machine's load before, for other programs' work makes every figure here smaller. All ways
+must leave the same bytes.
+"""
+
+import argparse
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+PHOTO = Path(__file__).parents[1] / "examples" / "astronaut.jpg"
+OPTIONS = ("--light", "30,20", "--exposure", "0")
+WAYS: dict[str, tuple[int, tuple[tuple[str, ...], ...]]] = {  # workers, and the options of each command
+    "jobs-1": (1, (("--jobs", "1"),)),
+    "jobs-2": (2, (("--jobs", "2"),)),
+    "shards": (2, (("--shard", "1/2"), ("--shard", "2/2"))),
+    "ray-1": (1, (("--ray", "local", "--jobs", "1"),)),
+    "ray-2": (2, (("--ray", "local", "--jobs", "2"),)),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A way's times and what it left."""
+
+    whole_s: float
+    steady: float  # pictures a second
+    digest: str
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--pictures", type=int, default=12)
+    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
+    given = parser.parse_args()
+    load = os.getloadavg()[0]
+    machine = f"{os.cpu_count()} processors, load {load:.1f} before"
+    print(f"{given.pictures} pictures, {machine}, best of {given.rounds}", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        photos = Path(folder, "photos")
+        photos.mkdir()
+        for number in range(given.pictures):
+            shutil.copy(PHOTO, photos / f"{number:03d}.jpg")
+        runs: dict[str, list[Run]] = {way: [] for way in given.ways}
+        for _ in range(given.rounds):
+            for way in given.ways:
+                runs[way].append(measure(photos, Path(folder, "out"), way))
+    show(runs, given.pictures)
+
+
+def show(runs: dict[str, list[Run]], pictures: int) -> None:
+    """Print a line a way, and whether all left the same bytes."""
+    print(f"{'way':8s} {'workers':>7s} {'whole s':>8s} {'pictures/s':>11s} {'once started':>13s}")
+    for way, found in runs.items():
+        whole_s, steady = min(run.whole_s for run in found), max(run.steady for run in found)
+        print(f"{way:8s} {WAYS[way][0]:7d} {whole_s:8.1f} {pictures / whole_s:11.3f} {steady:13.3f}")
+    digests = {run.digest for found in runs.values() for run in found}
+    print(
+        "all left the same bytes" if len(digests) == 1 else f"DIFFERENT BYTES: {len(digests)} kinds of trees"
+    )
+
+
+def measure(photos: Path, out: Path, way: str) -> Run:
+    """Run a way's commands at once, and note when each picture is told on standard output."""
+    workers, commands = WAYS[way]
+    shutil.rmtree(out, ignore_errors=True)
+    start_s = time.perf_counter()
+    base = [sys.executable, "-m", "facerf_cli", "relight", str(photos), "-o", str(out), *OPTIONS, "-q"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    with tempfile.TemporaryFile() as told:
+        running = [
+            subprocess.Popen([*base, *options], stdout=told, env=environment, cwd=PHOTO.parents[1])
+            for options in commands
+        ]
+        if any([process.wait() for process in running]):  # all of them: none is left behind
+            sys.exit(f"{way}: failed")
+    whole_s = time.perf_counter() - start_s
+    return Run(whole_s, rate_of(out, workers), digest_of(out))
+
+
+def rate_of(out: Path, workers: int) -> float:
+    """Pictures a second after each worker's first."""
+    done_s: Sequence[float] = sorted(path.stat().st_mtime for path in out.rglob("*.exr"))
+    later = len(done_s) - workers
+    return later / (done_s[-1] - done_s[workers - 1]) if later > 0 else float("nan")
+
+
+def digest_of(out: Path) -> str:
+    """Of every file's place and bytes but the reports', which hold times."""
+    files = sorted(path for path in out.rglob("*") if path.is_file() and path.suffix != ".jsonl")
+    parts = [f"{path.relative_to(out)} {hashlib.sha256(path.read_bytes()).hexdigest()}" for path in files]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+if __name__ == "__main__":
+    main()
