@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.commands.capture_checks import show_findings
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import (
     DryRunOption,
@@ -22,7 +23,6 @@ from facerf_cli.commands.prepare_findings import (
     check_all,
     collect_findings,
     require_sound,
-    show_rows,
     write_findings,
 )
 from facerf_cli.errors import InputError, UsageError
@@ -46,6 +46,7 @@ class _Given:
     folder: Path
     layout: str
     subtract_ambient: bool
+    align: bool
 
     def opened(self) -> "Capture":
         """The capture's description, once a process; it is an input of the whole run."""
@@ -77,7 +78,7 @@ class _Prepare:
 
         capture, model = self.given.opened(), _face_model(self.face_model)
         with one_thread():
-            chosen = self._choose(capture, item.name)
+            capture, chosen = self._choose(capture, item.name)
             record = prepare_subject(
                 capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.strict
             )
@@ -89,14 +90,19 @@ class _Prepare:
         facts |= {"lights": len(chosen.lights)}
         return Outcome(self.outputs_of(item), facts)
 
-    def _choose(self, capture: "Capture", subject: str) -> "Selection":
-        """The frames that are sound; an InputError where that is not enough, or anything with --strict."""
+    def _choose(self, capture: "Capture", subject: str) -> "tuple[Capture, Selection]":
+        """The capture, aligned on request, and its sound frames; an InputError where those are too few."""
+        from facerf_cli.stage.checks.align import with_alignment
+        from facerf_cli.stage.checks.findings import frames_left_out
         from facerf_cli.stage.data.selection import select_frames
 
         findings = check(capture, subject) if self.checks == "on" else []
         write_findings(self.folder, subject, findings)
         require_sound(subject, findings, self.strict)
-        return select_frames(capture, subject, findings, self.strict)
+        chosen = select_frames(capture, subject, findings, self.strict)
+        if capture.align:
+            capture = with_alignment(capture, subject, frames_left_out(findings))
+        return capture, chosen
 
 
 @cache
@@ -104,7 +110,7 @@ def _capture(given: _Given) -> "Capture":
     from facerf_cli.stage.data.layouts import read_capture
 
     try:
-        return read_capture(given.folder, given.layout, given.subtract_ambient)
+        return read_capture(given.folder, given.layout, given.subtract_ambient, given.align)
     except InputError as error:
         raise UsageError(str(error)) from None
 
@@ -140,6 +146,9 @@ def prepare_dataset(
     subtract_ambient: Annotated[
         bool,
         typer.Option("--subtract-ambient", help="Subtract each camera's picture without lamps, if there."),
+    ] = False,
+    align: Annotated[
+        bool, typer.Option("--align", help="Shift frames back to where the head was, where it moved.")
     ] = False,
     checks: Annotated[
         Checks,
@@ -183,7 +192,7 @@ def prepare_dataset(
     drawn = Split.parse(split)
     if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:
         raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    given = _Given(capture, layout, subtract_ambient)
+    given = _Given(capture, layout, subtract_ambient, align)
     found = given.opened()
     _check_subjects(found, output, drawn)
     items = [Item(found.folder / name, output / name, name) for name in found.subjects]
@@ -262,7 +271,7 @@ def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model
     found = prepared_subjects(capture, work.folder).items()
     records = {subject: record for subject, record in found if record.get("prepared") == work.key}
     findings = collect_findings(work.folder, capture.subjects)
-    show_rows([row for rows in findings.values() for row in rows])
+    show_findings([row for rows in findings.values() for row in rows])
     if not records:
         return
     model = _face_model(work.face_model)

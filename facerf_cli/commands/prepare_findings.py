@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from facerf_cli.commands.capture_checks import show_findings
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.workers import spread
@@ -76,7 +77,7 @@ def check_all(
     findings = [found for of_subject in bar for found in of_subject]
     rows = [found.row() for found in findings]
     _write_rows(output / FINDINGS_FILE, rows)
-    show_rows(rows)
+    show_findings(rows)
     print(output / FINDINGS_FILE)
     return 1 if stopping(findings, strict) else 0
 
@@ -100,10 +101,6 @@ def _died(item: Item, error: Exception) -> "list[Finding]":
 
     words = f"its process died, perhaps for want of memory; try fewer --jobs ({error})"
     return [Finding("error", "unchecked", item.name, words)]
-
-
-def show_rows(rows: "Sequence[Mapping[str, Any]]") -> None:
-    """The findings as a table on stderr, if there are any."""
 
 
 def _write_rows(path: Path, rows: "Iterable[Mapping[str, Any]]") -> None:

@@ -90,6 +90,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "to": _COLOUR_SPACE,
             "black_level": capture.black_level,
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
+            **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
             "non_finite": "set to 0",
             "negative": "set to 0 after the crop",

@@ -65,6 +65,7 @@ class Capture:
     )
     subtract_ambient: bool = False
     marked: Mapping[str, frozenset[str]] = field(default_factory=dict)  # ids of lights that it gives up
+    align: bool = False  # head motion is to be undone: `shifts` are to be found for each subject
     # Pixels down and right that take a frame back to where the head was, by subject, camera and light.
     shifts: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
@@ -99,7 +100,9 @@ class Capture:
         return pixels if pixels is not None and pixels.shape == (posed.height_px, posed.width_px, 3) else None
 
 
-def read_capture(folder: Path, layout: str = "stage", subtract_ambient: bool = False) -> Capture:
+def read_capture(
+    folder: Path, layout: str = "stage", subtract_ambient: bool = False, align: bool = False
+) -> Capture:
     """Read a capture's description in one of `LAYOUTS`; no pictures yet."""
     if layout not in LAYOUTS:
         raise UsageError(f"--layout {layout}: not known; there is {', '.join(sorted(LAYOUTS))}")
@@ -108,7 +111,7 @@ def read_capture(folder: Path, layout: str = "stage", subtract_ambient: bool = F
     capture = LAYOUTS[layout](folder)
     if subtract_ambient and not capture.ambient_pattern:
         raise UsageError(f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' pictures")
-    return replace(capture, subtract_ambient=subtract_ambient)
+    return replace(capture, subtract_ambient=subtract_ambient, align=align)
 
 
 def _read_picture(path: Path, colour_space: str) -> np.ndarray:

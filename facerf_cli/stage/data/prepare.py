@@ -128,12 +128,13 @@ def _settle_dropped(subject: str, chosen: Selection, folder: Path, any_left: boo
 
 
 def _record_of_less(view: _Subject, chosen: Selection) -> dict[str, Any]:
-    """What a record says where a subject lacks lights or cameras: the ids of its lights, in their order."""
+    """What a record says besides: the lights there are (ids) and what is lacking, moved or not subtracted."""
     capture = view.capture
     entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
     if chosen.left_out:
         entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
         entries |= {"left_out": chosen.left_out}
+    entries |= {"shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()}}
     if capture.subtract_ambient:
         without = [camera for camera in chosen.cameras if capture.ambient(view.name, camera) is None]
         entries |= {"ambient_kept": without}
