@@ -9,10 +9,12 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import read_image
 from facerf_cli.stage.checks.frames import CameraFrames, small
-from facerf_cli.stage.checks.gamma import EXPONENTS, Curve, vertex
+from facerf_cli.stage.checks.gamma import EXPONENTS, Curve
 from facerf_cli.stage.checks.missing import FULL_NAMES
 from facerf_cli.stage.data.layouts import Capture
 
+_EXPONENTS = np.geomspace(EXPONENTS[0], EXPONENTS[-1], 80)  # a sharp minimum wants fine steps
+_NOISE = 1e-3  # of log ratios: no sum is better than that
 _DARK = 0.02  # of the brightest: darker pixels are noise
 
 
@@ -28,15 +30,13 @@ def added_exponent(capture: Capture, frames: CameraFrames) -> Curve | None:
     lit = full > _DARK * full.max()
     each = np.maximum(frames.grey[:, lit] * strength, 0).astype(float)
     together = full[lit].astype(float)
-    errors = np.array([_error(each, together, exponent) for exponent in EXPONENTS])
-    place = int(errors.argmin())
-    best = float(np.exp(vertex(np.log(EXPONENTS), errors, place)))
-    at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
-    return Curve(best, at_one / max(float(errors[place]), 1e-3))
+    errors = np.array([_error(each, together, exponent) for exponent in _EXPONENTS])
+    at_one = _error(each, together, 1.0)
+    return Curve(float(_EXPONENTS[errors.argmin()]), at_one / max(float(errors.min()), _NOISE))
 
 
 def _error(each: np.ndarray, together: np.ndarray, exponent: float) -> float:
-    """How far the sum of decoded frames [L, P] is from the decoded full one [P], as a median of log ratios."""
+    """How far the sum of decoded frames [L, P] is from the decoded full one [P]: median log ratio."""
     return float(np.median(np.abs(np.log((each**exponent).sum(0) + 1e-12) - exponent * np.log(together))))
 
 

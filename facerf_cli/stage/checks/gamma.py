@@ -43,7 +43,7 @@ def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> Curve | None:
         return None
     errors = np.array([_error(values, used, frames.directions, exponent) for exponent in EXPONENTS])
     place = int(errors.argmin())
-    exponent = vertex(np.log(EXPONENTS), errors, place)
+    exponent = _vertex(np.log(EXPONENTS), errors, place)
     at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
     return Curve(float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9))
 
@@ -64,7 +64,7 @@ def _error(values: np.ndarray, used: np.ndarray, directions: np.ndarray, exponen
     return float(np.median(np.abs(values - back)[used]))
 
 
-def vertex(x: np.ndarray, y: np.ndarray, place: int) -> float:
+def _vertex(x: np.ndarray, y: np.ndarray, place: int) -> float:
     """Where the parabola through the least value and its neighbours is least."""
     if not 0 < place < len(x) - 1:
         return float(x[place])

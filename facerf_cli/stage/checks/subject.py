@@ -77,7 +77,10 @@ class _Checks:
             return found
         found += check_unlit(sound, stereo)
         sound = frames.less(left_out(found))
-        return found + self._of_shading(sound)
+        by_shading = self._of_shading(sound)
+        if is_disordered(by_shading):  # then nobody knows how bright a frame should be
+            found = [finding for finding in found if finding.check != "unlit"]
+        return found + by_shading
 
     def _of_shading(self, frames: CameraFrames) -> list[Finding]:
         """Findings about frames that are whole and lit, as far as shading tells."""
@@ -85,8 +88,9 @@ class _Checks:
         if stereo is None:
             return []
         found = list(check_frames_order(frames, stereo))
-        if not found:  # otherwise normals are not to be trusted
-            self._look_at_rig(frames, stereo, found)
+        if is_disordered(found):
+            return found  # no normals are to be trusted
+        self._look_at_rig(frames, stereo, found)
         found += check_motion(frames.less(left_out(found)), stereo)
         curve = added_exponent(self.capture, frames)
         curve = curve or fit_exponent(frames.less(left_out(found)), stereo.lit)
@@ -104,6 +108,11 @@ class _Checks:
             if face is not None:
                 self.rig_known = True
                 found += check_rig(frames, stereo, face)
+
+
+def is_disordered(findings: Iterable[Finding]) -> bool:
+    """Whether the lights as a whole are in another order, as far as the camera's frames tell."""
+    return any(found.check == "order" and not found.leaves_out for found in findings)
 
 
 def left_out(findings: Iterable[Finding]) -> set[str]:

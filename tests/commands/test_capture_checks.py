@@ -1,0 +1,42 @@
+"""The table of findings: errors first, alike ones put together, nothing where there is nothing."""
+
+import io
+
+from rich.console import Console
+
+from facerf_cli.commands.capture_checks import show_findings, summary
+from facerf_cli.stage.checks.findings import Finding
+
+STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
+WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
+UNLIT = [
+    Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{k:03d}", {}, True)
+    for k in range(9)
+]
+
+
+def shown(findings: list[Finding]) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    show_findings([finding.row() for finding in findings], console)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_no_findings_print_nothing() -> None:
+    assert shown([]) == ""
+
+
+def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
+    text = shown([WARNS, *UNLIT, STOPS])
+    assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
+    assert text.index("0000/C0/L002") < text.index("the head moves")
+    assert "are mirrored [left] to right" in text  # brackets are no markup
+
+
+def test_many_alike_are_counted() -> None:
+    text = shown(UNLIT)
+    assert "0000/C0/L002" in text and "L003" not in text and "(and 6 more like it)" in text
+
+
+def test_the_summary_counts_what_follows() -> None:
+    rows = [finding.row() for finding in [WARNS, *UNLIT, STOPS]]
+    assert summary(rows) == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"
