@@ -1,0 +1,70 @@
+"""Verbs that end with something of all items: shards leave what one run leaves; the last writes the sum."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.evaluation_run import run_protocol
+from facerf_cli.commands.options import Settings, Shard
+from facerf_cli.main import main
+from facerf_cli.records import configure_logging
+from tests.evaluation.toy_protocol import LAYOUT, Toy, evaluate, items
+from tests.stage.data.dataset_fixture import write_small_dataset
+
+Said = pytest.CaptureFixture[str]
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Every file but the reports, which hold times."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith("report")
+    }
+
+
+def test_evaluate(tmp_path: Path) -> None:
+    configure_logging()
+    assert evaluate(tmp_path / "whole") == 0
+    options = EvaluateOptions(tmp_path / "shards", reflectance=())
+    for number in (2, 1):
+        assert not (options.output / "summary.json").exists()
+        settings = Settings(shard=Shard(number, 2))
+        assert run_protocol(LAYOUT, items(options.output), Toy(), options, settings) == 0
+    assert tree(options.output) == tree(tmp_path / "whole")
+    assert (options.output / "report.html").exists()
+
+
+def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:
+    for name in ("whole", "shards"):
+        write_small_dataset(tmp_path / name, counts=(1, 1, 1), lights=12, crop_px=32)
+    line = ["--envmaps", "procedural:2", "--per-subject", "3"]
+    whole = ["relight-dataset", str(tmp_path / "whole"), *line]
+    shards = ["relight-dataset", str(tmp_path / "shards"), *line]
+    assert main(whole) == 0
+    assert main([*shards, "--shard", "1/2"]) == 2
+    assert "give this line once with --lazy and no --shard" in capsys.readouterr().err
+    assert main([*shards, "--lazy"]) == 0
+    assert main([*shards, "--shard", "2/2"]) == 0 and main([*shards, "--shard", "1/2"]) == 0
+    assert tree(tmp_path / "shards/relit") == tree(tmp_path / "whole/relit")
+    before = tree(tmp_path / "shards")
+    assert main([*shards, "--shard", "1/2", "--overwrite"]) == 2, "it would take the other's away"
+    assert tree(tmp_path / "shards") == before
+
+
+@pytest.mark.slow
+def test_synth_stage_and_prepare_dataset(tmp_path: Path) -> None:
+    synth = ["synth-stage", "--subjects", "2", "--size", "64", "--lights", "12"]
+    for name, shards in (("whole", [[]]), ("shards", [["--shard", "2/2"], ["--shard", "1/2"]])):
+        for shard in shards:
+            assert main([*synth, "-o", str(tmp_path / name), *shard]) == 0
+    assert tree(tmp_path / "shards") == tree(tmp_path / "whole")
+    prepare = ["prepare-dataset", str(tmp_path / "whole"), "--crop", "64", "--split", "1/0/1"]
+    for name, shards in (("data", [[]]), ("data-2", [["--shard", "2/2"], ["--shard", "1/2"]])):
+        for shard in shards:
+            assert not (tmp_path / name / "dataset.json").exists()
+            assert main([*prepare, "-o", str(tmp_path / name), *shard]) == 0
+    assert tree(tmp_path / "data-2") == tree(tmp_path / "data")
+    assert (tmp_path / "data" / "dataset.json").exists()
