@@ -17,7 +17,7 @@ Row = Mapping[str, Any]  # as `Finding.row` makes it
 
 
 def show_findings(rows: Sequence[Row], console: Console = STDERR) -> None:
-    """Print the rows as a table, if there are any; rows in findings.jsonl are never cut short as these are."""
+    """Print the rows as a table, if there are any; findings.jsonl has all of them, here like ones are cut."""
     if not rows:
         return
     width = None if console.is_terminal else _PLAIN_WIDTH
