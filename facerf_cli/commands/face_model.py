@@ -114,7 +114,7 @@ def list_models(
 
 
 def _rows() -> list[dict[str, Any]]:
-    """What is listed, each with what --face-model or `import` takes as its `model`."""
+    """What is listed: models by what --face-model takes for them, then archives that `import` takes."""
     from facerf_cli.face.importers.published import PUBLISHED, cached_face_model
     from facerf_cli.face.model_facts import read_model_facts
     from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH
@@ -127,8 +127,8 @@ def _rows() -> list[dict[str, Any]]:
             rows.append({"model": model, "name": facts.name, "shapes": shapes, "licence": facts.licence})
     for kind in PUBLISHED:
         cached = cached_face_model(kind)
-        words = "in the cache; to import" if cached else f"not here; facerf face-model fetch {kind}"
-        rows.append({"model": str(cached or "-"), "name": kind, "shapes": "-", "licence": words})
+        words = f"to import: {cached}" if cached else f"not here; facerf face-model fetch {kind}"
+        rows.append({"model": "-", "name": kind, "shapes": "-", "licence": words, "archive": cached})
     return rows
 
 

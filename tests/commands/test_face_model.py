@@ -96,8 +96,8 @@ def test_list_names_what_is_here(
     archive.write_bytes(b"")
     assert main(["face-model", "list", "--json"]) == 0
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [row["model"] for row in rows] == ["builtin", "mine.npz", str(archive)]
-    assert rows[0]["shapes"] == "80 + 29" and "to import" in rows[2]["licence"]
+    assert [row["model"] for row in rows] == ["builtin", "mine.npz", "-"]
+    assert rows[0]["shapes"] == "80 + 29" and rows[2]["archive"] == str(archive)
 
 
 def test_show_says_what_a_model_is(capsys: Capture) -> None:
