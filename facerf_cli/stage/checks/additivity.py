@@ -8,7 +8,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import read_image
-from facerf_cli.stage.checks.frames import CameraFrames, small
+from facerf_cli.stage.checks.frames import CameraFrames, grey_of, small
 from facerf_cli.stage.checks.gamma import EXPONENTS, Curve
 from facerf_cli.stage.checks.missing import FULL_NAMES
 from facerf_cli.stage.data.layouts import Capture
@@ -50,6 +50,6 @@ def _full_frame(capture: Capture, frames: CameraFrames) -> np.ndarray | None:
             pixels = read_image(path, capture.colour_space, non_finite="zero").pixels
         except InputError:
             return None
-        grey = small(pixels - np.float32(capture.black_level), frames.grey.shape[1:])
+        grey = small(grey_of(pixels) - np.float32(capture.black_level), frames.grey.shape[1:])
         return grey if grey.max() > 0 else None
     return None

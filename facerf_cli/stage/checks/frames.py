@@ -92,8 +92,9 @@ def read_frames(
             continue
         places.append(place)
         figures.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
-        greys.append(small(pixels, size))
-        lit += small(pixels, lit_size)
+        grey = grey_of(pixels)
+        greys.append(small(grey, size))
+        lit += small(grey, lit_size)
     rows = np.array(places, int)
     frames = CameraFrames(
         subject=subject,
@@ -124,15 +125,19 @@ def _decodes(capture: Capture, subject: str, camera: str, light: str) -> bool:
     return True
 
 
-def small(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The mean of the channels, each small pixel the mean of its area."""
-    grey = torch.from_numpy(pixels.mean(-1, dtype=np.float32))
-    return F.interpolate(grey[None, None], size, mode="area")[0, 0].numpy()
+def grey_of(pixels: np.ndarray) -> np.ndarray:
+    """The mean of the channels [H, W]; numpy's own is many times slower over an axis of three."""
+    return (pixels[..., 0] + pixels[..., 1] + pixels[..., 2]) / np.float32(3)
+
+
+def small(grey: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A plane made small, each pixel the mean of its area."""
+    return F.interpolate(torch.from_numpy(grey)[None, None], size, mode="area")[0, 0].numpy()
 
 
 def _measure(pixels: np.ndarray) -> FrameFigures:
     """Figures of a full picture [H, W, 3]."""
-    highest, grey = float(pixels.max()), pixels.mean(-1)
+    highest, grey = float(pixels.max()), grey_of(pixels)
     rows, columns = comb(grey), comb(grey.T)
     top = (pixels >= highest * _AT_THE_TOP).any(-1) if highest > 0 else np.zeros(1)
     return FrameFigures(
