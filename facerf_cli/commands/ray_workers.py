@@ -87,7 +87,9 @@ def in_ray(
 
 def connect(address: str, jobs: int = 0) -> Any:
     """The module `ray`, connected; it stays so until this process ends. Errors as of `in_ray`."""
-    for name, value in _ENVIRONMENT.items():
+    token = Path.home() / ".ray" / "auth_token"
+    show_token = {"RAY_AUTH_MODE": "token"} if address != LOCAL and token.is_file() else {}
+    for name, value in (_ENVIRONMENT | show_token).items():
         os.environ.setdefault(name, value)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Ray's, of its own future
@@ -115,7 +117,8 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
     finally:
         signal.signal(signal.SIGTERM, ours)  # Ray sets one of its own
     # A thread of Ray's tells standard output, which is for results, of workers that died; so do we.
-    importlib.import_module("ray._private.worker").print_to_stdstream = lambda *_, **__: None
+    innards: Any = importlib.import_module("ray._private.worker")
+    innards.print_to_stdstream = lambda *_, **__: None
 
 
 def _require_listener(address: str) -> None:
