@@ -55,6 +55,14 @@ def si_rel(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float
     return si_mse(prediction, truth, mask) / energy if energy > 0 else float("nan")
 
 
+def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """`si_mse` with a scale for each channel: what is left once the colour of light and skin is given.
+
+    One photo cannot tell a red light from red skin, so pictures in lights of two colours need not agree.
+    """
+    return float(np.mean([si_mse(prediction[..., c], truth[..., c], mask) for c in range(3)]))
+
+
 def mse(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     """Mean squared error of pictures clipped to 0..1, as a display shows them; no scale is sought."""
     p, t, weight = _inside(np.clip(prediction, 0, 1), np.clip(truth, 0, 1), mask)

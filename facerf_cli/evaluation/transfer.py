@@ -17,7 +17,7 @@ from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.methods import Method, relit_by
 from facerf_cli.evaluation.people import Person
 from facerf_cli.evaluation.views import View
-from facerf_cli.metrics import si_mse
+from facerf_cli.metrics import si_mse_channels
 from facerf_cli.pipeline import FaceTexture, turn_to
 from facerf_cli.stage.data.recipes import Pair
 
@@ -67,14 +67,6 @@ def _made_of(
         view.fit.landmarks_px.numpy(),
         {name: {CHANNELS: si_mse_channels(p, side.picture, view.mask)} for name, p in predictions.items()},
     )
-
-
-def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """`si_mse` with a scale for each channel: what is left once the colour of light and skin is given.
-
-    One photo cannot tell a red light from red skin, so pictures in lights of two colours need not agree.
-    """
-    return float(np.mean([si_mse(prediction[..., c], truth[..., c], mask) for c in range(3)]))
 
 
 def transfer_person(

@@ -17,10 +17,10 @@ from facerf_cli.evaluation.geometry import FULL, MEAN, Form, compare_geometries
 from facerf_cli.evaluation.olat import LAMBERT, compare_olats
 from facerf_cli.evaluation.people import Person, evenly
 from facerf_cli.evaluation.reconstruction import brightest, reconstruct
-from facerf_cli.evaluation.transfer import Side, couples_of, si_mse_channels, transfer
+from facerf_cli.evaluation.transfer import Side, couples_of, transfer
 from facerf_cli.evaluation.views import View
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.metrics import si_mse
+from facerf_cli.metrics import si_mse, si_mse_channels
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.stage.data.dataset import Dataset, read_dataset
 from facerf_cli.stage.data.recipes import Pair
