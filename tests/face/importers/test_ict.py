@@ -204,7 +204,7 @@ HOSTILE = {
     ),
     "a surface that is one point": (
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(), identity000=obj(), jawOpen=obj()),
-        "mm apart",
+        "largest side is 0 mm",
     ),
     "a bomb": (lambda t: zipped(t / "a.zip", generic_neutral_mesh=bytes(65 << 20)), "too large"),
     "a damaged zip": (
