@@ -1,14 +1,12 @@
 """`facerf prepare-dataset`: a light stage's capture as crops, fits, OLAT stacks and splits."""
 
 import logging
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.commands.batch import BatchOptions, run_items, sums_up
 from facerf_cli.commands.capture_checks import show_findings
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import (
@@ -17,110 +15,17 @@ from facerf_cli.commands.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.commands.prepare_findings import (
-    CheckOnly,
-    check,
-    check_all,
-    collect_findings,
-    require_sound,
-    write_findings,
-)
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.commands.prepare_findings import CheckOnly, check_all, collect_findings
+from facerf_cli.commands.prepare_item import Checks, Given, Prepare, face_model_of
+from facerf_cli.errors import UsageError
 from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
-    from facerf_cli.face.morphable import MorphableModel
     from facerf_cli.stage.data.layouts import Capture
-    from facerf_cli.stage.data.selection import Selection
     from facerf_cli.stage.data.splits import Split
 
-Checks = Literal["on", "off", "only"]
 _CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
-
-
-@dataclass(frozen=True)
-class _Given:
-    """Which capture, and how it is read; settings only."""
-
-    folder: Path
-    layout: str
-    subtract_ambient: bool
-    align: bool
-
-    def opened(self) -> "Capture":
-        """The capture's description, once a process; it is an input of the whole run."""
-        return _capture(self)
-
-
-@dataclass(frozen=True)
-class _Prepare:
-    """Prepares one subject; settings only."""
-
-    given: _Given
-    checks: Checks
-    strict: bool
-    face_model: str
-    crop_px: int
-    folder: Path
-    key: str
-
-    def outputs_of(self, item: Item) -> list[Path]:
-        """A subject's files."""
-        from facerf_cli.stage.data.prepare import subject_outputs
-
-        return subject_outputs(self.given.opened(), item.name, self.folder)
-
-    def __call__(self, item: Item) -> Outcome:
-        """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
-        from facerf_cli.stage.data.prepare import prepare_subject
-        from facerf_cli.stage.threads import one_thread
-
-        capture, model = self.given.opened(), _face_model(self.face_model)
-        with one_thread():
-            capture, chosen = self._choose(capture, item.name)
-            record = prepare_subject(
-                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.strict
-            )
-        if record["quality"] == "poor":
-            log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
-        worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
-        facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-        facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
-        facts |= {"lights": len(chosen.lights)}
-        return Outcome(self.outputs_of(item), facts)
-
-    def _choose(self, capture: "Capture", subject: str) -> "tuple[Capture, Selection]":
-        """The capture, aligned on request, and its sound frames; an InputError where those are too few."""
-        from facerf_cli.stage.checks.align import with_alignment
-        from facerf_cli.stage.checks.findings import frames_left_out
-        from facerf_cli.stage.data.selection import select_frames
-
-        findings = check(capture, subject) if self.checks == "on" else []
-        write_findings(self.folder, subject, findings)
-        require_sound(subject, findings, self.strict)
-        chosen = select_frames(capture, subject, findings, self.strict)
-        if capture.align:
-            capture = with_alignment(capture, subject, frames_left_out(findings))
-        return capture, chosen
-
-
-@cache
-def _capture(given: _Given) -> "Capture":
-    from facerf_cli.stage.data.layouts import read_capture
-
-    try:
-        return read_capture(given.folder, given.layout, given.subtract_ambient, given.align)
-    except InputError as error:
-        raise UsageError(str(error)) from None
-
-
-@cache
-def _face_model(name: str) -> "MorphableModel":
-    """The face model, once a process."""
-    from facerf_cli.face.morphable import load_face_model
-
-    return load_face_model(name)
 
 
 def prepare_dataset(
@@ -192,7 +97,7 @@ def prepare_dataset(
     drawn = Split.parse(split)
     if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:
         raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    given = _Given(capture, layout, subtract_ambient, align)
+    given = Given(capture, layout, subtract_ambient, align)
     found = given.opened()
     _check_subjects(found, output, drawn)
     items = [Item(found.folder / name, output / name, name) for name in found.subjects]
@@ -201,7 +106,7 @@ def prepare_dataset(
     model_sha256 = _model_digest(face_model)
     key = preparation_key(found, model_sha256, crop)
     _check_earlier(found, output, key, overwrite)
-    work = _Prepare(given, checks, strict, face_model, crop, output, key)
+    work = Prepare(given, checks, strict, face_model, crop, output, key)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     if overwrite and not dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
@@ -230,7 +135,7 @@ def _model_digest(name: str) -> str:
     from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH
     from facerf_cli.stage.data.description import sha256_of
 
-    _face_model(name)  # a file that is none is named first
+    face_model_of(name)  # a file that is none is named first
     return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
 
 
@@ -259,7 +164,7 @@ def _forget_mended(capture: "Capture", output: Path) -> None:
             record_path(output, subject).unlink()
 
 
-def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model_sha256: str) -> None:
+def _finish(work: Prepare, capture: "Capture", split: "Split", seed: int, model_sha256: str) -> None:
     """Write the page and `dataset.json` of the subjects that are finished, and prepared as this run would."""
     from facerf_cli.files.atomic import atomic_path
     from facerf_cli.stage.data.dataset import DATASET_FILE
@@ -274,7 +179,7 @@ def _finish(work: _Prepare, capture: "Capture", split: "Split", seed: int, model
     show_findings([row for rows in findings.values() for row in rows])
     if not records:
         return
-    model = _face_model(work.face_model)
+    model = face_model_of(work.face_model)
     dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
     with atomic_path(work.folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)

@@ -6,7 +6,7 @@ the face is left out, too.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -78,12 +78,7 @@ def prepare_subject(
             dropped[camera] = str(error)
             continue
         rows.append(_write_camera(view, camera, fit, header, folder))
-        cameras[camera] = {
-            "face_found": seen_px is not None,
-            "error_iod": round(error_iod, 5),
-            "quality": fit.quality,
-            "crop_off_iod": round(off_iod, 5),
-        }
+        cameras[camera] = _camera_record(fit, seen_px is not None, off_iod)
     chosen = replace(chosen, dropped=dropped)
     _settle_dropped(subject, chosen, folder, bool(cameras), strict)
     write_display(sheet_path(folder, subject), contact_sheet(np.concatenate(rows), len(rows[0])))
@@ -93,10 +88,20 @@ def prepare_subject(
         "quality": quality_of(joint.mean_error_iod),
         "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
         "cameras": cameras,
-        **_record_of_less(view, chosen),
+        **_record_besides(view, chosen),
     }
     write_document(record_path(folder, subject), record)
     return record
+
+
+def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, Any]:
+    """What a record says of a camera."""
+    return {
+        "face_found": face_found,
+        "error_iod": round(fit.error_iod, 5),
+        "quality": fit.quality,
+        "crop_off_iod": round(off_iod, 5),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +132,7 @@ def _settle_dropped(subject: str, chosen: Selection, folder: Path, any_left: boo
         fit_path(folder, subject, camera).unlink(missing_ok=True)
 
 
-def _record_of_less(view: _Subject, chosen: Selection) -> dict[str, Any]:
+def _record_besides(view: _Subject, chosen: Selection) -> dict[str, Any]:
     """What a record says besides: the lights there are (ids) and what is lacking, moved or not subtracted."""
     capture = view.capture
     entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
@@ -135,13 +140,19 @@ def _record_of_less(view: _Subject, chosen: Selection) -> dict[str, Any]:
         entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
         entries |= {"left_out": chosen.left_out}
     entries |= {"shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()}}
-    if capture.subtract_ambient:
-        without = [camera for camera in chosen.cameras if capture.ambient(view.name, camera) is None]
-        entries |= {"ambient_kept": without}
-        if without:
-            words = "no ambient picture of the camera's size; nothing is subtracted"
-            log.warning("%s/%s: %s", view.name, ", ".join(without), words)
+    entries |= {"ambient_kept": _ambient_kept(view, chosen.cameras)}
     return {name: entry for name, entry in entries.items() if entry}
+
+
+def _ambient_kept(view: _Subject, cameras: Iterable[str]) -> list[str]:
+    """The cameras, with a warning, whose ambient picture should be subtracted but is not there."""
+    if not view.capture.subtract_ambient:
+        return []
+    without = [camera for camera in cameras if view.capture.ambient(view.name, camera) is None]
+    if without:
+        words = "no ambient picture of the camera's size; nothing is subtracted"
+        log.warning("%s/%s: %s", view.name, ", ".join(without), words)
+    return without
 
 
 @contextmanager
