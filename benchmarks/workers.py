@@ -1,8 +1,9 @@
 """Pictures a second of a folder verb by its workers: --jobs 1, --jobs 2, two shards at once, and --ray local.
 
-    python benchmarks/workers.py [--pictures 12] [--rounds 2] [--ways jobs-1 jobs-2 shards ray-1 ray-2]
+    python benchmarks/workers.py [--verb fit-geometry] [--pictures 12] [--rounds 2] [--ways jobs-1 ray-2 ...]
 
-`facerf relight` of copies of examples/astronaut.jpg under one lamp, as a command each, one thread a worker.
+`facerf fit-geometry`, or `facerf relight` under one lamp, of copies of examples/astronaut.jpg, a command a
+way, one thread a worker.
 Two rates: of the whole command, start and end of its workers included; and between its workers' first
 pictures and the last one, which is what a long run comes to. The best of the rounds, which take turns, is
 shown; so is the machine's load before, for other programs' work makes every figure here smaller. All ways
@@ -22,7 +23,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PHOTO = Path(__file__).parents[1] / "examples" / "astronaut.jpg"
-OPTIONS = ("--light", "30,20", "--exposure", "0")
+# A verb's options, and how its last file of a picture ends.
+VERBS = {"fit-geometry": ((), "_fit.npz"), "relight": (("--light", "30,20", "--exposure", "0"), ".png")}
 WAYS: dict[str, tuple[int, tuple[tuple[str, ...], ...]]] = {  # workers, and the options of each command
     "jobs-1": (1, (("--jobs", "1"),)),
     "jobs-2": (2, (("--jobs", "2"),)),
@@ -43,13 +45,14 @@ class Run:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--verb", choices=list(VERBS), default="fit-geometry")
     parser.add_argument("--pictures", type=int, default=12)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS))
     given = parser.parse_args()
     load = os.getloadavg()[0]
     machine = f"{os.cpu_count()} processors, load {load:.1f} before"
-    print(f"{given.pictures} pictures, {machine}, best of {given.rounds}", flush=True)
+    print(f"{given.verb}: {given.pictures} pictures, {machine}, best of {given.rounds}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         photos = Path(folder, "photos")
         photos.mkdir()
@@ -58,7 +61,7 @@ def main() -> None:
         runs: dict[str, list[Run]] = {way: [] for way in given.ways}
         for _ in range(given.rounds):
             for way in given.ways:
-                runs[way].append(measure(photos, Path(folder, "out"), way))
+                runs[way].append(measure(given.verb, photos, Path(folder, "out"), way))
     show(runs, given.pictures)
 
 
@@ -74,27 +77,27 @@ def show(runs: dict[str, list[Run]], pictures: int) -> None:
     )
 
 
-def measure(photos: Path, out: Path, way: str) -> Run:
-    """Run a way's commands at once, and note when each picture is told on standard output."""
+def measure(verb: str, photos: Path, out: Path, way: str) -> Run:
+    """Run a way's commands at once."""
     workers, commands = WAYS[way]
+    options_of_verb, last = VERBS[verb]
     shutil.rmtree(out, ignore_errors=True)
     start_s = time.perf_counter()
-    base = [sys.executable, "-m", "facerf_cli", "relight", str(photos), "-o", str(out), *OPTIONS, "-q"]
+    base = [sys.executable, "-m", "facerf_cli", verb, str(photos), "-o", str(out), *options_of_verb, "-q"]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    with tempfile.TemporaryFile() as told:
-        running = [
-            subprocess.Popen([*base, *options], stdout=told, env=environment, cwd=PHOTO.parents[1])
-            for options in commands
-        ]
-        if any([process.wait() for process in running]):  # all of them: none is left behind
-            sys.exit(f"{way}: failed")
+    running = [
+        subprocess.Popen([*base, *options], stdout=subprocess.DEVNULL, env=environment, cwd=PHOTO.parents[1])
+        for options in commands
+    ]
+    if any([process.wait() for process in running]):  # all of them: none is left behind
+        sys.exit(f"{way}: failed")
     whole_s = time.perf_counter() - start_s
-    return Run(whole_s, rate_of(out, workers), digest_of(out))
+    return Run(whole_s, rate_of(out, last, workers), digest_of(out))
 
 
-def rate_of(out: Path, workers: int) -> float:
+def rate_of(out: Path, last: str, workers: int) -> float:
     """Pictures a second after each worker's first."""
-    done_s: Sequence[float] = sorted(path.stat().st_mtime for path in out.rglob("*.exr"))
+    done_s: Sequence[float] = sorted(path.stat().st_mtime for path in out.rglob(f"*{last}"))
     later = len(done_s) - workers
     return later / (done_s[-1] - done_s[workers - 1]) if later > 0 else float("nan")
 
