@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from facerf_cli.light.sh import irradiance, sh_basis
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, exposure_of, head_rotation, resize
+from facerf_cli.network.reflectance import Down
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2
@@ -62,7 +63,7 @@ class DiffuseNetwork(nn.Module):
         self.settings = settings
         enc, dec = settings.encoder_widths, settings.decoder_widths
         self.down = nn.ModuleList(
-            _Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip((7, *enc), enc, strict=False))
+            Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip((7, *enc), enc, strict=False))
         )
         coarser = (*dec[1:], enc[-1])
         self.up = nn.ModuleList(_Up(coarser[i], dec[i], enc[i]) for i in range(len(dec)))
@@ -150,21 +151,6 @@ def shading(normals: Tensor, coefficients: Tensor) -> Tensor:
         e = irradiance(normal.permute(1, 2, 0), of_lights).permute(2, 0, 1)
         faces.append(e.view(len(lights), 3, *e.shape[1:]))
     return torch.stack(faces).clamp_min(0) / math.pi
-
-
-class _Down(nn.Module):
-    """Halve the side (but for the first), then a convolution around which the input goes on."""
-
-    def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
-        super().__init__()
-        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
-        self.norm = nn.GroupNorm(4, channels_out)
-        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = F.silu(self.norm(self.enter(x)))
-        result: Tensor = x + F.silu(self.inner(x))
-        return result
 
 
 class _Up(nn.Module):

@@ -57,7 +57,7 @@ class ReflectanceNetwork(nn.Module):
         self.template = nn.Parameter(0.1 * torch.randn(settings.template_channels, 32, 32))
         widths = (7 + settings.template_channels, *enc)
         self.down = nn.ModuleList(
-            _Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(widths, enc, strict=False))
+            Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(widths, enc, strict=False))
         )
         self.bottleneck = nn.Conv2d(enc[-1], dec[-1], 3, padding=1)
         self.light_code = nn.Sequential(
@@ -156,8 +156,8 @@ class ReflectanceNetwork(nn.Module):
         return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
 
 
-class _Down(nn.Module):
-    """Halve the side (but for the first), then two convolutions with a residual."""
+class Down(nn.Module):
+    """Halve the side (but for the first), then a convolution around which the input goes on."""
 
     def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
         super().__init__()
@@ -166,6 +166,7 @@ class _Down(nn.Module):
         self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Features [B, C, H, W] to [B, C', H / 2, W / 2], or of the same side."""
         x = F.silu(self.norm(self.enter(x)))
         result: Tensor = x + F.silu(self.inner(x))
         return result
