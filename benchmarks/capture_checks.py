@@ -4,10 +4,10 @@
 
 Truth is the list of broken pictures in `facerf_cli/stage/data/yale_b.py`, which the checks never see.
 Thresholds were reasoned on subjects 05, 15 and 22 and on synthetic faces, and the others are counted apart;
-but they are no blind test. Seen once as a whole, they had 9 of 10 broken pictures found and 13 false alarms, all of lamps
-overhead that hair hides: since then an unlit lamp is judged by the places that it reaches best, and lamps
-straight above are not judged. What else is found (clipped pictures, heads that move) has no truth to be held
-against, and is counted.
+but they are no blind test. Seen once as a whole, they had 9 of 10 broken pictures found and 15 false alarms,
+all of lamps overhead that hair hides: since then an unlit lamp is judged by the places that it reaches best,
+and lamps straight above are not judged. What else is found (clipped pictures, heads that move) has no truth
+to be held against, and is counted.
 """
 
 import argparse
