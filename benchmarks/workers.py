@@ -62,6 +62,9 @@ def main() -> None:
         for _ in range(given.rounds):
             for way in given.ways:
                 runs[way].append(measure(given.verb, photos, Path(folder, "out"), way))
+                print(
+                    f"  {way}: {runs[way][-1].whole_s:.1f} s, {runs[way][-1].steady:.3f} a second", flush=True
+                )
     show(runs, given.pictures)
 
 
