@@ -241,7 +241,7 @@ def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
     one, two = (state_of(tmp_path / name)["networks"] for name in ("one", "two"))
     for name, weights in one.items():
         if weights.is_floating_point():
-            assert float((two[name] - weights).norm()) < 1e-5 * float(weights.norm()) + 1e-12, name
+            assert float((two[name] - weights).norm()) < 3e-5 * float(weights.norm()) + 1e-12, name
 
 
 def _free_port() -> int:

@@ -8,6 +8,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+import facerf_cli.baselines.field
 import facerf_cli.pipeline
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
@@ -71,11 +72,12 @@ def test_maps_rotations_and_lamps_from_one_prediction(
 ) -> None:
     predicted = []
     predict = facerf_cli.pipeline.predict_olat
-    monkeypatch.setattr(
-        facerf_cli.pipeline,
-        "predict_olat",
-        lambda *given, **named: predicted.append("quotient" in named) or predict(*given, **named),
-    )
+    for module in (facerf_cli.pipeline, facerf_cli.baselines.field):
+        monkeypatch.setattr(
+            module,
+            "predict_olat",
+            lambda *given, **named: predicted.append("quotient" in named) or predict(*given, **named),
+        )
     line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0", "--ball"]
     assert relight(given, tmp_path, *line) == 0
     assert predicted == [False, True]  # to estimate the photo's own light, and for all that is asked
