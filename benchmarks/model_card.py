@@ -88,17 +88,18 @@ def evaluation(found: Table) -> list[str]:
 def comparison(found: Table) -> list[str]:
     """Methods over all pictures, and over each column of Extended Yale B: a row a method."""
     head = "Si-MSE (sd) | its median | 95 % interval | less the first | won | Face dis (sd) | SSIM"
-    count = f"{found['pictures']} pictures, {found['persons']} people"
+    people = "1 person" if found["persons"] == 1 else f"{found['persons']} people"
+    count = f"{found['pictures']} pictures, {people}"
     lines = [f"| {count} | | {head} |", "|---" * 9 + "|"]
     for group in found["groups"]:
-        if group["fact"] not in (None, "task"):
+        if group["fact"] not in (None, "column"):
             continue
         error, alike = group["metrics"]["si_mse"], group["metrics"].get("ssim", {})
         for method, cell in error.items():
             apart = cell.get("less_the_first")
             paired = ["", ""] if apart is None else [_signed(apart), f"{100 * apart['won']:.0f} %"]
             own = [f"{cell['mean']:.5f} ({cell['sd']:.5f})", f"{cell['median']:.5f}"]
-            own.append(f"[{cell['low']:.5f}, {cell['high']:.5f}]")
+            own.append(_span(cell, ".5f"))
             face = group["metrics"].get("face_distance", {}).get(method)
             shown = "" if face is None else f"{face['mean']:.3f} ({face['sd']:.3f})"
             ssim = f"{alike[method]['mean']:.3f}" if method in alike else ""
@@ -107,7 +108,12 @@ def comparison(found: Table) -> list[str]:
 
 
 def _signed(part: Table) -> str:
-    return f"{part['mean']:+.5f} [{part['low']:+.5f}, {part['high']:+.5f}]"
+    return f"{part['mean']:+.5f} {_span(part, '+.5f')}".strip()
+
+
+def _span(part: Table, form: str) -> str:
+    """An interval; of one person there is none."""
+    return "" if part["low"] is None else f"[{part['low']:{form}}, {part['high']:{form}}]"
 
 
 def table1(found: Table) -> list[str]:
