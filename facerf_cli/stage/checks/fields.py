@@ -8,8 +8,8 @@ from facerf_cli.stage.checks.findings import Finding
 from facerf_cli.stage.checks.frames import CameraFrames
 from facerf_cli.stage.checks.stereo import reaches_face
 
-# Sound frames of Extended Yale B's subjects 05, 15 and 22 have ratios within 1.3 times their median, those of a
-# dozen lamps far apart up to 3; the two broken ones there are 78 and 184 times above it, a planted one 7.
+# Sound frames of Extended Yale B's subjects 05, 15 and 22 have ratios within 1.3 times their median, those of
+# a dozen lamps far apart up to 3; the two broken ones there are 78 and 184 times above it, a planted one 7.
 _TIMES_USUAL = 5.0
 _NEIGHBOURS = 6
 _COMB = 0.01  # of the mean: below it, noise may do it and nobody is harmed
