@@ -13,6 +13,7 @@ import numpy as np
 Key = TypeVar("Key", bound=Hashable)
 
 _RESAMPLES = 10_000
+_DRAWN_AT_ONCE = 1 << 22
 _SEED = 0
 _LOW, _HIGH = 2.5, 97.5  # percent
 
@@ -56,8 +57,11 @@ def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
         return float("nan"), float("nan")
     totals = np.array([sum(group) for group in groups])
     counts = np.array([len(group) for group in groups])
-    drawn = np.random.default_rng(_SEED).integers(len(groups), size=(_RESAMPLES, len(groups)))
-    means = totals[drawn].sum(1) / counts[drawn].sum(1)
+    random, means = np.random.default_rng(_SEED), np.empty(_RESAMPLES)
+    for first in range(0, _RESAMPLES, at_once := max(1, _DRAWN_AT_ONCE // len(groups))):
+        part = means[first : first + at_once]
+        drawn = random.integers(len(groups), size=(len(part), len(groups)))
+        part[:] = totals[drawn].sum(1) / counts[drawn].sum(1)
     low, high = np.percentile(means, [_LOW, _HIGH])
     return float(low), float(high)
 

@@ -132,7 +132,7 @@ TONES = {
 
 def tone_of(ita: float) -> str:
     """The class of an ITA in degrees."""
-    return next(name for name, lowest in TONES.items() if ita > lowest)
+    return next((name for name, lowest in TONES.items() if ita > lowest), "dark")
 
 
 def tone_drift_deg(

@@ -78,7 +78,10 @@ def reconstruction(
         metrics=("si_mse", "face_distance", "ssim", *(("light_error_deg",) if folder else ())),
         by=("tone",) if folder else (),
         published=TABLE_2_RECONSTRUCTION,
-        notes=("The field is the network's own, not held to the photo: it would be exact by construction.",),
+        notes=(
+            "The field is the network's own, not held to the photo: it would be exact by construction.",
+            *(() if folder else ("Each photo counts as a person of its own.",)),
+        ),
     )
     load_before(methods, options)
     return run_protocol(layout, items, work, options, settings)

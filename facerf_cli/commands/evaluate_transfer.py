@@ -169,11 +169,11 @@ def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
         _Couple(first.name, first, second) for first, second in zip(named[::2], named[1::2], strict=True)
     ]
     for folder, members in groups.items():
-        if len(members) < 2:
-            raise UsageError(f"{folder}: one photo; give two of a person at least")
+        if len(members) % 2:
+            raise UsageError(f"{folder}: {len(members)} photos; give two of a person, or four, ...")
         place = Path(members[0].name).parent.as_posix()
         person = folder.resolve().name if place == "." else place
-        two_by_two = zip(members[::2], members[1::2], strict=False)
+        two_by_two = zip(members[::2], members[1::2], strict=True)
         couples += [_Couple(person, first, second) for first, second in two_by_two]
     return {couple.item: couple for couple in couples}
 

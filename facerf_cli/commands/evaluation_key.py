@@ -15,7 +15,7 @@ from facerf_cli.records import json_line
 
 # Settings that change no figure, wherever they stand.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
-_WITHOUT_EFFECT |= {"shard", "ray"}
+_WITHOUT_EFFECT |= {"shard", "ray", "output_base"}
 
 
 def evaluation_key(
@@ -28,18 +28,30 @@ def evaluation_key(
         "compare": _plain(compare),
         "options": _plain(options),
         "networks": networks_of(options, settings),
+        "others": [_files_of(folder) for folder in options.compare],
     }
     return hashlib.sha256(json_line(facts).encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
 
+def item_key(key: str, path: Path) -> str:
+    """The key of one item: another file of the same name is another picture."""
+    return hashlib.sha256(json_line({"run": key, "item": _plain(path)}).encode()).hexdigest()[:16]
+
+
 def networks_of(options: EvaluateOptions, settings: Settings) -> dict[str, str]:
-    """SHA-256 of the checkpoints by their names; none where no reflectance model is asked for."""
+    """SHA-256 of the checkpoints by what they are for; none where no reflectance model is asked for."""
     if not options.reflectance:
         return {}
     from facerf_cli.pipeline import DEFAULT_CHECKPOINT
 
-    paths = [settings.checkpoint or DEFAULT_CHECKPOINT, *options.against]
-    return {path.stem: _sha256(path) for path in paths}
+    own = settings.checkpoint or DEFAULT_CHECKPOINT
+    against = {f"against {path.stem}": _sha256(path) for path in options.against}
+    return {own.stem: _sha256(own), **against}
+
+
+def _files_of(folder: Path) -> list[Any]:
+    """What tells a folder of predictions from the same folder rewritten."""
+    return [_plain(path) for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
 @cache
@@ -64,6 +76,9 @@ def _plain(value: Any) -> Any:
         return [_plain(entry) for entry in value]
     if isinstance(value, (set, frozenset)):
         return sorted(map(str, value))
+    if isinstance(value, Path) and value.is_file():
+        facts = value.stat()
+        return [value.as_posix(), facts.st_size, facts.st_mtime_ns]
     if isinstance(value, (str, int, float, bool, Path)) or value is None:
         return value
     return value.tolist() if hasattr(value, "tolist") else type(value).__name__

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from facerf_cli.commands.batch import BatchOptions, Outcome, run_items, sums_up
-from facerf_cli.commands.evaluation_key import evaluation_key, networks_of
+from facerf_cli.commands.evaluation_key import evaluation_key, item_key, networks_of
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
@@ -64,8 +64,8 @@ def _check_earlier(items: Sequence[Item], work: "_Measure") -> None:
 
     if work.options.overwrite:
         return
-    paths = [path for item in items if (path := work.path_of(item)).exists()]
-    other = [path for path in paths if read_figures(path).key != work.key]
+    found = {item: path for item in items if (path := work.path_of(item)).exists()}
+    other = [path for item, path in found.items() if read_figures(path).key != work.key_of(item)]
     if other:
         raise UsageError(
             f"{work.options.output}: {len(other)} items ({other[0].stem}, ...) were evaluated with other "
@@ -95,6 +95,10 @@ class _Measure:
         """The item's figures."""
         return self.options.output / CASES / f"{item.name}.json"
 
+    def key_of(self, item: Item) -> str:
+        """What its figures depend on."""
+        return item_key(self.key, item.input_path)
+
     def outputs_of(self, item: Item) -> list[Path]:
         """What a finished item has."""
         return [self.path_of(item)]
@@ -122,7 +126,7 @@ class _Measure:
             rows += measured
         _require_whole(item, rows, wrong)
         strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings)
-        write_figures(self.path_of(item), ItemFigures(self.key, tuple(rows), strips))
+        write_figures(self.path_of(item), ItemFigures(self.key_of(item), tuple(rows), strips))
         return Outcome([], {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)})
 
 

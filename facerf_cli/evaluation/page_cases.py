@@ -51,12 +51,11 @@ def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[KeptStrip], w
     cases = sorted(cases, key=lambda case: (-badness(case), case.strip.case))
     if len(cases) == summary.pictures <= worst:
         return Chosen(tuple(cases), (), ())
-    most = max(1, min(worst, len(cases) - TYPICAL - BEST))
-    shown, rest = cases[:most], cases[most:]
-    between, best = rest[:-BEST], rest[-BEST:][::-1]
+    rest, best = cases[:-BEST], cases[-BEST:][::-1]
     cell = summary.groups[0].cells[metric].get(first)
     median = sign * cell.interval.median if cell else 0.0
-    typical = sorted(between, key=lambda case: abs(badness(case) - median))[:TYPICAL]
+    typical = sorted(rest, key=lambda case: abs(badness(case) - median))[:TYPICAL]
+    shown = [case for case in rest if case not in typical and badness(case) > median][:worst]
     return Chosen(tuple(shown), tuple(typical), tuple(best))
 
 

@@ -94,7 +94,7 @@ def read_light(path: Path) -> LightRecord:
         raise InputError(f"{path}: not a light of facerf ({error}); {_ADVICE}") from None
     provenance = fields.get("provenance")
     kept = provenance.items() if isinstance(provenance, dict) else ()
-    attributes = {name: value for name, value in kept if isinstance(value, str | int | float)}
+    attributes = {name: value for name, value in kept if _is_attribute(value)}
     return LightRecord(directions, weights, str(fields.get("rig", "")), sh, attributes)
 
 
@@ -111,6 +111,13 @@ def _parsed(path: Path) -> dict[str, Any]:
     if not isinstance(fields, dict):
         raise InputError(f"{path}: not a light of facerf (no JSON object); {_ADVICE}")
     return fields
+
+
+def _is_attribute(value: Any) -> bool:
+    """Whether a picture's header can hold it."""
+    if isinstance(value, str):
+        return True
+    return isinstance(value, int | float) and math.isfinite(value) and abs(value) < 1 << 31
 
 
 def _rig(fields: dict[str, Any]) -> tuple[Tensor, Tensor]:

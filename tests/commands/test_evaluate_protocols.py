@@ -110,12 +110,14 @@ def test_photos_are_reconstructed_in_their_crops(tmp_path: Path) -> None:
 def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) -> None:
     person = tmp_path / "ann"
     person.mkdir()
-    for name in ("a.jpg", "b.jpg", "c.jpg"):
+    for name in ("a.jpg", "b.jpg"):
         shutil.copy(PHOTO, person / name)
     assert run("transfer", "--photos", person, "-o", tmp_path / "out") == 0
     rows = images(tmp_path / "out")
     assert [row["case"] for row in rows] == ["a_by_b", "b_by_a"]
     assert {row["person"] for row in rows} == {"ann"}
+    shutil.copy(PHOTO, person / "c.jpg")
+    assert run("transfer", "--photos", person, "-o", tmp_path / "odd") == 2
     (person / "b.jpg").unlink()
     (person / "c.jpg").unlink()
     assert run("transfer", "--photos", person, "-o", tmp_path / "alone") == 2

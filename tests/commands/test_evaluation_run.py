@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.commands import evaluation_run
+from facerf_cli.commands.evaluation_key import evaluation_key, item_key
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.options import Settings
 from facerf_cli.errors import InputError, UsageError
@@ -68,6 +69,21 @@ def test_items_evaluated_otherwise_are_refused(tmp_path: Path) -> None:
     assert (tmp_path / "summary.json").exists()
     assert evaluate(tmp_path, Toy(cases=3), overwrite=True) == 0
     assert json.loads((tmp_path / "summary.json").read_text())["pictures"] == 9
+
+
+def test_another_file_of_the_same_name_is_another_picture(tmp_path: Path) -> None:
+    path = tmp_path / "anna.png"
+    path.write_bytes(b"one")
+    key = item_key("run", path)
+    assert key == item_key("run", path) != item_key("other", path)
+    path.write_bytes(b"another")
+    assert key != item_key("run", path)
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    options = EvaluateOptions(tmp_path, compare=(theirs,))
+    before = evaluation_key("toy", Toy(), options, Settings())
+    (theirs / "a.png").write_bytes(b"one")
+    assert before != evaluation_key("toy", Toy(), options, Settings())
 
 
 def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, capsys: Said) -> None:
