@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -72,10 +71,10 @@ def _text_of(value: Any, indent: str) -> str:
 
 
 def _number(value: float) -> str:
-    """The shortest decimals that the same float32 is read back from."""
+    """Decimals that the same float32 is read back from, whatever numpy's print options are."""
     if not math.isfinite(value):
         raise ValueError(f"a light of {value}")
-    return str(np.float32(value))
+    return f"{value:.9g}"
 
 
 def read_light(path: Path) -> LightRecord:
