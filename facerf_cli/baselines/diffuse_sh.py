@@ -42,8 +42,8 @@ class Diffuse:
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """See `Reflectance`; of a light its order 2 alone counts, and what that makes negative is black."""
         normals = self.normals if turn is None else torch.einsum("dc,cij->dij", turn, self.normals)
-        coefficients = [rig_coefficients(RigLight(directions, w), ORDER) for w in weights]
-        return self.albedo * shading(normals[None], torch.stack(coefficients)[None])[0]
+        coefficients = rig_coefficients(RigLight(directions, weights), ORDER)
+        return self.albedo * shading(normals[None], coefficients[None])[0]
 
 
 def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:

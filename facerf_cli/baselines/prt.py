@@ -21,7 +21,7 @@ from facerf_cli.baselines.reflectance import Explained
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sh import coefficients_to_rig, rotated, sh_basis
+from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import FaceTexture, Models
 
@@ -42,9 +42,8 @@ class Prt:
         """See `Reflectance`."""
         head_to_camera = self.rotation if turn is None else turn @ self.rotation
         order = math.isqrt(self.transfer.shape[1]) - 1
-        basis = math.pi * sh_basis(directions @ head_to_camera, order)  # rows: camera to head
-        light = torch.einsum("lk,mlc->mkc", basis, weights)
-        return self.albedo * self.shading(light)
+        in_head = RigLight(directions @ head_to_camera, weights)  # rows: camera to head
+        return self.albedo * self.shading(rig_coefficients(in_head, order))
 
     def shading(self, light: Tensor) -> Tensor:
         """Radiance [M, 3, T, T] of a white face in a light of coefficients [M, K, 3] in the head frame."""

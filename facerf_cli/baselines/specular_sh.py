@@ -24,7 +24,7 @@ from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, so
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, sh_basis
+from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, rig_coefficients, sh_basis
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import FaceTexture, Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
@@ -66,8 +66,7 @@ class SpecularSh:
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """See `Reflectance`."""
         in_photo = directions if turn is None else directions @ turn  # rows: the inverse of the turn
-        basis = math.pi * sh_basis(in_photo, GLOSS_ORDER)
-        light = torch.einsum("lk,mlc->mkc", basis, weights)
+        light = rig_coefficients(RigLight(in_photo, weights), GLOSS_ORDER)
         shading, shining = self.parts(light, turn)
         return (self.albedo * shading + self.gloss * shining).clamp_min(0)
 

@@ -47,7 +47,7 @@ def run_protocol(
     _check_earlier(items, work)
     batch = BatchOptions(options.output, options.overwrite, options.dry_run, options.jobs)
     if not options.dry_run:
-        _load_what_measures_need(options)
+        options.measures().check()  # names what is wrong with a metric's weights before anything is measured
         for name in (SUMMARY, IMAGES, PAGE):  # they speak of a run that is about to change
             (options.output / name).unlink(missing_ok=True)
     code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
@@ -71,14 +71,6 @@ def _check_earlier(items: Sequence[Item], work: "_Measure") -> None:
             f"{work.options.output}: {len(other)} items ({other[0].stem}, ...) were evaluated with other "
             "options, another checkpoint or another version; give --overwrite, or another folder"
         )
-
-
-def _load_what_measures_need(options: EvaluateOptions) -> None:
-    """Name what is wrong with the weights of a metric before anything is measured."""
-    if options.vgg_weights is not None:
-        from facerf_cli.evaluation.perceptual import perceptual_metric
-
-        perceptual_metric(options.lpips, options.vgg_weights)
 
 
 @dataclass(frozen=True)

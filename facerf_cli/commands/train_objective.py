@@ -244,14 +244,7 @@ def _mean_model(options: TrainOptions, folder: Path) -> str:
     """The face model to fit with, with shapes that do nothing: its fit is a pose."""
     from facerf_cli.face.morphable import load_face_model, save_face_model
 
-    model = load_face_model(options.fit_with)
-    still = replace(
-        model,
-        name=f"{model.name}-mean",
-        identity=model.identity[:1] * 0,
-        expression=model.expression[:1] * 0,
-        expression_names=model.expression_names[:1],
-    )
+    still = load_face_model(options.fit_with).pose_only()
     path = folder / f"{still.name}.npz"
     save_face_model(path, still)
     return str(path)

@@ -67,7 +67,7 @@ def order_of(coefficients: Tensor) -> int:
 
 
 def rig_coefficients(light: RigLight, order: int) -> Tensor:
-    """Coefficients [K, 3] of a rig's light: pi times the sum of w_l Y(d_l)."""
+    """Coefficients [..., K, 3] of a rig's lights [..., L, 3]: pi times the sum of w_l Y(d_l)."""
     basis = sh_basis(light.directions.double(), order)
     return (math.pi * basis.T @ light.weights.double()).float()
 
