@@ -198,10 +198,14 @@ def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px:
 
 
 def fit_to_arrays(fit: FaceFit) -> dict[str, np.ndarray]:
-    """A fit as plain arrays by name, for a file."""
+    """A fit as plain arrays by name, for a file.
+
+    In single precision: the last digits of a fit's doubles depend on where in memory they lay.
+    """
+    numbers = {"error_iod": np.float32(fit.error_iod)}
     tensors = {name: getattr(fit, name).numpy() for name in _TENSORS}
-    numbers = {"error_iod": fit.error_iod, **asdict(fit.crop)}
-    return {"model": np.array(fit.model), **{k: np.array(v) for k, v in numbers.items()}, **tensors}
+    crop = {name: np.array(value) for name, value in asdict(fit.crop).items()}
+    return {"model": np.array(fit.model), **numbers, **crop, **tensors}
 
 
 def fit_from_arrays(arrays: Mapping[str, np.ndarray]) -> FaceFit:

@@ -209,6 +209,14 @@ def test_a_fit_knows_its_model_and_its_quality(model):
         fit.vertices_camera(replace(model, name="other"))
 
 
+def test_a_file_does_not_hold_what_depends_on_memory(model):
+    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
+    error_iod = 0.03456789123
+    a, b = (replace(fit, error_iod=error) for error in (error_iod, np.nextafter(error_iod, 1)))
+    assert a.error_iod != b.error_iod
+    assert fit_to_arrays(a)["error_iod"].tobytes() == fit_to_arrays(b)["error_iod"].tobytes()
+
+
 def test_jaw_points_at_the_border_of_a_tight_crop_are_dropped():
     landmarks_px = CROP.to_crop(np.stack([np.linspace(0, 168, 68), np.full(68, 90.0)], -1))
     trust = trust_inside(landmarks_px, CROP, 192, 168)
