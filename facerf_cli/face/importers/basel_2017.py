@@ -1,9 +1,11 @@
 """Basel Face Model 2017 and 2019 (Gerig et al., 'Morphable Face Models - An Open Framework').
 
 HDF5 in statismo's layout: under `shape` and `expression`, `model/mean` [3 N] in millimetres,
-`model/pcaBasis` [3 N, K] of unit length and `model/pcaVariance` [K]; `shape/representer/cells` [3, F]; the
-expressions' mean is a displacement, and belongs to the neutral face (as eos reads them, Apache-2.0).
-`metadata/landmarks/json` names points on the mean, which scalismo writes as a list of `id` and `coordinates`.
+`model/pcaBasis` [3 N, K] of unit length and `model/pcaVariance` [K]; `shape/representer/cells` [3, F]. The
+neutral face is the shapes' mean; the expressions' mean is how far the people's faces were from it on average,
+up to 17 mm about an open mouth. So it is a shape of its own here: with the others it has the same second
+moments about the neutral face. `metadata/landmarks/json` names points on the shapes' mean, which scalismo
+writes as a list of `id` and `coordinates`.
 """
 
 import importlib
@@ -73,21 +75,21 @@ def _h5py() -> Any:
 
 def _source(file: Any, kind: str) -> SourceModel:
     mean, identity = _linear_model(file, "shape")
-    shift, expression = _linear_model(file, "expression")
+    usual, expression = _linear_model(file, "expression")
     triangles = _numbers(file, "shape/representer/cells").astype(np.int64).T
-    if shift.shape != mean.shape:
-        raise ValueError(f"its expressions have {len(shift)} vertices, its shapes {len(mean)}")
-    mean = mean + shift
+    if usual.shape != mean.shape:
+        raise ValueError(f"its expressions have {len(usual)} vertices, its shapes {len(mean)}")
     require_mesh(mean, triangles)
+    names = tuple(f"expression_{index:03d}" for index in range(len(expression)))
     return SourceModel(
         name=kind,
         licence=_LICENCE.format(year=_YEARS[kind]),
         mean=mean,
         identity=identity,
-        expression=expression,
-        expression_names=tuple(f"expression_{index:03d}" for index in range(len(expression))),
+        expression=np.concatenate([usual[None].astype(expression.dtype), expression]),
+        expression_names=("mean_expression", *names),
         triangles=triangles,
-        known=_known(file, mean, shift),
+        known=_known(file, mean),
     )
 
 
@@ -133,7 +135,7 @@ def _dataset(file: Any, name: str) -> Any:
     return at
 
 
-def _known(file: Any, mean: np.ndarray, shift: np.ndarray) -> dict[int, np.ndarray]:
+def _known(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
     """The named points on the mean [N, 3], by their number among the 68; none where the file has no names."""
     try:
         dataset = _dataset(file, "metadata/landmarks/json")
@@ -141,15 +143,20 @@ def _known(file: Any, mean: np.ndarray, shift: np.ndarray) -> dict[int, np.ndarr
         return {}
     if dataset.nbytes > _MAX_TEXT:
         raise ValueError("metadata/landmarks/json is too long")
-    text = dataset[()]
     known = {}
-    for entry in json.loads(text if isinstance(text, (str, bytes)) else np.asarray(text).tobytes()):
+    for entry in json.loads(_text(dataset[()])):
         number = _LANDMARKS.get(str(entry["id"]))
         point = np.array(entry["coordinates"], dtype=np.float64) / 1000
         if number is None or point.shape != (3,) or not np.isfinite(point).all():
             continue
-        neutral = mean - shift  # they are marked on the shapes' own mean
-        nearest = np.linalg.norm(neutral - point, axis=-1).argmin()
-        if np.linalg.norm(neutral[nearest] - point) < _ON_MEAN_M:
+        nearest = np.linalg.norm(mean - point, axis=-1).argmin()
+        if np.linalg.norm(mean[nearest] - point) < _ON_MEAN_M:
             known[number] = mean[nearest]
     return known
+
+
+def _text(stored: Any) -> str | bytes:
+    """What h5py gives of a text: itself, bytes, or an array of one text or of its bytes."""
+    if isinstance(stored, np.ndarray) and stored.dtype.kind in "OSU" and stored.size == 1:
+        stored = stored.item()
+    return stored if isinstance(stored, (str, bytes)) else np.asarray(stored).tobytes()

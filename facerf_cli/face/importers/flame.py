@@ -3,7 +3,7 @@
 Its files, 2019 to 2023, hold `v_template` [5023, 3] in metres, `f` [9976, 3], and `shapedirs` [5023, 3, 400]:
 300 shapes of identity and 100 of expression, each scaled by its standard deviation (as smplx, DECA and others
 read them). A mouth opens by turning the jaw, which is no shape there: `posedirs`, `weights` and `J_regressor`
-make three shapes of it here.
+make three shapes of it here. In `flame2023_no_jaw.pkl` the expressions open it, and its jaw is not to be turned.
 """
 
 from collections.abc import Mapping
@@ -27,6 +27,9 @@ _LICENCE = (
     "FLAME, (c) Max-Planck-Gesellschaft; under the licence that its download came with "
     "(flame.is.tue.mpg.de; non-commercial research, unless that says otherwise)"
 )
+_OPEN_LICENCE = "FLAME 2023 Open, (c) Max-Planck-Gesellschaft; CC BY 4.0 (flame.is.tue.mpg.de)"
+_OPEN_KEY = "supr_expression_metadata"  # which FLAME 2023 Open alone has
+_NO_JAW = "no_jaw"  # in a file's name; nothing in the file says so
 _JAW, _JOINTS = 2, 5  # of the joints: root, neck, jaw and two eyes
 _JAW_STD_RAD = 0.1  # a coefficient of 3 opens a mouth by 17 degrees
 _JAW_SHAPES = {
@@ -50,7 +53,7 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
         raw = read_npz(path) if path.suffix == ".npz" else read_inert_pickle(path)
         if not isinstance(raw, dict):
             raise ValueError(f"it holds a {type(raw).__name__}, not a table of arrays")
-        source = _source({key: value for key, value in raw.items() if isinstance(key, str)})
+        source = _source({key: value for key, value in raw.items() if isinstance(key, str)}, path.stem)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))[:160]
         raise InputError(f"{path}: not a FLAME model ({reason}); download it again") from None
@@ -72,7 +75,7 @@ def _model_file(path: Path) -> Path:
     return models[0]
 
 
-def _source(raw: Mapping[str, Any]) -> SourceModel:
+def _source(raw: Mapping[str, Any], stem: str) -> SourceModel:
     mean = array_of(raw["v_template"]).astype(np.float64)
     triangles = array_of(raw["f"]).astype(np.int64)
     shapes = array_of(raw["shapedirs"])
@@ -82,11 +85,11 @@ def _source(raw: Mapping[str, Any]) -> SourceModel:
     if not np.isfinite(shapes).all():
         raise ValueError("shapedirs holds values that are not finite")
     bases = np.moveaxis(shapes, -1, 0).astype(np.float32)
-    jaw = _jaw_shapes(mean, raw)
+    jaw = {} if _NO_JAW in stem else _jaw_shapes(mean, raw)
     names = tuple(f"expression_{index:03d}" for index in range(len(bases[IDENTITIES:])))
     return SourceModel(
         name="flame",
-        licence=_LICENCE,
+        licence=_OPEN_LICENCE if _OPEN_KEY in raw else _LICENCE,
         mean=mean,
         identity=bases[:IDENTITIES],
         expression=np.concatenate([bases[IDENTITIES:], *jaw.values()]),

@@ -66,28 +66,27 @@ def written_mat(path: Path, arrays: dict[str, Any]) -> Path:
 
 @pytest.fixture(scope="module")
 def shift(face: Head) -> np.ndarray:
-    """The mean of the expressions: a displacement of the mouth."""
+    """The mean of the expressions: a displacement of the mouth from the neutral face."""
     around = np.exp(-((np.linalg.norm(face.mean - face.landmarks[62], axis=-1) / 0.02) ** 2))
     return 0.001 * around[:, None] * [0.0, -1, 0]
 
 
 def h5(path: Path, face: Head, shift: np.ndarray, **changes: Any) -> Path:
     """`model2017-1_*.h5`: statismo's groups, millimetres, and scalismo's landmarks."""
-    neutral = face.mean - shift
     basis, deviations = orthonormal(face.shapes * 1000, SHAPES)
     moved, spread = orthonormal(face.shapes[:1] * 500, EXPRESSIONS)
     marks = [
-        {"coordinates": (1000 * neutral[_nearest(face, number)]).tolist(), "id": name}
+        {"coordinates": (1000 * face.mean[_nearest(face, number)]).tolist(), "id": name}
         for number, name in NAMES.items()
     ]
     inside = [{"coordinates": (1000 * face.mean.mean(0)).tolist(), "id": "center.nose.tip"}]
     tables: dict[str, Any] = {
-        "shape/model/mean": (1000 * neutral).ravel().astype("f4"),
+        "shape/model/mean": (1000 * face.mean).ravel().astype("f4"),
         "shape/model/pcaBasis": basis,
         "shape/model/pcaVariance": (deviations**2).ravel(),
         "shape/model/noiseVariance": np.zeros(1, "f4"),
         "shape/representer/cells": face.triangles.T.astype("i4"),
-        "shape/representer/points": (1000 * neutral).T.astype("f4"),
+        "shape/representer/points": (1000 * face.mean).T.astype("f4"),
         "expression/model/mean": (1000 * shift).ravel().astype("f4"),
         "expression/model/pcaBasis": moved,
         "expression/model/pcaVariance": (spread**2).ravel(),
@@ -147,8 +146,10 @@ def test_basel_2017_is_read_in_metres_and_deviations(
     np.testing.assert_allclose(source.mean, face.mean, atol=1e-7)
     np.testing.assert_array_equal(source.triangles, face.triangles)
     np.testing.assert_allclose(source.identity[: len(face.shapes)], face.shapes, atol=1e-8)
-    np.testing.assert_allclose(source.expression[0], face.shapes[0] / 2, atol=1e-8)
-    assert source.expression.shape[0] == EXPRESSIONS and len(source.expression_names) == EXPRESSIONS
+    np.testing.assert_allclose(source.expression[0], shift, atol=1e-8)  # zeros are the neutral face
+    np.testing.assert_allclose(source.expression[1], face.shapes[0] / 2, atol=1e-8)
+    assert len(source.expression) == len(source.expression_names) == EXPRESSIONS + 1
+    assert source.expression_names[:2] == ("mean_expression", "expression_000")
     assert set(source.known) == set(NAMES)
     for number, point in source.known.items():
         np.testing.assert_allclose(point, face.mean[_nearest(face, number)], atol=1e-7)
@@ -162,12 +163,13 @@ def test_basel_2017_s_names_help_to_find_the_other_landmarks(tmp_path: Path) -> 
     assert off[others].mean() < 1.0 and off[others].max() < 2.5
     model = carry_over(source)
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
-    assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS
+    assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS + 1
 
 
 def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_path: Path) -> None:
-    text = json.dumps([{"coordinates": (1000 * (face.mean - shift)[7]).tolist(), "id": "center.nose.tip"}])
-    for written in (np.bytes_(text.encode()), np.frombuffer(text.encode(), np.uint8)):
+    text = json.dumps([{"coordinates": (1000 * face.mean[7]).tolist(), "id": "center.nose.tip"}])
+    encoded = text.encode()  # scalismo writes an array of one text of fixed length
+    for written in (np.bytes_(encoded), np.array([encoded]), [text], np.frombuffer(encoded, np.uint8)):
         path = h5(tmp_path / "model.h5", face, shift, **{"metadata/landmarks/json": written})
         assert set(read_basel_2017(path).known) == {30}
     path = h5(tmp_path / "model.h5", face, shift, **{"metadata/landmarks/json": None})
@@ -235,6 +237,7 @@ WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
     "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "leads elsewhere"),
     "names that are none": ({"metadata/landmarks/json": "[1, 2"}, "not a Basel Face Model 2017"),
     "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
+    "a number for names": ({"metadata/landmarks/json": 10**15}, "not a Basel Face Model 2017"),
     "metres": ({"shape/model/mean": np.zeros(10800)}, "the unit of its"),
 }
 

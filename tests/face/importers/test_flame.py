@@ -184,6 +184,21 @@ def test_a_table_of_arrays_is_as_good_as_a_pickle(face: Head, source: SourceMode
     assert len(again.expression) == 100  # no skeleton, no jaw
 
 
+def test_without_a_jaw_the_expressions_open_the_mouth(face: Head, tmp_path: Path) -> None:
+    path = tmp_path / "flame2023_no_jaw.pkl"
+    path.write_bytes(pickle.dumps(tables(face, 301)))
+    assert read_flame(path).expression_names == ("expression_000",)
+
+
+def test_the_open_model_s_licence_is_its_own(face: Head, tmp_path: Path) -> None:
+    said = {"expr_components": "last_100", "n_expr": 100}
+    path = tmp_path / "flame2023_Open.pkl"
+    path.write_bytes(pickle.dumps(changed(face, supr_expression_metadata=said)))
+    assert "CC BY 4.0" in read_flame(path).licence
+    path.write_bytes(pickle.dumps(changed(face)))
+    assert "CC BY" not in read_flame(path).licence
+
+
 def changed(face: Head, **changes: Any) -> dict[str, Any]:
     made = tables(face, 2)
     return {key: value for key, value in {**made, **changes}.items() if value is not None}
