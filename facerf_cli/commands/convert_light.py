@@ -9,7 +9,14 @@ import typer
 
 from facerf_cli.commands.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.commands.inputs import Item
-from facerf_cli.commands.options import DryRunOption, JobsOption, OutputOption, OverwriteOption, settings_of
+from facerf_cli.commands.options import (
+    DryRunOption,
+    JobsOption,
+    OutputOption,
+    OverwriteOption,
+    refuse_given,
+    settings_of,
+)
 from facerf_cli.commands.values import parse_directions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import LOGGER_NAME
@@ -29,6 +36,13 @@ _ENDINGS: dict[Form, str] = {
     "sfsnet": "_sfsnet.txt",
     "blender": "_blender.exr",
     "mitsuba": "_mitsuba.exr",
+}
+_MAPS: tuple[Form, ...] = ("latlong", "blender", "mitsuba")
+_MADE_FOR: dict[str, tuple[Form, ...]] = {  # what an option says something of
+    "width": _MAPS,
+    "order": ("json", "sh"),
+    "lights": ("json",),
+    "signed": ("json", *_MAPS),
 }
 _SUFFIXES = frozenset({".exr", ".hdr", ".json", ".txt"})
 _MOST_ORDER = 20
@@ -211,6 +225,9 @@ def convert_light(
     """
     if unknown := [form for form in to if form not in get_args(Form)]:
         raise UsageError(f"--to {unknown[0]}: no such form; there are {', '.join(_ENDINGS)}")
+    for option, made in _MADE_FOR.items():
+        if not set(made) & set(to):
+            refuse_given(context, (option,), f"is for --to {', '.join(made)}; leave it out here")
     if width is not None and width % 2:
         raise UsageError(f"--width {width}: the height is half of it, so give an even number")
     if lights is not None:

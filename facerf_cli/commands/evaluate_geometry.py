@@ -20,6 +20,8 @@ from facerf_cli.commands.evaluation_items import (
     only_dataset,
     people_items,
     read_split,
+    refuse_for_others,
+    refuse_without_field,
 )
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_photos import photo_items, portraits
@@ -68,10 +70,12 @@ def geometry(
     no_part_of_preset(options, every)
     if options.against:
         raise UsageError("--against does not apply to geometry; give --checkpoint and --mean-checkpoint")
+    folder = only_dataset(inputs)
+    refuse_for_others(context, photos=folder is None)
+    refuse_without_field(context, options, "mean_checkpoint")
     photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks)
     photo.check()
     forms = _FormOptions(MethodOptions.of(photo, options), mean_checkpoint, options.keep_eyes)
-    folder = only_dataset(inputs)
     work: _OfPhotos | _OfPeople
     if folder is None:
         items = photo_items(inputs, options, PAPER_PHOTOS)

@@ -19,6 +19,7 @@ from facerf_cli.commands.evaluation_items import (
     no_part_of_preset,
     people_items,
     read_split,
+    refuse_without_field,
     require_enough,
 )
 from facerf_cli.commands.evaluation_options import EvaluateOptions
@@ -60,6 +61,7 @@ def olat(
 
     settings = settings_of(context)
     no_part_of_preset(options, every)
+    refuse_without_field(context, options, "network_alone")
     photo = PhotoOptions(settings, face_model=face_model)
     prepared, pairs = read_split(dataset, split, face_model, refit)
     chosen = _paper_pairs(dataset, pairs) if options.preset else every_nth(pairs, every)

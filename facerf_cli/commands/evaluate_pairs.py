@@ -13,7 +13,6 @@ from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_run import run_protocol
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import settings_of
-from facerf_cli.errors import UsageError
 from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
@@ -81,16 +80,16 @@ def pairs(
     Trees are mirrored and names must match, suffixes may differ. A missing, an additional and a differently
     sized prediction is an error: no table is made of what is left.
     """
+    from facerf_cli.evaluation.folder_names import folder_name
     from facerf_cli.evaluation.pairs import collect_pairs
     from facerf_cli.evaluation.summary import Layout
 
+    options.require_output_apart([*predictions, truth, *([] if masks is None else [masks])])
     found = collect_pairs(predictions, truth, masks, facts)
-    if options.output.resolve() in {folder.resolve() for folder in (*predictions, truth)}:
-        raise UsageError(f"-o {options.output}: is a folder of pictures; give another one")
     by = dict.fromkeys(n for pair in found for n, value in pair.facts.items() if isinstance(value, str))
     asked = {"lpips": options.vgg_weights is not None, "face_distance": face_distance}
     metrics = ("si_mse", "mse", "psnr", "ssim", *(name for name, wanted in asked.items() if wanted))
-    layout = Layout("pairs", f"Predictions against {truth.name}", metrics, tuple(by))
+    layout = Layout("pairs", f"Predictions against {folder_name(truth)}", metrics, tuple(by))
     size = math.ceil(len(found) / _ITEMS_AT_MOST)
     starts = range(0, len(found), size)
     items = [Item(truth, options.output / f"part-{n:02d}", f"part-{n:02d}") for n, _ in enumerate(starts)]

@@ -19,6 +19,7 @@ from facerf_cli.commands.evaluation_items import (
     only_dataset,
     people_items,
     read_split,
+    refuse_for_others,
 )
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_photos import photo_items, portraits
@@ -59,10 +60,11 @@ def reconstruction(
 
     settings = settings_of(context)
     no_part_of_preset(options, every)
+    folder = only_dataset(inputs)
+    refuse_for_others(context, photos=folder is None)
     photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks)
     photo.check()
     methods = MethodOptions.of(photo, options)
-    folder = only_dataset(inputs)
     work: _OfPhotos | _OfPeople
     if folder is None:
         items = photo_items(inputs, options, PAPER_PHOTOS)

@@ -19,6 +19,8 @@ from facerf_cli.commands.evaluation_items import (
     only_dataset,
     people_items,
     read_split,
+    refuse_for_others,
+    refuse_without_field,
     require_enough,
 )
 from facerf_cli.commands.evaluation_options import EvaluateOptions
@@ -78,6 +80,8 @@ def transfer(
 
     settings = settings_of(context)
     no_part_of_preset(options, every)
+    refuse_for_others(context, photos)
+    refuse_without_field(context, options, "held_to_photo")
     photo = PhotoOptions(settings, input_colourspace, face_model, landmarks=landmarks)
     photo.check()
     methods = MethodOptions.of(photo, options)
@@ -175,7 +179,23 @@ def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
         person = folder.resolve().name if place == "." else place
         two_by_two = zip(members[::2], members[1::2], strict=True)
         couples += [_Couple(person, first, second) for first, second in two_by_two]
+    _require_different(couples)
     return {couple.item: couple for couple in couples}
+
+
+def _require_different(couples: Sequence[_Couple]) -> None:
+    """UsageError where a couple is one photo twice, or the same two photos as another couple."""
+    seen: set[frozenset[Path]] = set()
+    for couple in couples:
+        files = frozenset(item.input_path.resolve() for item in (couple.first, couple.second))
+        if len(files) < 2:
+            raise UsageError(
+                f"{couple.first.input_path}: given twice; give two photos of a person, A B A B ..."
+            )
+        if files in seen:
+            both = f"{couple.first.input_path} and {couple.second.input_path}"
+            raise UsageError(f"{both}: given as a couple twice; give them once")
+        seen.add(files)
 
 
 def _preset_couples(couples: dict[Item, _Couple], options: EvaluateOptions) -> dict[Item, _Couple]:

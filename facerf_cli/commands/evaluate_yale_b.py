@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from facerf_cli.commands.evaluation_items import MethodOptions, load_methods
+from facerf_cli.commands.evaluation_items import MethodOptions, load_methods, refuse_without_field
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_run import run_protocol
 from facerf_cli.commands.inputs import Item
@@ -70,6 +70,7 @@ def yale_b(
     from facerf_cli.stage.data.yale_b import read_shifts, read_yale_b
 
     settings = settings_of(context)
+    refuse_without_field(context, options, "network_alone")
     database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
     chosen = _chosen(database, subjects or [])
     photo = PhotoOptions(settings, face_model=face_model)

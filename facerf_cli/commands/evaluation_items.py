@@ -11,6 +11,7 @@ import typer
 
 from facerf_cli.commands.evaluation_options import EvaluateOptions, KindName
 from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.options import refuse_given
 from facerf_cli.commands.photo import PhotoOptions, load_models_once
 from facerf_cli.errors import UsageError
 
@@ -48,6 +49,9 @@ RefitOption = Annotated[
         "--refit", help="Fit each of DATASET's pictures by its own landmarks, not a person's all at once."
     ),
 ]
+
+_OF_DATASETS = ("split", "every", "refit")
+_OF_PHOTOS = ("face", "landmarks", "input_colourspace")
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,18 @@ def only_dataset(inputs: Sequence[str]) -> Path | None:
     if datasets and len(inputs) > 1:
         raise UsageError(f"{datasets[0]}: give one dataset alone, or photos")
     return datasets[0] if datasets else None
+
+
+def refuse_for_others(context: typer.Context, photos: bool) -> None:
+    """UsageError for an option of datasets beside photos, or of photos beside a dataset."""
+    names, kind = (_OF_DATASETS, "a prepared dataset") if photos else (_OF_PHOTOS, "photos")
+    refuse_given(context, names, f"is for {kind}; leave it out here")
+
+
+def refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
+    """UsageError for an option of the field where that is not among the methods."""
+    if "field" not in options.reflectance and not options.against:
+        refuse_given(context, (name,), "is for the field; give --reflectance field too, or leave it out")
 
 
 def read_split(

@@ -13,9 +13,10 @@ from facerf_cli.commands.options import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.records import json_line
 
-# Settings that change no figure, wherever they stand.
+# Settings that change no figure, wherever they stand; and those that are a name or a file's path.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
 _WITHOUT_EFFECT |= {"shard", "ray", "output_base"}
+_NAME_OR_PATH = {"face_model", "vgg_weights"}
 
 
 def evaluation_key(
@@ -64,21 +65,28 @@ def _sha256(path: Path) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Settings as JSON can have them; what is no setting is told by its type alone."""
+    """Settings as JSON can have them; what is no setting is told by its type alone.
+
+    A path is told by what it leads to, however it was written; a file by its size and time as well.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name for field in dataclasses.fields(value)} - _WITHOUT_EFFECT
-        return {"type": type(value).__name__} | {
-            name: _plain(getattr(value, name)) for name in sorted(fields)
-        }
+        return {"type": type(value).__name__} | {name: _field(value, name) for name in sorted(fields)}
     if isinstance(value, Mapping):
-        return {str(name): _plain(entry) for name, entry in value.items()}
+        return [[_plain(name), _plain(entry)] for name, entry in value.items()]
     if isinstance(value, (list, tuple)):
         return [_plain(entry) for entry in value]
     if isinstance(value, (set, frozenset)):
         return sorted(map(str, value))
-    if isinstance(value, Path) and value.is_file():
-        facts = value.stat()
-        return [value.as_posix(), facts.st_size, facts.st_mtime_ns]
-    if isinstance(value, (str, int, float, bool, Path)) or value is None:
+    if isinstance(value, Path):
+        facts = value.stat() if value.is_file() else None
+        return [value.resolve(), *((facts.st_size, facts.st_mtime_ns) if facts else ())]
+    if isinstance(value, (str, int, float, bool)) or value is None:
         return value
     return value.tolist() if hasattr(value, "tolist") else type(value).__name__
+
+
+def _field(settings: Any, name: str) -> Any:
+    value = getattr(settings, name)
+    is_file = name in _NAME_OR_PATH and value is not None and Path(value).is_file()
+    return _plain(Path(value) if is_file else value)

@@ -1,7 +1,7 @@
 """The options that every protocol of `facerf evaluate` has beside its own, named and explained once."""
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -10,6 +10,7 @@ import typer
 
 from facerf_cli.commands.options import DryRunOption, JobsOption, OutputOption, OverwriteOption
 from facerf_cli.errors import UsageError
+from facerf_cli.evaluation.folder_names import folder_name
 
 if TYPE_CHECKING:
     from facerf_cli.evaluation.measure import Measures
@@ -103,7 +104,7 @@ class EvaluateOptions:
 
     def check(self) -> None:
         """Raise for what would fail every item alike."""
-        names = [*self.methods, *(folder.name for folder in self.compare)]
+        names = [*self.methods, *map(folder_name, self.compare)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise UsageError(f"two methods are called {twice[0]!r}; rename one's file or folder")
@@ -113,8 +114,17 @@ class EvaluateOptions:
         for folder in self.compare:
             if not folder.is_dir():
                 raise UsageError(f"--compare {folder}: no such folder")
+        self.require_output_apart(self.compare)
         if self.lpips is not None and self.vgg_weights is None:
             raise UsageError("--lpips is measured with --vgg-weights imagenet, or a file of VGG-16's weights")
+
+    def require_output_apart(self, folders: Iterable[Path]) -> None:
+        """UsageError for an output folder in one whose pictures are read: the next run would read it too."""
+        for folder in folders:
+            if self.output.resolve().is_relative_to(folder.resolve()):
+                raise UsageError(
+                    f"-o {self.output}: is {folder} or lies in it, which is read; give another one"
+                )
 
     def measures(self) -> "Measures":
         """How pictures are measured."""

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.commands.photo import PhotoOptions, face_model, fit_faces, read_photo
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from facerf_cli.evaluation.cases import Case
@@ -31,5 +31,8 @@ def portraits(item: Item, photo: PhotoOptions, keep_eyes: bool) -> "Iterator[tup
     picture = read_photo(item, photo)
     for face in fit_faces(item, picture, photo):
         name = f"{item.name}{face.tag}"
-        of = face.fit, face.cropped, picture.pixels.shape, keep_eyes
-        yield Case(name, name, {"quality": face.fit.quality}), Portrait.of(face_model(photo), *of)
+        try:
+            portrait = Portrait.of(face_model(photo), face.fit, face.cropped, picture, keep_eyes)
+        except InputError as error:
+            raise InputError(f"{item.input_path}: {error}") from None
+        yield Case(name, name, {"quality": face.fit.quality}), portrait

@@ -18,8 +18,8 @@ PICTURES, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
 
 
-def keep_pictures(comparison: "Comparison", folder: Path, settings: Settings) -> None:
-    """Write FOLDER/pictures/{source,truth,mask,METHOD}/CASE.exr, scene-linear.
+def keep_pictures(comparison: "Comparison", folder: Path, settings: Settings) -> list[str]:
+    """Write FOLDER/pictures/{source,truth,mask,METHOD}/CASE.exr, scene-linear; give the paths from FOLDER on.
 
     Predictions carry the mark of what facerf makes; sources and truths are given and carry its version only.
     """
@@ -28,17 +28,18 @@ def keep_pictures(comparison: "Comparison", folder: Path, settings: Settings) ->
     from facerf_cli.files.images import write_exr
 
     name = comparison.case.name
-    given = {"truth": comparison.truth, "mask": comparison.mask, "source": comparison.source}
+    asked = {"truth": comparison.truth, "mask": comparison.mask, "source": comparison.source}
+    given = {kind: picture for kind, picture in asked.items() if picture is not None}
     clash = set(given) & set(comparison.predictions)
     if clash:
         raise InputError(f"a method is called {clash.pop()!r}, as a folder of --pictures is; rename it")
     for kind, picture in given.items():
-        if picture is not None:
-            pixels = np.broadcast_to(picture.reshape(*picture.shape[:2], -1), (*picture.shape[:2], 3))
-            write_exr(_place(folder, kind, name), pixels, metadata={"Software": _software()})
+        pixels = np.broadcast_to(picture.reshape(*picture.shape[:2], -1), (*picture.shape[:2], 3))
+        write_exr(folder / _place(kind, name), pixels, metadata={"Software": _software()})
     for method, picture in comparison.predictions.items():
         marks = Provenance(name, _checkpoint_of(method, settings)).attributes()
-        write_exr(_place(folder, method, name), picture, metadata=marks)
+        write_exr(folder / _place(method, name), picture, metadata=marks)
+    return [_place(kind, name) for kind in (*given, *comparison.predictions)]
 
 
 def _software() -> str:
@@ -52,12 +53,12 @@ def _checkpoint_of(method: str, settings: Settings) -> str:
     return (settings.checkpoint or DEFAULT_CHECKPOINT).stem if method == "field" else method
 
 
-def _place(folder: Path, kind: str, case: str) -> Path:
-    """Where a case's picture is kept; a name that leads out of the folder is an error."""
+def _place(kind: str, case: str) -> str:
+    """Where in the folder a case's picture is kept; a name that leads out of it is an error."""
     parts = PurePosixPath(case).parts
     if not parts or ".." in parts or PurePosixPath(case).is_absolute() or "/" in kind:
         raise InputError(f"{kind}/{case}: is no name for a picture in a folder")
-    return folder / PICTURES / kind / f"{case}.exr"
+    return f"{PICTURES}/{kind}/{case}.exr"
 
 
 def keep_strips(

@@ -37,8 +37,9 @@ def run_protocol(
 
     `compare` (a frozen dataclass, for it goes to other processes) yields an item's pictures one after
     another. An item's rows are DIR/cases/ITEM.json, so finished items are skipped and a run that was cut off
-    goes on. When all are there: DIR/summary.json, DIR/images.csv, DIR/report.html, and a table on stdout.
-    Where an item failed or a prediction is missing, each is named and no summary is written.
+    goes on; an item is unfinished where a strip or picture that it kept is gone. When all are there:
+    DIR/summary.json, DIR/images.csv, DIR/report.html, and a table on stdout. Where an item failed or a
+    prediction is missing, each is named and no summary is written.
     """
     if not items:
         raise UsageError(f"evaluate {protocol.name}: nothing to evaluate")
@@ -92,8 +93,12 @@ class _Measure:
         return item_key(self.key, item.input_path)
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """What a finished item has."""
-        return [self.path_of(item)]
+        """What a finished item has: its figures, and the pictures that they name."""
+        from facerf_cli.evaluation.case_files import read_figures
+
+        path = self.path_of(item)
+        kept = () if self.options.overwrite or not path.exists() else read_figures(path).files
+        return [path, *(self.options.output / file for file in kept)]
 
     def __call__(self, item: Item) -> Outcome:
         """Measure an item's pictures one after another; its figures are written when all are measured."""
@@ -105,11 +110,12 @@ class _Measure:
 
         rows: list[Row] = []
         wrong: list[str] = []
+        pictures: list[str] = []
         scaled = self.metric.startswith("si_") and self.options.space == "linear"
         keeper, measures = StripKeeper(self.metric), self.options.measures()
         for own in self.compare(item):
             if self.options.pictures:
-                keep_pictures(own, self.options.output, self.settings)
+                pictures += keep_pictures(own, self.options.output, self.settings)
             comparison = _with_others(own, self.options.compare, wrong)
             if wrong:
                 continue  # all that is missing is to be named, at once
@@ -118,7 +124,8 @@ class _Measure:
             rows += measured
         _require_whole(item, rows, wrong)
         strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings)
-        write_figures(self.path_of(item), ItemFigures(self.key_of(item), tuple(rows), strips))
+        figures = ItemFigures(self.key_of(item), tuple(rows), strips, tuple(pictures))
+        write_figures(self.path_of(item), figures)
         return Outcome([], {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)})
 
 

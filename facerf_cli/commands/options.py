@@ -58,6 +58,24 @@ def settings_of(context: typer.Context) -> Settings:
     return settings
 
 
+def was_given(context: typer.Context, name: str) -> bool:
+    """Whether the command line names an option, be it with its default."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def flag(name: str) -> str:
+    """An option as it is typed."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse_given(context: typer.Context, names: Sequence[str], why: str) -> None:
+    """UsageError for those of the options that were given although they would do nothing; `why` goes on."""
+    for name in names:
+        if was_given(context, name):
+            raise UsageError(f"{flag(name)} {why}")
+
+
 def torch_device(settings: Settings) -> "torch.device":
     """Seed torch and give the device that `--device` names; `auto` takes cuda, then mps, then cpu."""
     import torch

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from facerf_cli.commands.options import flag, was_given
 from facerf_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -27,16 +28,16 @@ _STAGES = {  # that an option means something to
 
 def refuse_what_makes_no_sense(context: "typer.Context", stage: str) -> None:
     """UsageError for what was given although it means nothing beside the rest of the line."""
-    given = {name for name in context.params if _was_given(context, name)}
+    given = {name for name in context.params if was_given(context, name)}
     for name, stages in _STAGES.items():
         if name in given and stage not in stages:
-            raise UsageError(f"{_flag(name)} means nothing to the stage {stage}; leave it out")
+            raise UsageError(f"{flag(name)} means nothing to the stage {stage}; leave it out")
     if stage == "joint" and "dataset" not in given:
         raise UsageError("the stage joint learns from a prepared dataset; give --dataset")
     for name in ("heads_from", "heads", "views", "bank"):
         if {name, "dataset"} <= given:
             raise UsageError(
-                f"{_flag(name)} is for synthetic heads, and --dataset takes their place; give one of them"
+                f"{flag(name)} is for synthetic heads, and --dataset takes their place; give one of them"
             )
     if "texture_size" in given and "dataset" not in given:
         raise UsageError("--texture-size is for a prepared dataset; give --dataset beside it")
@@ -44,12 +45,3 @@ def refuse_what_makes_no_sense(context: "typer.Context", stage: str) -> None:
         raise UsageError("--mean-face: a dataset was fitted already; give --stage joint, or synthetic heads")
     if {"without_normals", "start_from"} <= given:
         raise UsageError("--without-normals: the networks of --start-from are as they are; give one of them")
-
-
-def _was_given(context: "typer.Context", name: str) -> bool:
-    source = context.get_parameter_source(name)
-    return source is not None and source.name == "COMMANDLINE"
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"

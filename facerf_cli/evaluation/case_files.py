@@ -14,7 +14,7 @@ from facerf_cli.evaluation.measure import Row
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.records import json_line
 
-FORMAT = "facerf-evaluation-1"
+FORMAT = "facerf-evaluation-2"
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,26 @@ class KeptStrip:
 
 @dataclass(frozen=True)
 class ItemFigures:
-    """What an item left: the key of how it was evaluated, its rows, its strips."""
+    """What an item left: the key of how it was evaluated, its rows, its strips.
+
+    `pictures` are those that were kept for other methods; their paths, too, start from the evaluation's
+    folder.
+    """
 
     key: str
     rows: tuple[Row, ...]
     strips: tuple[KeptStrip, ...]
+    pictures: tuple[str, ...]
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """All that was kept beside the figures."""
+        return (*(strip.file for strip in self.strips), *self.pictures)
 
 
 def write_figures(path: Path, figures: ItemFigures) -> None:
     """Write an item's figures as one line of JSON, whole or not at all; NaN and infinity become null."""
-    content = {"format": FORMAT, "key": figures.key}
-    content |= {"rows": [asdict(row) for row in figures.rows]}  # type: ignore[dict-item]
-    content |= {"strips": [asdict(strip) for strip in figures.strips]}  # type: ignore[dict-item]
+    content = {"format": FORMAT, **asdict(figures)}
     with atomic_path(path) as temporary:
         temporary.write_text(json_line(content) + "\n", encoding="utf-8", errors="backslashreplace")
 
@@ -55,7 +63,8 @@ def read_figures(path: Path) -> ItemFigures:
         if content["format"] != FORMAT:
             raise ValueError(f"its format is {content['format']!r}")
         rows = tuple(_row(entry) for entry in content["rows"])
-        return ItemFigures(content["key"], rows, tuple(_strip(entry) for entry in content["strips"]))
+        strips = tuple(_strip(entry) for entry in content["strips"])
+        return ItemFigures(content["key"], rows, strips, tuple(map(str, content["pictures"])))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         advice = "remove it, or give --overwrite"
         raise InputError(f"{path}: no figures of an evaluation ({error}); {advice}") from None

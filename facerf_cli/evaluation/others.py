@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
+from facerf_cli.evaluation.folder_names import folder_name
 from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
 
 SUFFIXES = (".exr", ".png", ".npy")
@@ -31,7 +32,7 @@ class Others:
         found, wrong = {}, []
         for folder in self.folders:
             try:
-                found[folder.name] = _prediction(folder, case, shape, self.grey_as_given)
+                found[folder_name(folder)] = _prediction(folder, case, shape, self.grey_as_given)
             except InputError as error:
                 wrong.append(str(error))
         if wrong:

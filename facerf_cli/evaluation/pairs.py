@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.facts_file import Facts, read_facts
+from facerf_cli.evaluation.folder_names import folder_name
 from facerf_cli.evaluation.others import read_array
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import Picture, read_image
@@ -49,10 +50,10 @@ def collect_pairs(
     others = [*predictions, *([] if masks is None else [masks])]
     _check_folders(predictions, [truths, *others])
     found = _pictures_in(truths, others)
-    by_method = {folder.name: _pictures_in(folder, [truths, *others]) for folder in predictions}
+    by_method = {folder_name(folder): _pictures_in(folder, [truths, *others]) for folder in predictions}
     mask_files = {} if masks is None else _pictures_in(masks, [truths, *predictions])
     described = {} if facts is None else read_facts(facts)
-    complaints = [_mismatch(found, by_method[folder.name], str(folder)) for folder in predictions]
+    complaints = [_mismatch(found, by_method[folder_name(folder)], str(folder)) for folder in predictions]
     complaints += [_mismatch(found, mask_files, str(masks))] if masks is not None else []
     complaints += [_mismatch(found, described, str(facts))] if facts is not None else []
     _refuse(complaints, f"names must be those of {truths}, folders alike; suffixes may differ")
@@ -93,7 +94,7 @@ def _check_folders(predictions: Sequence[Path], folders: Sequence[Path]) -> None
     for folder in folders:
         if not folder.is_dir():
             raise UsageError(f"{folder}: no such folder")
-    names = [folder.name for folder in predictions]
+    names = [folder_name(folder) for folder in predictions]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UsageError(
             f"two folders of predictions are called {twice[0]!r}; rename one, it names the method"

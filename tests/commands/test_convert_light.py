@@ -126,7 +126,11 @@ def test_another_rig(tmp_path: Path) -> None:
     "line, complaint",
     [
         (["--to", "usdz"], "there are latlong, json"),
-        (["--to", "json", "--width", "33"], "even number"),
+        (["--to", "latlong", "--width", "33"], "even number"),
+        (["--to", "dpr", "--width", "64"], "--width is for --to latlong, blender, mitsuba"),
+        (["--to", "dpr", "--to", "latlong", "--order", "3"], "--order is for --to json, sh"),
+        (["--to", "sh", "--lights", "40"], "--lights is for --to json"),
+        (["--to", "sh", "--signed"], "--signed is for"),
         (["--to", "json", "--lights", "many"], "--lights"),
         ([], "--to"),
     ],

@@ -65,12 +65,41 @@ def test_what_is_missing_or_of_another_size_makes_no_table(folders: Path, capsys
     assert "anna/0 is 5 x 4, its truth 48 x 36" in capsys.readouterr().err
 
 
+def test_a_folder_may_be_given_from_inside(
+    folders: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folders / "good")
+    line = ["evaluate", "pairs", ".", "../bad", "--truth", "../truth", "-o", "../out"]
+    assert main(line) == 0
+    summary = json.loads((folders / "out/summary.json").read_text())
+    assert summary["methods"] == ["good", "bad"] and summary["title"].endswith("truth")
+    assert "finished" not in capsys.readouterr().err
+    monkeypatch.chdir(folders)  # the same run by another way
+    absolute = [str(folders / name) for name in ("good", "bad", "truth", "out")]
+    assert main(["evaluate", "pairs", *absolute[:2], "--truth", absolute[2], "-o", absolute[3]]) == 0
+    assert "6 of 6 already finished" in capsys.readouterr().err
+
+
+def test_a_link_is_a_method_of_its_own_name(folders: Path) -> None:
+    (folders / "link").symlink_to("good")
+    truth, out = str(folders / "truth"), str(folders / "out")
+    line = ["evaluate", "pairs", str(folders / "link"), "--truth", truth, "-o", out]
+    assert main(line) == 0
+    assert json.loads((folders / "out/summary.json").read_text())["methods"] == ["link"]
+    (folders / "link").unlink()
+    (folders / "link").symlink_to("bad")  # as PNG: other files, which are not the ones that were measured
+    assert main(line) == 2
+
+
 def test_bad_lines(folders: Path, capsys: Said) -> None:
     good, truth, out = (str(folders / name) for name in ("good", "truth", "out"))
     for line, words in (
         (["pairs", good, "-o", out], "--truth"),
         (["pairs", str(folders / "none"), "--truth", truth, "-o", out], "no such folder"),
         (["pairs", good, "--truth", truth, "-o", truth], "give another one"),
+        (["pairs", good, "--truth", truth, "-o", f"{truth}/here"], "lies in it"),
+        (["pairs", good, "--truth", truth, "-o", f"{good}/here"], "lies in it"),
+        (["olat", "x", "-o", f"{good}/here", "--compare", good], "lies in it"),
         (["pairs", good, "--truth", truth, "-o", out, "--lpips", "y"], "--vgg-weights"),
         (["pairs", good, "--truth", truth, "-o", out, "--preset", "paper"], "--preset"),
         (["olat", "x", "-o", out, "--reflectance", "phong"], "give field, diffuse-sh"),

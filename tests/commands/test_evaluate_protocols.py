@@ -7,10 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from facerf_cli.commands import evaluate_geometry, evaluate_reconstruction, evaluate_transfer
 from facerf_cli.commands.evaluation_items import MethodOptions
-from facerf_cli.commands.photo import load_models_once
+from facerf_cli.commands.evaluation_photos import portraits
+from facerf_cli.commands.inputs import Item
+from facerf_cli.commands.options import Settings
+from facerf_cli.commands.photo import PhotoOptions, face_model, load_models_once
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from facerf_cli.stage.data.dataset import read_dataset
@@ -93,6 +97,57 @@ def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
     assert "1 photos" in refused(capsys, "reconstruction", PHOTO, *out, "--preset", "paper")
     assert "--mean-checkpoint" in refused(capsys, "geometry", PHOTO, *out, "--against", PHOTO)
     assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def test_options_that_would_do_nothing_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = "-o", tmp_path / "out"
+    for words in (["--every", "1"], ["--split", "all"], ["--refit"]):
+        line = refused(capsys, "reconstruction", PHOTO, *out, *words)
+        assert words[0] in line and "prepared dataset" in line
+    assert "--every" in refused(capsys, "geometry", PHOTO, *out, "--every", "2")
+    assert "--refit" in refused(capsys, "transfer", "--photos", PHOTO, PHOTO, *out, "--refit")
+    assert "is for photos" in refused(capsys, "reconstruction", folder, *out, "--face", "all")
+    assert "--landmarks" in refused(capsys, "transfer", folder, *out, "--landmarks", tmp_path)
+    alone = "--reflectance", "prt"
+    assert "is for the field" in refused(capsys, "olat", folder, *out, *alone, "--network-alone")
+    assert "is for the field" in refused(capsys, "transfer", folder, *out, *alone, "--held-to-photo")
+    assert "is for the field" in refused(capsys, "geometry", PHOTO, *out, *alone, "--mean-checkpoint", "x")
+
+
+def test_couples_are_of_two_photos_and_given_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = "-o", tmp_path / "out"
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(PHOTO, tmp_path / name)
+    (tmp_path / "link.jpg").symlink_to("a.jpg")
+    a, b, link = (tmp_path / name for name in ("a.jpg", "b.jpg", "link.jpg"))
+    for couple in ((a, a), (a, link), (a, tmp_path / "../" / tmp_path.name / "a.jpg")):
+        assert "given twice" in refused(capsys, "transfer", "--photos", *couple, *out)
+    assert "a couple twice" in refused(capsys, "transfer", "--photos", a, b, b, a, *out)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_photos_alpha_leaves_out_is_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = np.asarray(Image.open(PHOTO).convert("RGB"))
+    shown = np.zeros(photo.shape[:2], np.uint8)
+    shown[:, 220:] = 255  # beside the nose
+    path = tmp_path / "half.png"
+    Image.fromarray(np.dstack([photo, shown])).save(path)
+    options = PhotoOptions(Settings(device="cpu"))
+    (_, whole), (_, half) = (next(portraits(Item(x, x, x.stem), options, False)) for x in (PHOTO, path))
+    crop = half.view.fit.crop
+    column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
+    left, right = column < 215, column > 225
+    assert whole.view.mask[:, left].max() == 1 and half.view.mask[:, left].max() == 0
+    np.testing.assert_allclose(half.view.mask[:, right], whole.view.mask[:, right], atol=0.01)
+    assert half.face.visible.sum() < 0.8 * whole.face.visible.sum()
+    assert half.fitted_with(face_model(options)).view.mask[:, left].max() == 0
+    Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
+    assert run("reconstruction", path, "-o", tmp_path / "out") == 1
+    assert f"{path}: " in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("doubles")

@@ -10,9 +10,13 @@ import numpy as np
 import pytest
 
 from facerf_cli.commands import evaluation_run
+from facerf_cli.commands.evaluate_transfer import _OfPhotos
+from facerf_cli.commands.evaluation_items import MethodOptions
 from facerf_cli.commands.evaluation_key import evaluation_key, item_key
 from facerf_cli.commands.evaluation_options import EvaluateOptions
+from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
+from facerf_cli.commands.photo import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.records import COMPOSITE_SOURCE_TYPE, configure_logging
@@ -86,6 +90,24 @@ def test_another_file_of_the_same_name_is_another_picture(tmp_path: Path) -> Non
     assert before != evaluation_key("toy", Toy(), options, Settings())
 
 
+def test_a_key_is_of_what_a_path_leads_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "theirs").mkdir()
+    Path("theirs/a.npz").write_bytes(b"one")
+
+    def key(folder: str) -> str:
+        photo = PhotoOptions(Settings(), face_model=f"{folder}/a.npz", landmarks=Path(folder))
+        couples = {Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a"): "ann"}
+        methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),))
+        options = EvaluateOptions(Path("out"), (), compare=(Path(folder),))
+        return evaluation_key("toy", _OfPhotos(methods, couples, False, False), options, Settings())
+
+    first = key("theirs")
+    assert first == key(str(tmp_path / "theirs")) == key("theirs/../theirs")
+    Path("theirs/a.npz").write_bytes(b"two, another model")
+    assert first != key("theirs")
+
+
 def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, capsys: Said) -> None:
     theirs = tmp_path / "theirs"
     for person in PEOPLE:
@@ -142,6 +164,21 @@ def test_strips_are_few_and_whole(tmp_path: Path) -> None:
         assert len(strips) <= 14 and {f"{person}/39", f"{person}/00"} <= {strip["case"] for strip in strips}
         assert all((tmp_path / strip["file"]).read_bytes()[:2] == b"\xff\xd8" for strip in strips)
     assert COMPOSITE_SOURCE_TYPE.encode() in (tmp_path / strips[0]["file"]).read_bytes()
+
+
+@pytest.mark.parametrize("lost", ["strips/bea/000.jpg", "pictures/good/bea/01.exr", "cases/bea.json"])
+def test_what_was_kept_and_is_gone_is_made_anew(tmp_path: Path, lost: str) -> None:
+    notes, out = tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
+    for note in notes.iterdir():
+        note.unlink()
+    before = (out / lost).read_bytes()
+    (out / lost).unlink()
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
+    assert [note.name for note in notes.iterdir()] == ["bea.asked"]
+    assert len((out / lost).read_bytes()) == len(before)
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
 
 
 def test_names_that_lead_out_of_the_folder(tmp_path: Path) -> None:
