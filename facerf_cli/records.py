@@ -26,23 +26,28 @@ LOGGER_NAME = "facerf"
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; every output of a verb carries it."""
+    """Where a result comes from; every output of a verb carries it.
 
-    input_name: str
+    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for what is no synthetic
+    picture, such as a photograph that was only cropped.
+    """
+
+    input_name: str = ""
     checkpoint_name: str = ""
-    face_model_name: str = ""
+    face_model: str = ""
     face_model_licence: str = ""
+    source_type: str = COMPOSITE_SOURCE_TYPE
 
     def attributes(self) -> dict[str, str | int]:
         """Metadata for a file's header; empty fields are left out."""
         attributes: dict[str, str | int] = {
             "Software": f"facerf {__version__}",
             "facerf:version": __version__,
-            "facerf:synthetic": 1,
-            "IPTC:DigitalSourceType": COMPOSITE_SOURCE_TYPE,
+            "facerf:synthetic": 1 if self.source_type else "",
+            "IPTC:DigitalSourceType": self.source_type,
             "facerf:input": self.input_name,
             "facerf:checkpoint": self.checkpoint_name,
-            "facerf:face_model": self.face_model_name,
+            "facerf:face_model": self.face_model,
             "facerf:face_model_licence": self.face_model_licence,
         }
         return {name: value for name, value in attributes.items() if value != ""}

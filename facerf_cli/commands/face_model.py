@@ -8,7 +8,7 @@ import typer
 
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.records import LOGGER_NAME, Provenance, json_line, one_line
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance, json_line, one_line
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
@@ -186,9 +186,7 @@ def _facts(model: "MorphableModel") -> dict[str, str]:
 def _draw(model: "MorphableModel", name: str, output: Path) -> None:
     from facerf_cli.face.turntable import draw_turntable
     from facerf_cli.files.images import write_display
-    from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
 
-    marks = Provenance(Path(name).name, "", model.name, model.licence).attributes()
-    marks["IPTC:DigitalSourceType"] = COMPUTER_GRAPHICS_SOURCE_TYPE
-    write_display(output, draw_turntable(model), 0.0, metadata=marks)
+    made = Provenance(Path(name).name, **model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE)
+    write_display(output, draw_turntable(model), 0.0, metadata=made.attributes())
     log.info("%s: drawn", output)

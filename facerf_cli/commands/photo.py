@@ -139,8 +139,7 @@ def facts_of(faces: list[FittedFace]) -> dict[str, Any]:
 
 def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
     """Metadata for what is made of a photo."""
-    model = face_model(options)
-    return Provenance(item.input_path.name, checkpoint_name, model.name, model.licence).attributes()
+    return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
 
 
 def _landmarks_px(item: Item, picture: "Picture", options: PhotoOptions) -> Iterator["np.ndarray"]:

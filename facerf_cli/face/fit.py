@@ -102,7 +102,9 @@ class FaceFit:
             len(self.alpha),
             len(self.beta),
         ):
-            raise ValueError(f"the fit is of the face model {self.model!r}, not of {model.name!r}")
+            raise ValueError(
+                f"the fit is of the face model {self.model!r}, not of {model.name!r}; give that --face-model"
+            )
         vertices = model.vertices(self.alpha[None], self.beta[None])[0]
         return vertices @ self.rotation.mT + self.translation_m
 

@@ -39,6 +39,11 @@ class MorphableModel:
     expression_names: tuple[str, ...]
     head: HeadModel | None = None
 
+    @property
+    def stamp(self) -> dict[str, str]:
+        """Its name and licence, for whatever is made with it."""
+        return {"face_model": self.name, "face_model_licence": self.licence}
+
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
         """v = mean + M_id alpha + M_exp beta, for alpha [B, Ki] and beta [B, Ke], as [B, V, 3]."""
         offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)

@@ -25,7 +25,7 @@ from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.texture import bake_attributes
-from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.stage.bake_renderer import StageCamera
@@ -125,8 +125,7 @@ def describe_stage(settings: StageSettings) -> dict[str, Any]:
         "provenance": {
             "software": f"facerf {__version__}",
             "synthetic": True,
-            "face_model": model.name,
-            "face_model_licence": model.licence,
+            **model.stamp,
             "skin": "procedural (facerf)",
             "settings": asdict(replace(settings, face_model=model.name)),
         },
@@ -250,11 +249,8 @@ def write_subject(
     folder: Path, subject: Subject, settings: StageSettings, transport_path: Path | None
 ) -> None:
     """Write `folder`/CAMERA/LIGHT.exr and subject.json, whole or not at all; the bake to `transport_path`."""
-    metadata: dict[str, str | int | float] = {
-        "Software": f"facerf {__version__}",
-        "facerf:synthetic": 1,
-        "IPTC:DigitalSourceType": COMPUTER_GRAPHICS_SOURCE_TYPE,
-    }
+    model = subject_model(settings.face_model)
+    metadata = Provenance(**model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE).attributes()
     shots, transport = photograph_subject(subject, settings)
     with atomic_path(folder) as unfinished:
         for camera, pictures in enumerate(shots):
@@ -291,4 +287,4 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
         "bounce": in_chart(np.sqrt(bounce)),
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata={"face_model": subject_model(settings.face_model).name})
+        save_file(tensors, temporary, metadata=subject_model(settings.face_model).stamp)

@@ -74,6 +74,17 @@ def test_every_camera_of_every_subject_is_there(prepared: Dataset) -> None:
     assert all(row["error_iod"] < 0.05 and row["worst_crop_off_iod"] < 0.005 for row in rows)
 
 
+def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
+    licence = load_face_model().licence
+    stack = read_olat_stack(prepared.stack_path("0000", "C1")).header.metadata
+    assert (stack["facerf:face_model"], stack["facerf:face_model_licence"]) == ("builtin", licence)
+    assert "facerf:synthetic" not in stack  # of a capture that does not say so
+    with np.load(prepared.fit_path("0000", "C1")) as fit:
+        assert {name: fit[name].item() for name in stack} == stack
+    sheet = (prepared.folder / "sheets" / "0000.jpg").read_bytes()
+    assert b'facerf:face_model="builtin"' in sheet and b"facerf:face_model_licence" in sheet
+
+
 def test_the_fit_lies_on_the_true_face_in_every_camera(given: Given, prepared: Dataset) -> None:
     """Also in the one that saw no face: the calibration knows where it is."""
     model, capture = load_face_model(), read_capture(given[0])

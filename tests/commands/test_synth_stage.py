@@ -13,6 +13,7 @@ from safetensors.numpy import load_file
 
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.stage.data.layouts import read_capture
 
 LIGHTS = 6
@@ -51,7 +52,10 @@ def test_it_is_a_capture_like_any_other(capture: Path) -> None:
     assert described["provenance"]["synthetic"] and -90 < described["subjects"]["0001"]["ita_deg"] < 90
     frames = np.stack([stage.frame("0001", "C3", light) for light in range(LIGHTS)])
     assert np.isfinite(frames).all() and 0.02 < frames.mean() < 1
-    assert read_image(capture / "0001" / "C0" / "L000.exr").pixels.shape == (64, 64, 3)
+    picture = read_image(capture / "0001" / "C0" / "L000.exr")
+    assert picture.pixels.shape == (64, 64, 3)
+    assert picture.metadata["facerf:face_model"] == "builtin" and picture.metadata["facerf:synthetic"] == 1
+    assert picture.metadata["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
 
 
 def test_two_jobs_and_one_more_person_change_no_byte(capture: Path, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 Its files, 2019 to 2023, hold `v_template` [5023, 3] in metres, `f` [9976, 3], and `shapedirs` [5023, 3, 400]:
 300 shapes of identity and 100 of expression, each scaled by its standard deviation (as smplx, DECA and others
 read them). A mouth opens by turning the jaw, which is no shape there: `posedirs`, `weights` and `J_regressor`
-make three shapes of it here. In `flame2023_no_jaw.pkl` the expressions open it, and its jaw is not to be turned.
+make three shapes of it here. In `flame2023_no_jaw.pkl` the expressions open it, and its jaw is never turned.
 """
 
 from collections.abc import Mapping

@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli import __version__
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.crop_pose import fit_in_crop
@@ -27,7 +26,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
-from facerf_cli.records import LOGGER_NAME
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 from facerf_cli.report import contact_sheet
 from facerf_cli.stage.data.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.stage.data.documents import read_document, write_document
@@ -81,7 +80,8 @@ def prepare_subject(
         cameras[camera] = _camera_record(fit, seen_px is not None, off_iod)
     chosen = replace(chosen, dropped=dropped)
     _settle_dropped(subject, chosen, folder, bool(cameras), strict)
-    write_display(sheet_path(folder, subject), contact_sheet(np.concatenate(rows), len(rows[0])))
+    sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
+    write_display(sheet_path(folder, subject), sheet, metadata=view.provenance())
     record = {
         "prepared": key,
         "error_iod": round(joint.mean_error_iod, 5),
@@ -117,6 +117,13 @@ class _Subject:
     def directions_world(self) -> np.ndarray:
         """Toward the lights [L, 3]."""
         return self.capture.directions_world[list(self.lights)]
+
+    def provenance(self, *camera: str) -> dict[str, str | int]:
+        """Metadata of what is made of their pictures; synthetic where the capture says that it is."""
+        synthetic = self.capture.provenance.get("synthetic") is True
+        source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
+        name = "/".join([self.name, *camera])
+        return Provenance(name, **self.model.stamp, source_type=source_type).attributes()
 
 
 def _settle_dropped(subject: str, chosen: Selection, folder: Path, any_left: bool, strict: bool) -> None:
@@ -183,14 +190,7 @@ def _header(view: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> Stack
     directions = view.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)
-    metadata = {
-        "Software": f"facerf {__version__}",
-        "facerf:version": __version__,
-        "facerf:input": f"{view.name}/{camera}",
-        "facerf:face_model": view.model.name,
-        "facerf:face_model_licence": view.model.licence,
-    }
-    header = stack_header(view.model, fit, directions, source, inside, metadata)
+    header = stack_header(view.model, fit, directions, source, inside, view.provenance(camera))
     if not header.seen.any():
         raise InputError("the camera does not see the face")
     complete = len(view.lights) == len(view.capture.light_ids)
@@ -203,7 +203,7 @@ def _write_camera(view: _Subject, camera: str, fit: FaceFit, header: StackHeader
     crops = _crops(view, camera, fit.crop, header, shown)
     write_olat_stack(stack_path(folder, view.name, camera), header, crops)
     with atomic_path(fit_path(folder, view.name, camera)) as temporary:
-        save_fit(temporary, fit)
+        save_fit(temporary, fit, header.metadata)
     return sheet_tiles(header, fit, view.model, shown)
 
 

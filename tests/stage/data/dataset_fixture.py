@@ -16,6 +16,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.records import Provenance
 from facerf_cli.stage.appearance.skin import draw_skin
 from facerf_cli.stage.data.dataset import (
     DATASET_FILE,
@@ -117,7 +118,7 @@ def _write_one(
         directions.numpy(),
         source,
         np.ones(fragments.covered.shape, bool),
-        {"facerf:input": f"{subject}/{camera}", "facerf:synthetic": 1},
+        Provenance(f"{subject}/{camera}", **model.stamp).attributes(),
     )
     cosine = torch.einsum("lc,hwc->lhw", directions, torch.from_numpy(header.normals)).clamp(min=0)
     olats = skin * fragments.covered * cosine[:, None]  # [L, 3, H, W]

@@ -71,6 +71,8 @@ def test_written_sources_are_their_rows_bit_for_bit(fresh: Dataset) -> None:
             picture.pixels.astype(np.float16).view(np.uint16), again.view(np.uint16)
         )
         assert picture.metadata["facerf:envmap"] == row["envmap"] and picture.pixels.max() > 0.02
+        of_stack = read_olat_header(fresh.stack_path(row["subject"], row["source_camera"])).metadata
+        assert picture.metadata.items() >= of_stack.items() and picture.metadata["facerf:face_model"]
 
 
 def test_weights_are_made_anew_where_they_are_missing(fresh: Dataset) -> None:
