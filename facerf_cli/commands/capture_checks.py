@@ -18,10 +18,9 @@ Row = Mapping[str, Any]  # as `Finding.row` makes it
 
 def show_findings(rows: Sequence[Row], console: Console = STDERR) -> None:
     """Print the rows as a table, if there are any; findings.jsonl has all of them, here like ones are cut."""
-    if not rows:
-        return
-    width = None if console.is_terminal else _PLAIN_WIDTH
-    console.print(findings_table(rows), width=width)
+    if rows:
+        wide = console if console.is_terminal else Console(file=console.file, width=_PLAIN_WIDTH)
+        wide.print(findings_table(rows))
 
 
 def findings_table(rows: Sequence[Row]) -> Table:

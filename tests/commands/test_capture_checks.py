@@ -15,8 +15,8 @@ UNLIT = [
 ]
 
 
-def shown(findings: list[Finding]) -> str:
-    console = Console(file=io.StringIO(), width=200)
+def shown(findings: list[Finding], width: int = 200) -> str:
+    console = Console(file=io.StringIO(), width=width)
     show_findings([finding.row() for finding in findings], console)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
@@ -30,6 +30,10 @@ def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
     assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
     assert text.index("0000/C0/L002") < text.index("the head moves")
     assert "are mirrored [left] to right" in text  # brackets are no markup
+
+
+def test_a_log_file_is_no_narrow_terminal() -> None:
+    assert "the lights are mirrored [left] to right" in shown([STOPS], width=60)
 
 
 def test_many_alike_are_counted() -> None:
