@@ -95,7 +95,7 @@ def geometry(
     )
     if not options.dry_run:
         _mean_methods(forms)  # what is wrong with a checkpoint is said once
-    return run_protocol(layout, items, work, options, settings)
+    return run_protocol(layout, items, work, options, settings, photo)
 
 
 def _note(mean_checkpoint: Path | None) -> str:

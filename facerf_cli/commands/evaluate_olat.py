@@ -76,7 +76,8 @@ def olat(
         published=TABLE_1 + (TABLE_3 if options.against else ()),
         notes=_notes(split, refit, network_alone),
     )
-    return run_protocol(layout, people_items(dataset, list(chosen), options.output), work, options, settings)
+    items = people_items(dataset, list(chosen), options.output)
+    return run_protocol(layout, items, work, options, settings, photo)
 
 
 def _notes(split: str, refit: bool, network_alone: bool) -> tuple[str, ...]:

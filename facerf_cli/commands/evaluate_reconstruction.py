@@ -86,7 +86,7 @@ def reconstruction(
         ),
     )
     load_before(methods, options)
-    return run_protocol(layout, items, work, options, settings)
+    return run_protocol(layout, items, work, options, settings, photo)
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,7 +107,7 @@ def transfer(
         notes=_notes(photos, held_to_photo),
     )
     load_before(methods, options)
-    return run_protocol(layout, items, work, options, settings)
+    return run_protocol(layout, items, work, options, settings, photo)
 
 
 def _notes(photos: bool, held_to_photo: bool) -> tuple[str, ...]:

@@ -76,7 +76,7 @@ def yale_b(
     photo = PhotoOptions(settings, face_model=face_model)
     work = _YaleB(MethodOptions.of(photo, options), database, network_alone)
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
-    return run_protocol(layout(database, chosen, network_alone), items, work, options, settings)
+    return run_protocol(layout(database, chosen, network_alone), items, work, options, settings, photo)
 
 
 def _chosen(database: "YaleB", given: Sequence[str]) -> list[str]:

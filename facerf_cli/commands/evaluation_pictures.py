@@ -18,10 +18,13 @@ PICTURES, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
 
 
-def keep_pictures(comparison: "Comparison", folder: Path, settings: Settings) -> list[str]:
+def keep_pictures(
+    comparison: "Comparison", folder: Path, settings: Settings, stamp: Mapping[str, str]
+) -> list[str]:
     """Write FOLDER/pictures/{source,truth,mask,METHOD}/CASE.exr, scene-linear; give the paths from FOLDER on.
 
-    Predictions carry the mark of what facerf makes; sources and truths are given and carry its version only.
+    Predictions carry the mark of what facerf makes, and the `stamp` of the face model; sources and truths are
+    given and carry its version only.
     """
     import numpy as np
 
@@ -37,7 +40,7 @@ def keep_pictures(comparison: "Comparison", folder: Path, settings: Settings) ->
         pixels = np.broadcast_to(picture.reshape(*picture.shape[:2], -1), (*picture.shape[:2], 3))
         write_exr(folder / _place(kind, name), pixels, metadata={"Software": _software()})
     for method, picture in comparison.predictions.items():
-        marks = Provenance(name, _checkpoint_of(method, settings)).attributes()
+        marks = Provenance(name, _checkpoint_of(method, settings), **stamp).attributes()
         write_exr(folder / _place(method, name), picture, metadata=marks)
     return [_place(kind, name) for kind in (*given, *comparison.predictions)]
 
@@ -62,7 +65,7 @@ def _place(kind: str, case: str) -> str:
 
 
 def keep_strips(
-    strips: "Mapping[str, Strip]", folder: Path, item: str, settings: Settings
+    strips: "Mapping[str, Strip]", folder: Path, item: str, settings: Settings, stamp: Mapping[str, str]
 ) -> "tuple[KeptStrip, ...]":
     """Write an item's strips to FOLDER/strips/ITEM/NUMBER.jpg in place of those that are there."""
     from facerf_cli.evaluation.case_files import KeptStrip
@@ -73,14 +76,14 @@ def keep_strips(
     kept = []
     for number, (case, strip) in enumerate(strips.items()):
         path = place / f"{number:03d}.jpg"
-        _write_strip(path, strip, case, settings)
+        _write_strip(path, strip, Provenance(case, _checkpoint_of("field", settings), **stamp))
         size = (strip.pixels.shape[1], strip.pixels.shape[0])
         relative = path.relative_to(folder).as_posix()
         kept.append(KeptStrip(case, relative, strip.methods, strip.ev, strip.scales, strip.has_source, size))
     return tuple(kept)
 
 
-def _write_strip(path: Path, strip: "Strip", case: str, settings: Settings) -> None:
+def _write_strip(path: Path, strip: "Strip", made: Provenance) -> None:
     from PIL import Image
 
     from facerf_cli.files.atomic import atomic_path
@@ -88,4 +91,4 @@ def _write_strip(path: Path, strip: "Strip", case: str, settings: Settings) -> N
 
     with atomic_path(path) as temporary:
         Image.fromarray(strip.pixels).save(temporary, quality=_STRIP_QUALITY, subsampling=0)
-        embed_xmp(temporary, Provenance(case, _checkpoint_of("field", settings)).attributes())
+        embed_xmp(temporary, made.attributes())

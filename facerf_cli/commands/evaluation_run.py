@@ -12,6 +12,7 @@ from facerf_cli.commands.evaluation_key import evaluation_key, item_key, network
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
+from facerf_cli.commands.photo import PhotoOptions, face_model
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import LOGGER_NAME
 
@@ -32,6 +33,7 @@ def run_protocol(
     compare: Callable[[Item], "Iterable[Comparison]"],
     options: EvaluateOptions,
     settings: Settings,
+    photo: PhotoOptions | None = None,
 ) -> int:
     """Measure the items' pictures and write their tables; give the exit code, 0 done, 1 some failed.
 
@@ -39,12 +41,13 @@ def run_protocol(
     another. An item's rows are DIR/cases/ITEM.json, so finished items are skipped and a run that was cut off
     goes on; an item is unfinished where a strip or picture that it kept is gone. When all are there:
     DIR/summary.json, DIR/images.csv, DIR/report.html, and a table on stdout. Where an item failed or a
-    prediction is missing, each is named and no summary is written.
+    prediction is missing, each is named and no summary is written. `photo` has the face model that the
+    pictures are made with; they and the summary name it.
     """
     if not items:
         raise UsageError(f"evaluate {protocol.name}: nothing to evaluate")
     key = evaluation_key(protocol.name, compare, options, settings)
-    work = _Measure(protocol.metrics[0], compare, options, settings, key)
+    work = _Measure(protocol.metrics[0], compare, options, settings, photo, key)
     _check_earlier(items, work)
     batch = BatchOptions(options.output, options.overwrite, options.dry_run, options.jobs)
     if not options.dry_run:
@@ -82,7 +85,13 @@ class _Measure:
     compare: Callable[[Item], "Iterable[Comparison]"]
     options: EvaluateOptions
     settings: Settings
+    photo: PhotoOptions | None
     key: str
+
+    @property
+    def stamp(self) -> dict[str, str]:
+        """The name and licence of the face model that the pictures are made with, if they are with one."""
+        return face_model(self.photo).stamp if self.photo else {}
 
     def path_of(self, item: Item) -> Path:
         """The item's figures."""
@@ -115,7 +124,7 @@ class _Measure:
         keeper, measures = StripKeeper(self.metric), self.options.measures()
         for own in self.compare(item):
             if self.options.pictures:
-                pictures += keep_pictures(own, self.options.output, self.settings)
+                pictures += keep_pictures(own, self.options.output, self.settings, self.stamp)
             comparison = _with_others(own, self.options.compare, wrong)
             if wrong:
                 continue  # all that is missing is to be named, at once
@@ -123,7 +132,7 @@ class _Measure:
             keeper.offer(measured, partial(strip_of, comparison, scaled))
             rows += measured
         _require_whole(item, rows, wrong)
-        strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings)
+        strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings, self.stamp)
         figures = ItemFigures(self.key_of(item), tuple(rows), strips, tuple(pictures))
         write_figures(self.path_of(item), figures)
         return Outcome([], {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)})
@@ -220,4 +229,6 @@ def _about(work: _Measure) -> "About":
     facts["values compared"] = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}[
         work.options.space
     ]
+    if stamp := work.stamp:
+        facts["face model"] = f"{stamp['face_model']} ({stamp['face_model_licence']})"
     return About(shlex.join(["facerf", *sys.argv[1:]]), __version__, facts)

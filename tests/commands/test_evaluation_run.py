@@ -18,6 +18,7 @@ from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.photo import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.records import COMPOSITE_SOURCE_TYPE, configure_logging
 from tests.evaluation.toy_protocol import HEIGHT, LAYOUT, NOISE, PEOPLE, WIDTH, Toy, comparison, evaluate
@@ -153,8 +154,20 @@ def test_pictures_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path)
     assert read_image(tmp_path / "pictures/source/bea/02.exr").pixels.shape == own.source.shape
     guess = read_image(tmp_path / "pictures/good/bea/02.exr")
     assert guess.metadata["facerf:synthetic"] == 1 and "facerf:synthetic" not in truth.metadata
+    assert "facerf:face_model" not in guess.metadata  # these are made without one
     # What was kept can be compared with itself.
     assert evaluate(tmp_path / "again", compare=(tmp_path / "pictures/truth",)) == 0
+
+
+def test_pictures_and_summary_name_the_face_model(tmp_path: Path) -> None:
+    assert evaluate(tmp_path, photo=PhotoOptions(Settings()), pictures=True) == 0
+    licence = load_face_model().licence
+    guess = read_image(tmp_path / "pictures/good/bea/02.exr").metadata
+    assert (guess["facerf:face_model"], guess["facerf:face_model_licence"]) == ("builtin", licence)
+    assert "facerf:face_model" not in read_image(tmp_path / "pictures/truth/bea/02.exr").metadata
+    assert json.loads((tmp_path / "summary.json").read_text())["face model"] == f"builtin ({licence})"
+    strip = json.loads((tmp_path / "cases/bea.json").read_text())["strips"][0]["file"]
+    assert b'facerf:face_model="builtin"' in (tmp_path / strip).read_bytes()
 
 
 def test_strips_are_few_and_whole(tmp_path: Path) -> None:
@@ -187,7 +200,7 @@ def test_names_that_lead_out_of_the_folder(tmp_path: Path) -> None:
     own = comparison("bea", 0)
     for name in ("../x", "/etc/x", ""):
         with pytest.raises(InputError, match="no name for a picture"):
-            keep_pictures(replace(own, case=replace(own.case, name=name)), tmp_path, Settings())
+            keep_pictures(replace(own, case=replace(own.case, name=name)), tmp_path, Settings(), {})
 
 
 def test_two_methods_of_one_name(tmp_path: Path) -> None:
@@ -199,5 +212,5 @@ def test_two_methods_of_one_name(tmp_path: Path) -> None:
 
 
 def test_the_work_goes_to_other_processes() -> None:
-    work = evaluation_run._Measure("si_mse", Toy(), EvaluateOptions(Path("out")), Settings(), "key")
+    work = evaluation_run._Measure("si_mse", Toy(), EvaluateOptions(Path("out")), Settings(), None, "key")
     assert pickle.loads(pickle.dumps(work)) == work

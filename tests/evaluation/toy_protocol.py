@@ -10,6 +10,7 @@ from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_run import run_protocol
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
+from facerf_cli.commands.photo import PhotoOptions
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.paper import TABLE_1
@@ -71,6 +72,12 @@ def items(output: Path, people: tuple[str, ...] = PEOPLE) -> list[Item]:
     return [Item(Path(person), output / person, person) for person in people]
 
 
-def evaluate(output: Path, toy: Toy | None = None, layout: Layout = LAYOUT, **options: object) -> int:
+def evaluate(
+    output: Path,
+    toy: Toy | None = None,
+    layout: Layout = LAYOUT,
+    photo: PhotoOptions | None = None,
+    **options: object,
+) -> int:
     given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
-    return run_protocol(layout, items(output), toy or Toy(), given, Settings())
+    return run_protocol(layout, items(output), toy or Toy(), given, Settings(), photo)
