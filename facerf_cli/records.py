@@ -2,6 +2,7 @@
 
 import json
 import logging
+import logging.handlers
 import math
 import sys
 from collections.abc import Mapping
@@ -116,6 +117,14 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
     logger.handlers[:] = [handler]
     logger.propagate = False
     logger.setLevel({-1: logging.ERROR, 0: logging.INFO}.get(verbosity, logging.DEBUG))
+
+
+def log_to_queue(queue: Any, level: int) -> None:
+    """Send this process's log, from a level on, to a queue alone: whatever has `put_nowait`."""
+    logger = logging.getLogger(LOGGER_NAME)
+    logger.handlers[:] = [logging.handlers.QueueHandler(queue)]
+    logger.propagate = False
+    logger.setLevel(level)
 
 
 def unexpected(error: Exception) -> str:

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facerf_cli import __version__
-from facerf_cli.commands.workers import log_to
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.records import LOGGER_NAME, one_line
+from facerf_cli.records import LOGGER_NAME, log_to_queue, one_line
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -219,6 +218,6 @@ def _task(work: Callable[[Any], Any], item: Any, site: _Site) -> _Answer:
     """What Ray's workers run."""
     site.enter()
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
-    log_to(records, site.level)
+    log_to_queue(records, site.level)
     result = work(item)
     return _Answer(result, [records.get() for _ in range(records.qsize())])

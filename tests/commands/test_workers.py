@@ -74,7 +74,7 @@ def _refuse(pipe: object, level: int, threads: int) -> None:
 
 
 def test_processes_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("facerf_cli.commands.workers._serve", _refuse)
+    monkeypatch.setattr("facerf_cli.commands.process_workers._serve", _refuse)
     with pytest.raises(FacerfError, match=r"could not start \(exit code 3\); try --jobs 1"):
         list(run("a", "b"))
 
