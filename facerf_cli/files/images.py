@@ -75,8 +75,8 @@ def read_image(
     colour = np.broadcast_to(values[..., : len(colour_at)], (*values.shape[:2], 3))
     if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
         colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
-    space = named_space(colourspace) if colourspace else _space_of_file(path, spec)
-    if colourspace and space.decode is not None and _is_floating(spec):
+    space = named_space(colourspace) if colourspace else space_of_file(path, spec)
+    if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
     pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
     return Picture(pixels, alpha, space.name, _metadata(spec))
@@ -167,9 +167,9 @@ def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
     return np.where(bad, np.float32(0), values)
 
 
-def _space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
+def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     """What the file says of its colours; else floats are linear Rec.709 and integers sRGB."""
-    default = LINEAR if _is_floating(spec) else SRGB
+    default = LINEAR if is_floating(spec) else SRGB
     profile = spec.get_string_attribute("ICCProfile:profile_description")
     name = profile or spec.get_string_attribute("oiio:ColorSpace")
     if profile:
@@ -191,7 +191,8 @@ def _is_rec709(chromaticities: tuple[float, ...]) -> bool:
     return bool(np.allclose(matrix_to_rec709(chromaticities), np.eye(3), atol=1e-3))
 
 
-def _is_floating(spec: oiio.ImageSpec) -> bool:
+def is_floating(spec: oiio.ImageSpec) -> bool:
+    """Whether values are of half, single or double precision."""
     return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 
 

@@ -41,9 +41,12 @@ def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
         if found.is_file() and name.startswith(prefix) and name.endswith(after) and name[0] != ".":
             names.append(name[len(prefix) : len(name) - len(after)])
     others = (name for name in names if name and name not in known)
-    return sorted(name for name in others if not _is_for_other_ends(name))
+    return sorted(name for name in others if not other_end(name))
 
 
-def _is_for_other_ends(name: str) -> bool:
+def other_end(name: str) -> str:
+    """What a picture in a light's place is for: 'full', 'ambient', or nothing where it may be of a lamp."""
     plain = name.lower().strip("_- ")
-    return plain in FULL_NAMES or any(word in plain for word in _NO_LAMP)
+    if plain in FULL_NAMES:
+        return "full"
+    return "ambient" if any(word in plain for word in _NO_LAMP) else ""

@@ -5,7 +5,7 @@ import json
 import math
 import re
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ class Node:
 
     def name(self) -> str:
         """A string that can stand in a file's name, such as a subject's or a camera's."""
-        if not _NAME.fullmatch(self.text()) or self.text().endswith(_RESERVED):
+        if not is_name(self.text()):
             raise self.wrong("a name of letters, digits, - and _")
         return self.text()
 
@@ -88,6 +88,18 @@ class Node:
             raise self.wrong("an object { }")
         return self.value
 
+    def nulls(self) -> "Iterator[Node]":
+        """Whatever is null in it, at any depth, in order."""
+        ahead = [self]  # not by recursion: documents may be deep
+        while ahead:
+            node = ahead.pop()
+            if node.value is None:
+                yield node
+            elif isinstance(node.value, dict):
+                ahead += [Node(f"{node.where}: {key}", entry) for key, entry in node.value.items()][::-1]
+            elif isinstance(node.value, list):
+                ahead += [Node(f"{node.where}[{at}]", entry) for at, entry in enumerate(node.value)][::-1]
+
     def items(self, most: int) -> "list[Node]":
         """A list's entries, `most` of them or fewer."""
         if not isinstance(self.value, list):
@@ -104,6 +116,11 @@ class Node:
             Node(f"{self.where}: a key", key).name(): Node(f"{self.where}: {key}", entry)
             for key, entry in self.value.items()
         }
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can stand in a file's name, as a subject's, a camera's or a light's id."""
+    return bool(_NAME.fullmatch(text)) and not text.endswith(_RESERVED)
 
 
 def read_document(path: Path, missing: str) -> Node:
