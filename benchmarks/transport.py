@@ -29,10 +29,11 @@ from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, draw_appearance
-from facerf_cli.stage.bake_renderer import RenderSettings, StageCamera
+from facerf_cli.stage.bake_renderer import RenderSettings
 from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import HeadMesh
 from facerf_cli.stage.path_tracer import PathSettings
+from facerf_cli.stage.stage_camera import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and what a picture's side takes in
 CHART = 128  # texels along the chart's side

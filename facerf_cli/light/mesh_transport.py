@@ -7,16 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from embreex import rtcore_scene
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from facerf_cli.light.rays import build_scene, occluded, on_disc, over_hemisphere
-from facerf_cli.light.transport import OFFSET_M, BakeSettings
+from facerf_cli.light.mesh_surface import MeshSurface
+from facerf_cli.light.rays import occluded, on_disc, over_hemisphere
+from facerf_cli.light.transport import BakeSettings
 
 _SETTINGS = BakeSettings()
-_MESH_OFFSET_M = 3e-5  # rays start so far off a vertex, where no facet has to be cleared, and
-_RISE_SHARE = 0.5  # this share of its neighbours' rise, up to as much again as from a texel
 _BLUR_NEIGHBOURS = 24
 _SAME_SURFACE_COSINE = 0.6  # of two normals, for near vertices to share their view of the surroundings
 _NO_WEIGHT = 1e-4
@@ -77,7 +75,7 @@ def bake_mesh(
     rank = np.argsort(curve)
     baked = ~nothing if wanted is None else wanted
     strand = nothing if all_round is None else all_round
-    surface = _Surface.of(vertices[curve], normals[curve], rank[triangles], strand[curve])
+    surface = MeshSurface.of(vertices[curve], normals[curve], rank[triangles], strand[curve])
     shifts = np.random.default_rng(seed).random((count, 2), np.float32)[curve]
     strands, traced_strands = rank[np.flatnonzero(strand)], rank[np.flatnonzero(strand)[::_STRAND_STRIDE]]
     near = _nearest_of(surface.vertices, strands, traced_strands)
@@ -126,49 +124,6 @@ def _spread(shifts: np.ndarray, chosen: np.ndarray, sample: int) -> tuple[np.nda
     return numbers[:, :1], numbers[:, 1:]
 
 
-@dataclass(frozen=True, eq=False)
-class _Surface:
-    """A mesh to cast rays from and at."""
-
-    scene: rtcore_scene.EmbreeScene
-    vertices: np.ndarray
-    normals: np.ndarray
-    triangles: np.ndarray
-    all_round: np.ndarray
-    edges: np.ndarray  # [E, 2], each once, strands' left out,
-    beside: csr_matrix  # and as a matrix [V, V] of ones
-    offset_m: np.ndarray  # [V, 1] of ray origins off the surface
-
-    @classmethod
-    def of(
-        cls, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, all_round: np.ndarray
-    ) -> "_Surface":
-        vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
-        edges = _edges(triangles, len(vertices))
-        offset_m = _mesh_offset_m(vertices, normals, edges)[:, None]
-        edges = edges[~all_round[edges[:, 0]]]
-        both_ways = np.concatenate([edges, edges[:, ::-1]]).T
-        ones = np.ones(2 * len(edges), np.float32)
-        return cls(
-            build_scene(vertices, triangles),
-            vertices,
-            normals,
-            triangles,
-            all_round,
-            edges,
-            csr_matrix((ones, tuple(both_ways)), shape=(len(vertices), len(vertices))),
-            offset_m,
-        )
-
-
-def _edges(triangles: np.ndarray, count: int) -> np.ndarray:
-    """The edges [E, 2] of triangles among so many vertices, each once."""
-    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    keys = np.sort(pairs[:, 0].astype(np.int64) * count + pairs[:, 1])
-    keys = keys[np.diff(keys, prepend=-1) > 0]
-    return np.stack([keys // count, keys % count], -1)
-
-
 def _along_curve(points: np.ndarray) -> np.ndarray:
     """The ids of points [N, 3] in the order of Morton's curve (1966) through them."""
     low, size = points.min(0), max(float(np.ptp(points, 0).max()), 1e-9)
@@ -180,21 +135,8 @@ def _along_curve(points: np.ndarray) -> np.ndarray:
     return np.argsort(key, kind="stable")
 
 
-def _mesh_offset_m(vertices: np.ndarray, normals: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """How far [V] rays start off the surface: beyond what its facets stand out of their smooth surface.
-
-    Where a vertex lies in a hollow, its neighbours rise above its tangent plane, and flat facets between them
-    would shadow grazing light that the smooth surface, with these normals, lets through.
-    """
-    span = vertices[edges[:, 1]] - vertices[edges[:, 0]]
-    rise = np.zeros(len(vertices), np.float32)
-    np.maximum.at(rise, edges[:, 0], np.einsum("ec,ec->e", span, normals[edges[:, 0]]))
-    np.maximum.at(rise, edges[:, 1], -np.einsum("ec,ec->e", span, normals[edges[:, 1]]))
-    return _MESH_OFFSET_M + np.minimum(_RISE_SHARE * rise, OFFSET_M)
-
-
 def _lamp_share(
-    surface: _Surface,
+    surface: MeshSurface,
     direction: np.ndarray,
     traced: np.ndarray,
     settings: BakeSettings,
@@ -220,7 +162,7 @@ def _lamp_share(
 
 
 def _lamp_rays(
-    surface: _Surface,
+    surface: MeshSurface,
     chosen: np.ndarray,
     facing: np.ndarray,
     direction: np.ndarray,
@@ -246,7 +188,7 @@ def _beside(edges: np.ndarray, share: np.ndarray, lit: np.ndarray) -> np.ndarray
 
 
 def _hits(
-    surface: _Surface,
+    surface: MeshSurface,
     receives: np.ndarray,
     stands_for: np.ndarray,
     settings: BakeSettings,
@@ -267,7 +209,7 @@ def _hits(
 
 
 def _hemisphere_hits(
-    surface: _Surface, chosen: np.ndarray, samples: int, shifts: np.ndarray
+    surface: MeshSurface, chosen: np.ndarray, samples: int, shifts: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Row, column and value of what each round of one ray from every chosen vertex hits."""
     normals = surface.normals[chosen]
@@ -288,7 +230,7 @@ def _hemisphere_hits(
         yield chosen[found].repeat(3), columns.ravel(), weights.astype(np.float32).ravel()
 
 
-def _neighbour_means(surface: _Surface, blurred: np.ndarray, sigma_m: float) -> csr_matrix:
+def _neighbour_means(surface: MeshSurface, blurred: np.ndarray, sigma_m: float) -> csr_matrix:
     """A Gaussian mean [V, V] over near vertices of the same surface where `blurred` [V]; others stay."""
     count, chosen, other = len(blurred), np.flatnonzero(blurred), np.flatnonzero(~blurred)
     if sigma_m == 0 or len(chosen) == 0:

@@ -27,6 +27,7 @@ from facerf_cli.stage.appearance.pigments import hair_albedo
 from facerf_cli.stage.appearance.skin import Skin, draw_skin
 from facerf_cli.stage.baked_faces import Geometry
 from facerf_cli.stage.bank import geometry_of
+from facerf_cli.stage.draws import Uniform
 from facerf_cli.stage.head.clothes import draw_clothes
 from facerf_cli.stage.head.glasses import draw_glasses
 from facerf_cli.stage.head.hair import draw_hair
@@ -226,10 +227,7 @@ def _radiance(geometry: Geometry, skin: Skin, weights: Tensor, camera_m: Tensor)
 
 def _materials(around: _Surroundings, skin: Skin, generator: torch.Generator) -> Tensor:
     """Albedo [N, 3] of what stands around: this skin's mean, and hair, cloth and frames of random colours."""
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape or (1,), generator=generator)
-
+    uniform = Uniform(generator, (1,))
     side = skin.albedo.shape[-1]
     middle = skin.albedo[0, :, side // 4 : side * 5 // 8, side // 4 : side * 3 // 4].mean((1, 2))
     albedo = middle.expand(len(around.part), 3).clone()

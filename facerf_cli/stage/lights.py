@@ -4,13 +4,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.stage.draws import Uniform
+
 
 def draw_light(directions: Tensor, generator: torch.Generator) -> Tensor:
     """Weights [L, 3] of rig lights at camera-space directions [L, 3]: up to three lamps over a dome."""
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
-
+    uniform = Uniform(generator)
     kind = torch.rand((), generator=generator)
     if kind < 0.2:  # a flash near the camera
         axis = F.normalize(torch.tensor([0.0, 0.0, 1.0]) + 0.15 * torch.randn(3, generator=generator), dim=0)

@@ -17,9 +17,9 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.stage.appearance.materials import Appearance, Material
 from facerf_cli.stage.appearance.window import CANVAS_SPAN
-from facerf_cli.stage.bake_renderer import StageCamera
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.shading import LOBES
+from facerf_cli.stage.stage_camera import StageCamera
 
 _LIGHT = "light.to_world"
 

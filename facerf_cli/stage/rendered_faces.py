@@ -20,6 +20,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE
+from facerf_cli.stage.draws import Uniform
 from facerf_cli.stage.face_pictures import PictureSettings
 
 _PICTURES = PictureSettings()
@@ -174,10 +175,7 @@ def _composed(crop: Tensor, generator: torch.Generator) -> Tensor:
 
 def _texture(side: int, generator: torch.Generator) -> Tensor:
     """Random colours [3, S, S]: even, or blotches and strokes of a random size, or with straight edges."""
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
-
+    uniform = Uniform(generator)
     colour = torch.exp(uniform(-4.5, -0.5) + 0.35 * torch.randn(3, 1, 1, generator=generator))
     cells = torch.randint(2, 40, (2,), generator=generator).tolist()
     contrast = uniform(0, 1) ** 2 * 1.2
@@ -195,10 +193,7 @@ def _texture(side: int, generator: torch.Generator) -> Tensor:
 
 def _patch(side: int, generator: torch.Generator) -> Tensor:
     """Cover [1, S, S] by an ellipse that lies mostly toward the crop's border."""
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
-
+    uniform = Uniform(generator)
     angle, distance = uniform(0, 2 * math.pi), uniform(0.3, 0.6)
     centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
     radii, tilt = uniform(0.06, 0.22, 2), uniform(0, math.pi)
@@ -210,10 +205,7 @@ def _patch(side: int, generator: torch.Generator) -> Tensor:
 
 def _photographed(picture: Tensor, generator: torch.Generator) -> Tensor:
     """What a camera makes of a linear picture [3, S, S]: colour cast, clipping, blur, tone curve, noise."""
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, generator=generator)
-
+    uniform = Uniform(generator)
     picture = picture * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))
     if torch.rand((), generator=generator) < _GREY:
         picture = picture.mean(0, keepdim=True).expand(3, -1, -1)

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.stage.draws import Uniform
 from facerf_cli.stage.shading import scatter
 
 
@@ -71,11 +72,8 @@ def photograph(
     network.reflectance.
     """
     faces = len(source)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(faces, *(shape or (1, 1, 1)), generator=generator)
-
-    balance = torch.exp(uniform(-0.12, 0.12, 3, 1, 1))
+    uniform = Uniform(generator, (faces, 1, 1, 1))
+    balance = torch.exp(uniform(-0.12, 0.12, faces, 3, 1, 1))
     grey = (uniform(0, 1) < 0.25).float()
     source, target, albedo = (
         _greyed(x, grey) for x in (source * balance, target * balance[:, None], albedo * balance)

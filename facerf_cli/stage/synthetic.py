@@ -28,15 +28,16 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
-from facerf_cli.stage.bake_renderer import StageCamera
 from facerf_cli.stage.data.documents import write_document
 from facerf_cli.stage.data.layouts import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.stage.geometries import GeometrySettings, draw_coefficients
 from facerf_cli.stage.head.clothes import draw_clothes
 from facerf_cli.stage.head.glasses import draw_glasses
-from facerf_cli.stage.head.hair import draw_hair, scalp_cover
+from facerf_cli.stage.head.hair import draw_hair
+from facerf_cli.stage.head.hairline import scalp_cover
 from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.stage_camera import StageCamera
 
 Renderer = Literal["bake", "mitsuba"]
 # Azimuth and elevation of the cameras as seen from the head, all in front (paper, 'Dataset').

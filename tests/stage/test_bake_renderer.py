@@ -12,13 +12,9 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer
 from facerf_cli.stage.appearance.materials import Appearance, Material
-from facerf_cli.stage.bake_renderer import (
-    RenderSettings,
-    StageCamera,
-    photograph,
-    scattered_irradiance,
-)
+from facerf_cli.stage.bake_renderer import RenderSettings, photograph, scattered_irradiance
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.stage.stage_camera import StageCamera
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
 POINT_LAMP = BakeSettings(lamp_radius_deg=0, bounce_samples=0)

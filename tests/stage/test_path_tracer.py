@@ -12,9 +12,10 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, Material
-from facerf_cli.stage.bake_renderer import RenderSettings, StageCamera
+from facerf_cli.stage.bake_renderer import RenderSettings
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.path_tracer import PathSettings
+from facerf_cli.stage.stage_camera import StageCamera
 
 LAMPS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
 CAMERA = StageCamera(Camera(400, 60, 40, 24.0, 25.0), torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))

@@ -9,6 +9,7 @@ from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.stage.appearance.noise import plain_noise
 from facerf_cli.stage.appearance.people import People
 from facerf_cli.stage.appearance.window import LANDMARK_MM, Window, mask, places_mm
+from facerf_cli.stage.draws import Uniform
 
 _CORNERS = ((36, 39), (42, 45))
 _IRIS_DEG, _RADIUS_MM = 29.0, 12.0  # of the iris, from the gaze axis; of the ball
@@ -87,11 +88,7 @@ def _iris(
 
 def paint_eyes(albedo: Tensor, people: People, window: Window, generator: torch.Generator) -> Tensor:
     """The chart's albedo [B, 3, T, T] with eyes between the lids, of one gaze for both."""
-    count = len(albedo)
-
-    def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(count, 1, 1, 1, generator=generator)
-
+    uniform = Uniform(generator, (len(albedo), 1, 1, 1))
     between = mask(window, "eyes", 1.0)
     colours, _ = draw_irises(people, generator)
     x, y = places_mm(window)

@@ -14,6 +14,7 @@ from facerf_cli.stage.appearance.people import People, draw_people, named
 from facerf_cli.stage.appearance.pigments import hair_albedo
 from facerf_cli.stage.appearance.skin import bare_skin, paint_skin, scattering_mm
 from facerf_cli.stage.appearance.window import CANVAS_SPAN, Window
+from facerf_cli.stage.draws import Uniform
 from facerf_cli.stage.head.mesh import PARTS
 
 _SIDE = 256  # of the textures of small parts
@@ -135,7 +136,7 @@ def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | No
 
 
 def _uniform(low: float, high: float, generator: torch.Generator) -> float:
-    return float(low + (high - low) * torch.rand((), generator=generator))
+    return float(Uniform(generator)(low, high))
 
 
 def _mouth(generator: torch.Generator) -> Material:

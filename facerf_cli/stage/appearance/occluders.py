@@ -12,6 +12,7 @@ from torch import Tensor
 from facerf_cli.stage.appearance.noise import noise
 from facerf_cli.stage.appearance.skin import Skin
 from facerf_cli.stage.appearance.window import LANDMARK_MM, Window, places_mm, smooth
+from facerf_cli.stage.draws import Uniform
 
 _FRINGES, _GLASSES = 0.15, 0.08  # shares of faces
 _BROW_MM = float(LANDMARK_MM[17:27, 1].mean())
@@ -21,20 +22,17 @@ _EYE_MM = (float(abs(LANDMARK_MM[36:48, 0]).mean()), float(LANDMARK_MM[36:48, 1]
 def with_occluders(skin: Skin, window: Window, generator: torch.Generator) -> Skin:
     """Some of the skins under a fringe or behind glasses."""
     count = len(skin.albedo)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(count, *(shape or (1, 1, 1)), generator=generator)
-
+    uniform = Uniform(generator, (count, 1, 1, 1))
     fringed, spectacled = uniform(0, 1) < _FRINGES, uniform(0, 1) < _GLASSES
     strands = noise(count, window, (1.5, 40), generator, octaves=2)
     ragged = noise(count, window, (10, 30), generator, octaves=2)
     _, y = places_mm(window)
     lower_mm = _BROW_MM + uniform(-35, 8) + 4 * ragged
     fringe = smooth((lower_mm - y) / 4 + 0.5 + 0.4 * strands) * fringed
-    colour = uniform(0.01, 0.12) * (1 + 0.35 * strands).clamp(0.3, 2) * uniform(0.6, 1, 3, 1, 1)
+    colour = uniform(0.01, 0.12) * (1 + 0.35 * strands).clamp(0.3, 2) * uniform(0.6, 1, count, 3, 1, 1)
     rims = _rims(window, uniform(17, 25), uniform(11, 20), uniform(0.6, 1.8)) * spectacled
     skin = _covered(skin, fringe, colour, 0.5)
-    return _covered(skin, rims, uniform(0.005, 0.3, 3, 1, 1).expand_as(skin.albedo), 0.25)
+    return _covered(skin, rims, uniform(0.005, 0.3, count, 3, 1, 1).expand_as(skin.albedo), 0.25)
 
 
 def _covered(skin: Skin, cover: Tensor, albedo: Tensor, roughness: float) -> Skin:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+from facerf_cli.stage.draws import Uniform
+
 DARKEST, LIGHTEST = 0.23, 0.0075  # melanin
 RANDOM_TEXTURES = 0.06  # the share of people who wear random colours
 
@@ -47,9 +49,7 @@ class People:
 
 def draw_people(count: int, generator: torch.Generator) -> People:
     """Draw people: lightness from very light to dark evenly, the rest in proportion to what is common."""
-
-    def uniform(low: float, high: float) -> Tensor:
-        return low + (high - low) * torch.rand(count, generator=generator)
+    uniform = Uniform(generator, (count,))
 
     def share(part: float) -> Tensor:
         return (torch.rand(count, generator=generator) < part).float()

@@ -25,6 +25,7 @@ from facerf_cli.stage.appearance.window import (
     places_mm,
     smooth,
 )
+from facerf_cli.stage.draws import Uniform
 
 # Root mean square reach of the sum of Gaussians that d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
 _SCATTERING_MM = (1.18, 0.26, 0.16)
@@ -63,14 +64,11 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     albedo = skin.albedo * (1 - clothed) + clothed * cloth
     mouth = mask(window, "mouth", 1.0)
     albedo = albedo * (1 - mouth) + mouth * slit
-    shine = torch.exp(_uniform(faces, -0.5, 0.5, generator))
-    smoothness = 0.24 * _uniform(faces, 0, 1, generator) ** 2 - 0.06
+    uniform = Uniform(generator, (faces, 1, 1, 1))
+    shine = torch.exp(uniform(-0.5, 0.5))
+    smoothness = 0.24 * uniform(0, 1) ** 2 - 0.06
     specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp(0.16, 0.85)
     return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
-
-
-def _uniform(faces: int, low: float, high: float, generator: torch.Generator) -> Tensor:
-    return low + (high - low) * torch.rand(faces, 1, 1, 1, generator=generator)
 
 
 def bare_skin(people: People) -> Tensor:

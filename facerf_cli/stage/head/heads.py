@@ -1,6 +1,5 @@
 """The bare head of a person: skin, eyes that look somewhere, mouth and teeth."""
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,6 +18,7 @@ from facerf_cli.face.topology import HALF_ANGLE_DEG
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 from facerf_cli.stage.head.slits import Slit, eye_slit, lip_slit
+from facerf_cli.stage.head.subdivision import loop_step, quartered
 
 _TURN = 360 / (2 * HALF_ANGLE_DEG)  # of u, once around the head
 _LOOK_DEG = 30.0  # the gaze that a full eyeLook shape goes with
@@ -156,13 +156,13 @@ def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
     )  # the identity
     for _ in range(subdivisions):
         fine = (owner == _SKIN) | (owner == _EYE)
-        step, divided = _loop(triangles[fine], refine.shape[0])
+        step, divided = loop_step(triangles[fine], refine.shape[0])
         refine = step @ refine
         flat_uv = np.zeros((step.shape[1], 2))
         flat_uv[triangles.reshape(-1)] = uv.reshape(-1, 2)
         triangles = np.concatenate([divided, triangles[~fine]])
         owner = np.concatenate([np.repeat(owner[fine], 4), owner[~fine]])
-        divided_uv = _quartered(uv[fine]) + _slide(step, flat_uv, divided, _quartered(uv[fine]))
+        divided_uv = quartered(uv[fine]) + _slide(step, flat_uv, divided, quartered(uv[fine]))
         uv = np.concatenate([divided_uv, uv[~fine]])
     eyes = _eyes(head, triangles[owner == _EYE], refine)
     source, split, kinds, flat = _cut(triangles, owner, uv)
@@ -227,14 +227,6 @@ def _unwrapped(uv: np.ndarray) -> np.ndarray:
     return out
 
 
-def _quartered(uv: np.ndarray) -> np.ndarray:
-    """Corners [4 F, 3, 2] of the triangles that `_loop` makes of each, in its order."""
-    a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1)
-    return corners.reshape(-1, 3, 2)
-
-
 def _slide(step: csr_matrix, flat_uv: np.ndarray, triangles: np.ndarray, uv: np.ndarray) -> np.ndarray:
     """How far subdivision moves corners [F, 3, 2] in the texture, as it moves the vertices on the surface.
 
@@ -243,59 +235,6 @@ def _slide(step: csr_matrix, flat_uv: np.ndarray, triangles: np.ndarray, uv: np.
     moved = (step @ flat_uv)[triangles] - uv
     moved[..., 0] -= _TURN * np.round(moved[..., 0] / _TURN)
     return np.where(np.abs(moved).max(-1, keepdims=True) < _SLIDE_UV, moved, 0.0)
-
-
-def _loop(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
-    """One step of Loop's subdivision [count + E, count], and its triangles [4 F, 3].
-
-    Vertices of no triangle stay; a border is smoothed as a curve of its own.
-    """
-    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    opposite = triangles[:, [2, 0, 1]].reshape(-1)
-    edges, edge = np.unique(np.sort(sides, -1), axis=0, return_inverse=True)
-    edge = edge.reshape(-1)
-    inner = np.bincount(edge, minlength=len(edges)) == 2
-    rows, columns, weights = [], [], []
-
-    def add(row: np.ndarray, column: np.ndarray, weight: np.ndarray | float) -> None:
-        rows.append(row)
-        columns.append(column)
-        weights.append(np.broadcast_to(weight, row.shape))
-
-    new = count + np.arange(len(edges))
-    for end in (0, 1):
-        add(new, edges[:, end], np.where(inner, 3 / 8, 1 / 2))
-    add(new[edge[inner[edge]]], opposite[inner[edge]], 1 / 8)
-
-    border = np.zeros(count, bool)
-    border[edges[~inner]] = True
-    both = np.concatenate([edges, edges[:, ::-1]])
-    both_inner = np.concatenate([inner, inner])
-    valence = np.bincount(both[:, 0], minlength=count)
-    share = np.zeros(count)
-    regular = valence > 0
-    share[regular] = _loop_share(valence[regular])
-    smooth = both[~border[both[:, 0]]]
-    add(smooth[:, 0], smooth[:, 1], share[smooth[:, 0]])
-    rim = both[~both_inner]
-    rim_valence = np.bincount(rim[:, 0], minlength=count)
-    add(rim[:, 0], rim[:, 1], np.where(rim_valence[rim[:, 0]] == 2, 1 / 8, 0.0))
-    everyone = np.arange(count)
-    own = np.where(border, np.where(rim_valence == 2, 3 / 4, 1.0), 1 - valence * share)
-    add(everyone, everyone, own)
-    step = coo_matrix(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
-        shape=(count + len(edges), count),
-    ).tocsr()
-    ab, bc, ca = (count + edge.reshape(-1, 3)).T
-    a, b, c = triangles.T
-    divided = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1).reshape(-1, 3)
-    return step, divided
-
-
-def _loop_share(valence: np.ndarray) -> np.ndarray:
-    """The weight of each neighbour of a vertex that stays (Loop, 1987)."""
-    return (5 / 8 - (3 / 8 + np.cos(2 * math.pi / valence) / 4) ** 2) / valence
 
 
 def _eyes(head: HeadModel, triangles: np.ndarray, refine: csr_matrix) -> tuple[_Eye, ...]:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from facerf_cli.face.topology import chart_uv
-from facerf_cli.stage.head.hair import draw_hair, grow_hair, scalp_cover, scalp_margin_m
+from facerf_cli.stage.head.hair import draw_hair, grow_hair
 from facerf_cli.stage.head.hair_styles import STYLES, HairStyle, draw_style
+from facerf_cli.stage.head.hairline import scalp_cover, scalp_margin_m
 from facerf_cli.stage.head.hull import hull_of
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
 

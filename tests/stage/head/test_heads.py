@@ -15,8 +15,9 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.stage.head.heads import _loop, build_head
+from facerf_cli.stage.head.heads import build_head
 from facerf_cli.stage.head.mesh import PARTS, HeadMesh
+from facerf_cli.stage.head.subdivision import loop_step
 
 FULL = 1 / 0.3  # the coefficient of a whole blendshape
 
@@ -171,7 +172,7 @@ def test_a_model_without_a_head_gets_a_shell(monkeypatch):
 
 def test_loop_subdivision_keeps_what_it_must():
     mesh = trimesh.creation.icosphere(subdivisions=1)
-    step, triangles = _loop(np.asarray(mesh.faces), len(mesh.vertices))
+    step, triangles = loop_step(np.asarray(mesh.faces), len(mesh.vertices))
     assert np.allclose(step @ np.ones(len(mesh.vertices)), 1)
     fine = trimesh.Trimesh(step @ mesh.vertices, triangles, process=False)
     assert fine.is_watertight and fine.volume > 0 and fine.euler_number == 2
@@ -189,7 +190,7 @@ def test_loop_subdivision_keeps_a_flat_sheet_flat_and_its_border_straight():
             np.stack([corner, corner + 6, corner + 5], -1),
         ]
     )
-    fine = _loop(triangles, 25)[0] @ points
+    fine = loop_step(triangles, 25)[0] @ points
     assert np.allclose(fine[:, 2], fine[:, 0] + 2 * fine[:, 1])
     assert fine[:, 0].min() > -1e-9 and (np.abs(fine[:, 0]) < 1e-9).sum() == 9 - 2  # corners are rounded
 
