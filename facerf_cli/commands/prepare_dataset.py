@@ -8,6 +8,7 @@ import typer
 
 from facerf_cli.commands.batch import BatchOptions, run_items, sums_up
 from facerf_cli.commands.capture_checks import show_findings
+from facerf_cli.commands.describe_capture import describe_capture
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import (
     DryRunOption,
@@ -37,9 +38,23 @@ def prepare_dataset(
         ),
     ],
     output: Annotated[
-        Path,
-        typer.Option("--output", "-o", metavar="DATASET", help="Folder for the data.", show_default=False),
-    ],
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DATASET",
+            help="Folder for the data; with --describe the draft's name.",
+            show_default="CAPTURE/stage.json with --describe",
+        ),
+    ] = None,
+    describe: Annotated[
+        bool,
+        typer.Option(
+            "--describe",
+            help="Write a first draft of stage.json by the pictures' names and headers, tell what is left to "
+            "fill in, and prepare nothing.",
+        ),
+    ] = False,
     layout: Annotated[
         str,
         typer.Option(
@@ -93,6 +108,11 @@ def prepare_dataset(
     from facerf_cli.stage.data.description import preparation_key
     from facerf_cli.stage.data.splits import Split
 
+    if describe:
+        describe_capture(capture, output)
+        return
+    if output is None:
+        raise UsageError("give -o DATASET, a folder for the data (or --describe, for a draft of stage.json)")
     settings = settings_of(context)
     drawn = Split.parse(split)
     if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:

@@ -15,12 +15,13 @@ world_to_camera has OpenCV's axes (y down, z forward); it becomes DESIGN's (y up
 and nowhere else. Intensities are linear Rec.709 in DESIGN's unit of light; the black level is linear too.
 Without `subjects` whoever has pictures is one. "ambient": "{subject}/{camera}/ambient.exr", which may be
 missing, names pictures without any lamp; --subtract-ambient takes them away in the black level's place.
+A pattern names {camera} unless there is one camera alone, and {subject} unless `subjects` is of one alone.
 
 Layout 'extended-yale-b': `yale_layout.py`.
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -38,7 +39,7 @@ from facerf_cli.stage.data.moved import moved
 
 STAGE_FILE, STAGE_FORMAT = "stage.json", "facerf-stage-1"
 MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
-_FIELDS = ("subject", "camera", "light")
+FIELDS = ("subject", "camera", "light")  # of a pattern
 _LONGEST_SIDE_PX = 65_536
 _ORTHONORMAL_OFF = 1e-3
 _LEAST_INTENSITY = 1e-12  # what is less is no light, and 0 in float32 before long
@@ -124,7 +125,8 @@ _read_ambient = lru_cache(maxsize=2)(_read_picture)  # one a camera, and every f
 
 
 def _read_stage(folder: Path) -> Capture:
-    root = read_document(folder / STAGE_FILE, "a capture has one, see the manual of `facerf prepare-dataset`")
+    root = read_document(folder / STAGE_FILE, "--describe drafts one from the pictures")
+    _require_filled(root)
     for key, value in (("format", STAGE_FORMAT), ("axes", "opencv"), ("unit", "m")):
         if root[key].value != value:
             raise root[key].wrong(f"'{value}'")
@@ -133,7 +135,9 @@ def _read_stage(folder: Path) -> Capture:
         if not nodes:
             raise root[key].wrong("one entry at least")
     light_ids, camera_ids = unique_ids(lights), unique_ids(cameras)
-    pattern, subjects = _pattern(root["pattern"]), root.get("subjects")
+    subjects = root.get("subjects")
+    needed = _needed_fields(camera_ids, subjects)
+    pattern = require_pattern(root["pattern"], needed)
     return Capture(
         folder=folder,
         pattern=pattern,
@@ -149,12 +153,22 @@ def _read_stage(folder: Path) -> Capture:
             else {name: node.table() for name, node in sorted(subjects.entries(MOST_SUBJECTS).items())}
         ),
         provenance={} if (node := root.get("provenance")) is None else node.table(),
-        ambient_pattern="" if (node := root.get("ambient")) is None else _pattern(node, _FIELDS[:2]),
+        ambient_pattern=(
+            "" if (node := root.get("ambient")) is None else require_pattern(node, needed, FIELDS[:2])
+        ),
     )
 
 
 def _read_yale(folder: Path) -> Capture:
     from facerf_cli.stage.data.yale_layout import read_yale_capture  # it makes captures, too
+
+def _require_filled(root: Node) -> None:
+    """Raise where something is null, as in a draft of --describe; traits and provenance may be."""
+    said = (root[key] for key in root.table() if key not in ("subjects", "provenance"))
+    if gaps := [gap for node in said for gap in node.nulls()]:
+        more = f" (and {len(gaps) - 1} more)" if len(gaps) > 1 else ""
+        raise InputError(f"{gaps[0].where} is null; fill it in{more}")
+
 
     return read_yale_capture(folder)
 
@@ -211,20 +225,26 @@ def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
     return u @ vh, matrix[:3, 3]
 
 
-def _pattern(node: Node, fields: tuple[str, ...] = _FIELDS) -> str:
-    """A relative path that names each field, and leads nowhere else."""
+def _needed_fields(camera_ids: list[str], subjects: Node | None) -> set[str]:
+    """What a pattern must name: there may be one camera alone, or one subject alone."""
+    alone = {"camera": len(camera_ids) == 1, "subject": subjects is not None and len(subjects.table()) == 1}
+    return {field for field in FIELDS if not alone.get(field)}
+
+
+def require_pattern(node: Node, needed: Collection[str], fields: tuple[str, ...] = FIELDS) -> str:
+    """A relative path that names the needed of `fields`, and leads nowhere else; an InputError otherwise."""
     pattern = node.text()
     parts = pattern.split("/")
     plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
+    words = [f"{{{field}}}" for field in fields if field in needed]
     if (
-        any(f"{{{field}}}" not in pattern for field in fields)
+        any(word not in pattern for word in words)
         or not plain.isprintable()
         or re.search(r"[{}\\:*?]", plain)
         or any(part in ("", ".", "..") for part in parts)
         or len(pattern) > 500
     ):
-        *first, last = (f"{{{field}}}" for field in fields)
-        raise node.wrong(f"a path below the capture with {', '.join(first)} and {last} in it")
+        raise node.wrong(f"a path below the capture{' that names ' * bool(words)}{' and '.join(words)}")
     return pattern
 
 
@@ -239,7 +259,7 @@ def _found_subjects(folder: Path, pattern: str, cameras: list[str], lights: list
     parts = pattern.split("/")
     depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
     expression = re.escape("/".join(parts[: depth + 1]))
-    for word in _FIELDS:
+    for word in FIELDS:
         first, *rest = expression.split(re.escape(f"{{{word}}}"))
         named = [f"(?P<{word}>[^/]+)", *[f"(?P={word})"] * (len(rest) - 1)] if rest else []
         expression = first + "".join(name + part for name, part in zip(named, rest, strict=True))

@@ -1,0 +1,178 @@
+"""From the names of a capture's pictures to a pattern of {subject}, {camera} and {light}.
+
+Which part is which is told by the words that stand in it or before it (`cam3`, `L017`), else by its place:
+the lights come last, the subjects first.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+
+from facerf_cli.errors import UsageError
+from facerf_cli.stage.data.layouts import FIELDS, MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
+from facerf_cli.stage.draft.lamps import ANGLES
+from facerf_cli.stage.draft.parts import ANY, Part, is_crossed, parts_of
+
+_WORDS: Mapping[str, tuple[str, ...]] = {
+    "subject": ("subject", "subj", "sub", "person", "actor", "face", "s", "p"),
+    "camera": ("camera", "cam", "view", "c", "v"),
+    "light": ("light", "lamp", "led", "flash", "olat", "l"),
+}
+_MOST = {"subject": MOST_SUBJECTS, "camera": MOST_CAMERAS, "light": MOST_LIGHTS}
+_TOLD, _FAR_TOO_MANY = 4, 100  # what a word weighs against a place, and a limit against both
+
+
+@dataclass(frozen=True)
+class Naming:
+    """How a capture's pictures are named."""
+
+    pattern: str  # with {light}, and with {camera} and {subject} where the names have them
+    by_place: tuple[str, ...]  # fields that are told by their place alone, and may be others
+    strict: re.Pattern[str]  # of a picture's path, a group a field
+    loose: re.Pattern[str]  # the same with anything for a light
+
+
+def find_naming(paths: Sequence[str]) -> Naming:
+    """The pattern that most of the paths follow; a UsageError where they are not those of a capture."""
+    parts = parts_of(paths)
+    same = _same_again(parts)
+    varying = [place for place, part in enumerate(parts) if part.varies and place not in same]
+    _require_a_capture(parts, varying)
+    hints = _hints(parts)
+    for place, (piece, _, _) in same.items():
+        hints[piece] = hints[piece] or hints[place]
+    fields = _assigned(parts, varying, hints)
+    by_place = tuple(field for place, field in fields.items() if hints[place] != field)
+    settled = len(fields) == 1 or (len(fields) == len(FIELDS) and len(by_place) == 1)  # nothing else is left
+    fields |= _fixed_fields(parts, hints, set(fields.values()))
+    fields |= {place: fields[piece] for place, (piece, _, _) in same.items()}
+    around = {place: (before, after) for place, (_, before, after) in same.items()}
+    strict, loose = (re.compile(_expression(parts, fields, around, light)) for light in (None, ANY))
+    return Naming(_pattern(parts, fields, around), () if settled else by_place, strict, loose)
+
+
+def _same_again(parts: Sequence[Part]) -> dict[int, tuple[int, str, str]]:
+    """The parts that are another over again, as in `anna/anna_L01.exr` or `s01/01_L01.exr`.
+
+    By place: that of the part which it repeats, and what stands before and after the same text.
+    """
+    same: dict[int, tuple[int, str, str]] = {}
+    for a, b in combinations([place for place, part in enumerate(parts) if part.varies], 2):
+        for whole, piece in ((b, a), (a, b)):
+            repeated = {place for place, _, _ in same.values()}
+            free = not {whole, piece} & same.keys() and whole not in repeated
+            if free and (around := _around(parts[whole], parts[piece])):
+                same[whole] = (piece, *around)
+    return same
+
+
+def _around(whole: Part, piece: Part) -> tuple[str, str] | None:
+    """What stands around a part's text in another's, alike in all paths; None where it does not."""
+    before, found, after = whole.texts[0].partition(piece.texts[0])
+    pairs = set(zip(whole.texts, piece.texts, strict=True))
+    return (before, after) if found and all(a == f"{before}{b}{after}" for a, b in pairs) else None
+
+
+def _require_a_capture(parts: Sequence[Part], varying: Sequence[int]) -> None:
+    if not varying:
+        raise UsageError("one picture is no capture, which has a picture a light")
+    for a, b in combinations(varying, 2):
+        if not is_crossed(parts[a], parts[b]):
+            raise UsageError(
+                f"the names vary together in {_shown(parts[a])} and {_shown(parts[b])}; rename the pictures, "
+                "so that a light has one name under all subjects and cameras"
+            )
+    if len(varying) > len(FIELDS):
+        examples = ", ".join(_shown(parts[place]) for place in varying)
+        raise UsageError(
+            f"{len(varying)} parts of the names vary ({examples}), and subject, camera and light are three; "
+            "rename the pictures, or give a folder with fewer of them"
+        )
+
+
+def _shown(part: Part) -> str:
+    first, *_ = sorted(part.values)
+    return f"{first!a} ({len(part.values)} values)"
+
+
+def _hints(parts: Sequence[Part]) -> list[str]:
+    """By part, the field that its letters, or those before it, speak of; empty where none do."""
+    hints, before = [], ""
+    for part in parts:
+        hints.append(_hint(part, before))
+        before = "" if part.varies or "/" in part.values else before + part.texts[0]
+    return hints
+
+
+def _hint(part: Part, before: str) -> str:
+    if all(ANGLES.search(text) for text in part.values):
+        return "light"
+    words = {re.sub(r"[\W\d_].*", "", text, flags=re.DOTALL) for text in part.values}
+    if words == {""}:
+        words = {re.split(r"[\W\d_]+", before.rstrip("_- ."))[-1]}
+    if len(words) > 1 or not all(re.search("[0-9]", text) for text in part.values):
+        return ""
+    word = words.pop().lower()
+    return next((field for field, known in _WORDS.items() if {word, word.removesuffix("s")} & {*known}), "")
+
+
+def _assigned(parts: Sequence[Part], varying: Sequence[int], hints: Sequence[str]) -> dict[int, str]:
+    """The field of each part that varies."""
+
+    def score(fields: Sequence[str]) -> int:
+        pairs = list(zip(varying, fields, strict=True))
+        told = sum(_TOLD * (1 if hints[place] == field else -1) for place, field in pairs if hints[place])
+        placed = (fields[-1] == "light") + (fields[0] == "subject")
+        too_many = any(len(parts[place].values) > _MOST[field] for place, field in pairs)
+        return told + placed - _FAR_TOO_MANY * too_many
+
+    best = max((fields for fields in permutations(FIELDS, len(varying)) if "light" in fields), key=score)
+    if score(best) <= _TOLD - _FAR_TOO_MANY:
+        counts = ", ".join(_shown(parts[place]) for place in varying)
+        raise UsageError(
+            f"the names vary too much for {MOST_LIGHTS} lights at most: {counts}; is this one capture?"
+        )
+    return dict(zip(varying, best, strict=True))
+
+
+def _fixed_fields(parts: Sequence[Part], hints: Sequence[str], known: set[str]) -> dict[int, str]:
+    """Parts that name the only camera, by a word of theirs, or the only subject, which may be any folder."""
+    fixed = [place for place, part in enumerate(parts[:-1]) if not part.varies and part.texts[0] != "/"]
+    named = {field: [place for place in fixed if hints[place] == field] for field in ("camera", "subject")}
+    named["subject"] = [place for place in fixed if _is_folder(parts, place)] + named["subject"]
+    fields: dict[int, str] = {}
+    for field, places in named.items():
+        if field not in known and (free := [place for place in places if place not in fields]):
+            fields |= {place: field for place in fixed if parts[place].texts[0] == parts[free[0]].texts[0]}
+    return fields
+
+
+def _is_folder(parts: Sequence[Part], place: int) -> bool:
+    """Whether a part is a folder's whole name."""
+    return "/" in parts[place + 1].values and (place == 0 or "/" in parts[place - 1].values)
+
+
+def _pattern(parts: Sequence[Part], fields: Mapping[int, str], around: Mapping[int, tuple[str, str]]) -> str:
+    pieces = []
+    for place, part in enumerate(parts):
+        before, after = around.get(place, ("", ""))
+        pieces.append(f"{before}{{{fields[place]}}}{after}" if place in fields else part.texts[0])
+    return "".join(pieces)
+
+
+def _expression(
+    parts: Sequence[Part], fields: Mapping[int, str], around: Mapping[int, tuple[str, str]], light: str | None
+) -> str:
+    """A regular expression of the paths; `light` is of what may stand for a light, by default its like."""
+    like = {field: parts[place].expression for place, field in fields.items() if place not in around}
+    like |= {field: ANY for place, field in fields.items() if field == "camera" and _is_folder(parts, place)}
+    like |= {"subject": ANY} | ({} if light is None else {"light": light})
+    pieces, seen = [], set()
+    for place, part in enumerate(parts):
+        before, after = map(re.escape, around.get(place, ("", "")))
+        field = fields.get(place)
+        named = f"(?P={field})" if field in seen else f"(?P<{field}>{like.get(field or '')})"
+        pieces.append(part.expression if field is None else before + named + after)
+        seen.add(field)
+    return "".join(pieces)
