@@ -1,0 +1,138 @@
+"""From photographs of a colour chart to corrections of a capture's cameras; what is implausible is refused.
+
+The picture goes the way of the frames: decoded by the capture's colour space, less the black level, over the
+lamps' rgb. The chart's light is taken for that of all lamps, so it is their mean rgb, of luminance 1.
+"""
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.colour import luminance
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.stage.chart.colours import ColourFit, fit_colours, published_colours
+from facerf_cli.stage.chart.correction import ChartCorrection
+from facerf_cli.stage.chart.find import find_chart
+from facerf_cli.stage.chart.patches import GREYS, Patches, four_turns, is_convex, sample
+from facerf_cli.stage.data.layouts import Capture, read_picture
+
+CAMERA_FIELD = "{camera}"
+_LARGEST_DELTA_E = 8.0  # mean; a chart that was found and photographed well has 1 to 4
+_LEAST_PX = 25  # in the middle of a patch
+_LARGEST_NOISE = 0.25  # of a pixel on the white patch, as a share of it
+_LEAST_CHROMA = 0.02  # of a chart's colours; red and blue reach 1 and more
+_CLIPPED_SHARE = 0.1  # of a patch's pixels
+_CLIPPED_WHITE = 0.9  # of what the darker greys have white be
+_EXPONENTS = (0.8, 1.25)  # of the greys' brightness over what is published
+
+
+def read_charts(capture: Capture, picture: str, corners_px: np.ndarray | None) -> Iterator[ChartCorrection]:
+    """The corrections of a capture's cameras by a picture, or, with {camera} in its name, by one a camera.
+
+    corners_px [4, 2]: of the patches' area, in turn; None has the chart looked for.
+    """
+    if CAMERA_FIELD not in picture:
+        yield _read_chart(capture, Path(picture), tuple(capture.cameras), corners_px)
+        return
+    if corners_px is not None:
+        raise UsageError(f"--chart-corners are of one picture; --colour-chart {picture} names one a camera")
+    for camera in capture.cameras:
+        yield _read_chart(capture, Path(picture.replace(CAMERA_FIELD, camera)), (camera,), None)
+
+
+def as_a_frame(capture: Capture, decoded: np.ndarray) -> np.ndarray:
+    """Values [..., 3] of a chart's picture less the black level, over the lamps' mean rgb of luminance 1."""
+    mean = capture.intensities.mean(0)
+    return (decoded - capture.black_level) / (mean / luminance(mean))
+
+
+def _read_chart(
+    capture: Capture, picture: Path, cameras: tuple[str, ...], corners_px: np.ndarray | None
+) -> ChartCorrection:
+    raw = read_picture(picture, capture.colour_space)
+    if corners_px is None:
+        corners_px = find_chart(as_a_frame(capture, raw), _LARGEST_DELTA_E)
+        if corners_px is None:
+            raise InputError(
+                f"{picture}: no ColorChecker Classic found in it; say where its 24 patches are with "
+                "--chart-corners 'x,y x,y x,y x,y'"
+            )
+    _require_quadrilateral(picture, raw, corners_px)
+    tries = []
+    for turned in four_turns(corners_px):
+        patches = sample(raw, turned)
+        fit = fit_colours(as_a_frame(capture, patches.colours))
+        tries.append((float(fit.delta_e_after.mean()), turned, patches, fit))
+    _, corners_px, patches, fit = min(tries, key=lambda found: found[0])
+    _require_light(picture, patches, capture.black_level)
+    _require_chart(picture, patches, fit, capture.colour_space)
+    return ChartCorrection(
+        picture=picture,
+        picture_sha256=hashlib.sha256(picture.read_bytes()).hexdigest(),
+        cameras=cameras,
+        corners_px=_rows(corners_px, 2),
+        matrix=_rows(fit.matrix, 6),  # so that no processor's last digits make another dataset
+        delta_e_before=_mean_and_max(fit.delta_e_before),
+        delta_e_after=_mean_and_max(fit.delta_e_after),
+        light_span=round(float(fit.light.max() / fit.light.min()), 3),
+    )
+
+
+def _rows(values: np.ndarray, digits: int) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(round(float(value), digits) for value in row) for row in values)
+
+
+def _mean_and_max(delta_e: np.ndarray) -> tuple[float, float]:
+    return round(float(delta_e.mean()), 2), round(float(delta_e.max()), 2)
+
+
+def _require_quadrilateral(picture: Path, raw: np.ndarray, corners_px: np.ndarray) -> None:
+    height, width = raw.shape[:2]
+    if not ((corners_px >= 0) & (corners_px <= [width, height])).all():
+        raise InputError(f"{picture}: --chart-corners lie outside its {width} x {height} pixels")
+    if not is_convex(corners_px):
+        raise InputError(f"{picture}: --chart-corners make no convex quadrilateral; give them in turn around")
+
+
+def _require_light(picture: Path, patches: Patches, black_level: float) -> None:
+    """Raise for patches whose pixels say too little of their colours."""
+    if patches.counts.min() < _LEAST_PX:
+        raise InputError(
+            f"{picture}: a patch of the chart has {patches.counts.min()} pixels in its middle; "
+            f"{_LEAST_PX} are needed, photograph it larger"
+        )
+    greys = patches.colours[GREYS]
+    brightest = (greys - black_level).max(0)
+    if brightest.min() <= 0 or patches.noise[GREYS].max() > _LARGEST_NOISE * brightest[1]:
+        raise InputError(f"{picture}: the chart is too dark, or too noisy; expose it longer")
+    clipped = int((patches.at_white > _CLIPPED_SHARE).sum())
+    if clipped:
+        raise InputError(f"{picture}: {clipped} of the chart's patches are clipped at white; expose it less")
+    spread = np.ptp(patches.colours, -1) / greys.max()
+    if spread.max() < _LEAST_CHROMA:
+        raise InputError(f"{picture}: is grey; a chart's correction needs a picture in colour")
+
+
+def _require_chart(picture: Path, patches: Patches, fit: ColourFit, colour_space: str) -> None:
+    """Raise for colours that are no chart's, or not linear."""
+    mean = fit.delta_e_after.mean()
+    if mean > _LARGEST_DELTA_E:
+        raise InputError(
+            f"{picture}: the patches' colours are off a ColorChecker Classic's by a mean CIE delta E 2000 of "
+            f"{mean:.0f}; look whether the corners are its patches', and '{colour_space}' its colour space"
+        )
+    greys, published = luminance(fit.even[GREYS]), luminance(published_colours()[GREYS])
+    lit = slice(0, -1)  # black has stray light in it
+    exponent = np.polyfit(np.log(published[lit]), np.log(greys[lit].clip(1e-6)), 1)[0]
+    if not _EXPONENTS[0] < exponent < _EXPONENTS[1]:
+        raise InputError(
+            f"{picture}: the chart's greys are not linear (as their power {exponent:.2f}); "
+            f"'{colour_space}' is not how it was encoded"
+        )
+    for channel in range(3):
+        values, wanted = fit.even[GREYS, channel], published_colours()[GREYS, channel]
+        slope = (values[1:4] @ wanted[1:4]) / (wanted[1:4] @ wanted[1:4])
+        if values[0] < _CLIPPED_WHITE * slope * wanted[0]:
+            raise InputError(f"{picture}: the chart's white patch is clipped; expose it less")
