@@ -23,6 +23,7 @@ from torch import Tensor
 from facerf_cli.baselines import prt, specular_sh
 from facerf_cli.baselines.explain import explain
 from facerf_cli.baselines.kinds import Kind
+from facerf_cli.baselines.photo_texels import DETAIL
 from facerf_cli.evaluation.views import View
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
@@ -102,7 +103,7 @@ def method(given: argparse.Namespace, kind: Kind) -> Any:
 
 def _changed(given: argparse.Namespace, module: Any) -> dict[str, Any]:
     evidence = module.SETTINGS.evidence if given.evidence is None else given.evidence
-    detail = module.DETAIL if given.detail is None else given.detail
+    detail = DETAIL if given.detail is None else given.detail
     return {"settings": replace(module.SETTINGS, evidence=evidence), "detail": detail}
 
 

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
@@ -28,6 +28,7 @@ from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.refine import RefinedLight, refine_light
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.network.diffuse import DiffuseNetwork
 from facerf_cli.network.features import Layered
 from facerf_cli.network.inputs import colour_cast, exposure_of
 from facerf_cli.network.reflectance import ReflectanceNetwork
@@ -48,8 +49,9 @@ class Models:
     """The face model, on the processor as all geometry is, and the trained networks on `device`."""
 
     face: MorphableModel
-    network: ReflectanceNetwork
-    geometry: nn.Module | None  # a Geometry Network, where the checkpoint holds one
+    network: ReflectanceNetwork | None  # what of these the checkpoint holds: a Reflectance Network,
+    geometry: nn.Module | None  # a Geometry Network,
+    diffuse: DiffuseNetwork | None  # the network of the baseline diffuse-sh
     checkpoint_name: str
     metadata: dict[str, Any]
     device: torch.device
@@ -71,14 +73,15 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
     """Load what the arrows need; `checkpoint` None is the one shipped."""
     path = checkpoint or DEFAULT_CHECKPOINT
     networks, metadata = load_networks(path, LAYOUT_VERSION)
-    if "reflectance" not in networks:
+    if not networks.keys() & {"reflectance", "diffuse_sh"}:
         raise InputError(f"{path}: holds no Reflectance Network; give one by `facerf train`")
     _require_builtin_coefficients(path, networks.get("geometry"))
     on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
     return Models(
         face=load_face_model(face_model),
-        network=on_device["reflectance"],
+        network=on_device.get("reflectance"),
         geometry=on_device.get("geometry"),
+        diffuse=on_device.get("diffuse_sh"),
         checkpoint_name=path.stem,
         metadata=metadata,
         device=device,
@@ -235,9 +238,14 @@ def predict_olat(
     `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s. `quotient` is
     what `explain_photo` found; without it they are the network's own.
     """
-    device, texels = models.device, face.texture.shape[-1] ** 2
+    network, device, texels = models.network, models.device, face.texture.shape[-1] ** 2
+    if network is None:
+        raise UsageError(
+            f"{models.checkpoint_name}: a checkpoint without a Reflectance Network, which the field needs; "
+            "give --reflectance diffuse-sh with it, or another --checkpoint"
+        )
     most = _LIGHTS_ON_CPU if device.type == "cpu" else len(lights)
-    bytes_per_light = 4 * (_DECODER_CHANNELS * models.network.settings.side**2 + 16 * texels)
+    bytes_per_light = 4 * (_DECODER_CHANNELS * network.settings.side**2 + 16 * texels)
     batch = max(1, min(most, memory_bytes // bytes_per_light))
     normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
     normals = normals[None].to(device)
@@ -245,10 +253,10 @@ def predict_olat(
     texture = face.texture[None] / colour_cast(face.texture[None], visible)
     source = (texture, face.normals[None], visible)
     with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        encoded = models.network.encode(*(tensor.to(device) for tensor in source))
+        encoded = network.encode(*(tensor.to(device) for tensor in source))
     for chunk in torch.split(lights, batch):
         with torch.autocast(device.type, torch.bfloat16, enabled=bf16):  # not around a yield: it would leak
-            olats = models.network.decode(encoded, normals, chunk[None].to(device))[0]
+            olats = network.decode(encoded, normals, chunk[None].to(device))[0]
         olats = olats.float().cpu()
         yield quotient.corrected(olats) if quotient else olats
 

@@ -20,7 +20,6 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, irradiance, rig_coefficients
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.diffuse import COEFFICIENTS, ORDER, DiffuseNetwork, shading
 from facerf_cli.network.inputs import resize
 from facerf_cli.network.saved import load_networks
@@ -47,8 +46,11 @@ class Diffuse:
 
 
 def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
-    """Albedo and light of a face's photo by the network that is shipped; `fit` is not needed."""
-    return explain_texture(load_diffuse_network(CHECKPOINT).to(models.device), face)
+    """Albedo and light of a face's photo, by the network that is shipped where the models have none.
+
+    `fit` is not needed.
+    """
+    return explain_texture(models.diffuse or load_diffuse_network(CHECKPOINT).to(models.device), face)
 
 
 @torch.no_grad()
@@ -69,8 +71,7 @@ def explain_texture(
     coefficients = estimate.coefficients[0].cpu()
     if refit:
         coefficients = refitted(reflectance, face, coefficients)
-    rig = rig_directions()
-    return Explained(reflectance, RigLight(rig, coefficients_to_rig(coefficients, rig)))
+    return Explained(reflectance, coefficients_to_rig(coefficients))
 
 
 def refitted(reflectance: Diffuse, face: FaceTexture, coefficients: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from facerf_cli.pipeline import FaceTexture
 
 _SEEN = 0.5  # of a coarse texel, for it to count
 _FLOOR = 0.15  # of the mean shading: in darker shadow less is made of what the photo shows
+DETAIL = 0.5  # the share of what the prior lacks of the photo that is taken for the face's
 _MOST_DETAIL = 1.5  # of a logarithm
 
 

@@ -16,17 +16,15 @@ from torch import Tensor
 from facerf_cli.baselines.albedo import SIDE, skin_prior
 from facerf_cli.baselines.baked_transfer import TransferSettings, baked_transfer
 from facerf_cli.baselines.light_prior import light_prior
-from facerf_cli.baselines.photo_texels import coarse, shrunk, with_detail
+from facerf_cli.baselines.photo_texels import DETAIL, coarse, shrunk, with_detail
 from facerf_cli.baselines.reflectance import Explained
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import FaceTexture, Models
 
 SETTINGS, BAKE = SolveSettings(), TransferSettings()
-DETAIL = 0.5  # of what the prior lacks of the photo
 _ROUNDS = 2  # of the face's mean albedo, which tints its bounce
 
 
@@ -75,10 +73,7 @@ def explain_by_prt(
     shading = Prt(albedo, transfer, fit.rotation).shading(rotated(found.light, fit.rotation.T)[None])[0]
     albedo = with_detail(albedo, face, shading, torch.zeros_like(shading), detail)
     coefficients = light_given(scene, shrunk(albedo), skin_prior().gloss.mean, light)
-    rig = rig_directions()
-    return Explained(
-        Prt(albedo.exp(), transfer, fit.rotation), RigLight(rig, coefficients_to_rig(coefficients, rig))
-    )
+    return Explained(Prt(albedo.exp(), transfer, fit.rotation), coefficients_to_rig(coefficients))
 
 
 def _scene(transfer: Tensor, fit: FaceFit, face: FaceTexture) -> Scene:

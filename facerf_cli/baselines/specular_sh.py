@@ -18,21 +18,19 @@ from torch import Tensor
 
 from facerf_cli.baselines.albedo import SIDE, skin_prior
 from facerf_cli.baselines.light_prior import light_prior
-from facerf_cli.baselines.photo_texels import coarse, shrunk, with_detail
+from facerf_cli.baselines.photo_texels import DETAIL, coarse, shrunk, with_detail
 from facerf_cli.baselines.reflectance import Explained
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, rig_coefficients, sh_basis
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import FaceTexture, Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
 
 DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
 EXPONENT = 12.0  # of the Blinn-Phong lobe, which then ends at GLOSS_ORDER
 SETTINGS = SolveSettings()
-DETAIL = 0.5  # of what the prior lacks of the photo
 _NODES = 256  # at which the lobe is integrated
 
 
@@ -103,11 +101,7 @@ def explain_by_specular_sh(
     shading, shining = SpecularSh(surface, albedo, gloss).parts(found.light[None])
     albedo = with_detail(albedo, face, shading[0], gloss.exp() * shining[0], detail)
     coefficients = light_given(scene, shrunk(albedo), shrunk(gloss), light)
-    rig = rig_directions()
-    return Explained(
-        SpecularSh(surface, albedo.exp(), gloss.exp()),
-        RigLight(rig, coefficients_to_rig(coefficients, rig)),
-    )
+    return Explained(SpecularSh(surface, albedo.exp(), gloss.exp()), coefficients_to_rig(coefficients))
 
 
 def _surface(vertices: Tensor, fit: FaceFit, side: int) -> Surface:

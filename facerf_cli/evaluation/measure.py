@@ -12,7 +12,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.evaluation.cases import Comparison
 from facerf_cli.evaluation.perceptual import perceptual_metric
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
-from facerf_cli.metrics import mse, psnr_of, si_mse, si_mse_clipped, ssim
+from facerf_cli.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
 
 Space = Literal["linear", "display"]
 
@@ -115,6 +115,7 @@ def _pixel_values(prediction: np.ndarray, comparison: Comparison, space: Space) 
     return {
         "si_mse": si_mse(p, t, mask),
         "si_mse_clipped": si_mse_clipped(p, t, mask),
+        "si_mse_channels": si_mse_channels(p, t, mask),
         "mse": squared,
         "psnr": psnr_of(squared),
         "ssim": alike,

@@ -17,11 +17,9 @@ from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.methods import Method, relit_by
 from facerf_cli.evaluation.people import Person
 from facerf_cli.evaluation.views import View
-from facerf_cli.metrics import si_mse_channels
 from facerf_cli.pipeline import FaceTexture, turn_to
 from facerf_cli.stage.data.recipes import Pair
 
-CHANNELS = "si_mse_channels"
 Sides = tuple["Side", "Side"]
 
 
@@ -65,7 +63,6 @@ def _made_of(
         predictions,
         other.picture,
         view.fit.landmarks_px.numpy(),
-        {name: {CHANNELS: si_mse_channels(p, side.picture, view.mask)} for name, p in predictions.items()},
     )
 
 

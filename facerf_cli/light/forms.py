@@ -67,7 +67,7 @@ class LightForms:
             return self.rig
         directions = rig_directions() if directions is None else directions
         if self.coefficients is not None and self.signed:
-            return RigLight(directions, coefficients_to_rig(self.coefficients, directions))
+            return coefficients_to_rig(self.coefficients, directions)
         envmap = self.latlong(None if self.envmap is not None else _ROWS_BETWEEN)
         return RigLight(directions, envmap_weights(envmap, directions))
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sphere import latlong_directions
+from facerf_cli.light.sphere import latlong_directions, rig_directions
 
 CONVENTION = (
     "real, orthonormal over the sphere, no Condon-Shortley phase, index l*l+l+m; camera axes "
@@ -72,14 +72,17 @@ def rig_coefficients(light: RigLight, order: int) -> Tensor:
     return (math.pi * basis.T @ light.weights.double()).float()
 
 
-def coefficients_to_rig(coefficients: Tensor, directions: Tensor) -> Tensor:
-    """The least weights [L, 3] of lights at `directions` [L, 3] that have these coefficients [K, 3].
+def coefficients_to_rig(coefficients: Tensor, directions: Tensor | None = None) -> RigLight:
+    """The light of least weights, over `directions` [L, 3], that has these coefficients [K, 3].
 
-    Signed, by the pseudo-inverse: `rig_coefficients` gives the coefficients back exactly for a rig of enough
-    lights that are spread over the sphere (150 are enough up to order 11), else the nearest that can be had.
+    Over the paper's 150 lights where no directions are given. Signed, by the pseudo-inverse:
+    `rig_coefficients` gives the coefficients back exactly for a rig of enough lights that are spread over the
+    sphere (150 are enough up to order 11), else the nearest that can be had.
     """
+    directions = rig_directions() if directions is None else directions
     basis = sh_basis(directions.double(), order_of(coefficients))
-    return (torch.linalg.pinv(math.pi * basis.T) @ coefficients.double()).float()
+    weights = torch.linalg.pinv(math.pi * basis.T) @ coefficients.double()
+    return RigLight(directions, weights.float())
 
 
 def radiance(coefficients: Tensor, directions: Tensor) -> Tensor:

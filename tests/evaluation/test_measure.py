@@ -12,7 +12,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import measure as module
 from facerf_cli.evaluation.cases import Case, Comparison
 from facerf_cli.evaluation.measure import METRICS, Measures, Row, measure, shown
-from facerf_cli.metrics import mse, psnr, si_mse, si_mse_clipped, ssim
+from facerf_cli.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 
 LANDMARKS = np.random.default_rng(5).uniform(5, 20, (68, 2))
 
@@ -53,6 +53,7 @@ def test_a_row_a_method_in_their_order(comparison: Comparison) -> None:
     for name, metric in {
         "si_mse": si_mse,
         "si_mse_clipped": si_mse_clipped,
+        "si_mse_channels": si_mse_channels,
         "mse": mse,
         "psnr": psnr,
     }.items():
