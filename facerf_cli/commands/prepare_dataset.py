@@ -8,6 +8,7 @@ import typer
 
 from facerf_cli.commands.batch import BatchOptions, run_items, sums_up
 from facerf_cli.commands.capture_checks import show_findings
+from facerf_cli.commands.colour_chart import ChartCornersOption, ColourChartOption, with_charts
 from facerf_cli.commands.describe_capture import describe_capture
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import (
@@ -70,6 +71,8 @@ def prepare_dataset(
     align: Annotated[
         bool, typer.Option("--align", help="Shift frames back to where the head was, where it moved.")
     ] = False,
+    colour_chart: ColourChartOption = "",
+    chart_corners: ChartCornersOption = "",
     checks: Annotated[
         Checks,
         typer.Option(
@@ -117,7 +120,7 @@ def prepare_dataset(
     drawn = Split.parse(split)
     if crop % _CROP_STEP_PX or not 0 < crop <= LARGEST_CROP_PX:
         raise UsageError(f"--crop {crop}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    given = Given(capture, layout, subtract_ambient, align)
+    given = with_charts(Given(capture, layout, subtract_ambient, align), colour_chart, chart_corners)
     found = given.opened()
     _check_subjects(found, output, drawn)
     items = [Item(found.folder / name, output / name, name) for name in found.subjects]
@@ -132,6 +135,8 @@ def prepare_dataset(
         (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
     elif not dry_run:
         _forget_mended(found, output)
+    if not dry_run:
+        _show_charts(found, output)
     code = run_items("prepare-dataset", items, work, work.outputs_of, options, settings)
     if not dry_run and sums_up(items, work.outputs_of, options, settings):
         _finish(work, found, drawn, settings.seed, model_sha256)
@@ -167,9 +172,17 @@ def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) 
     other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
     if other:
         raise UsageError(
-            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model "
-            "or calibration; give --overwrite, or another folder"
+            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model, "
+            "calibration or colour chart; give --overwrite, or another folder"
         )
+
+
+def _show_charts(capture: "Capture", output: Path) -> None:
+    """Write pictures of the colour charts, so that a person sees what was sampled."""
+    if capture.charts:
+        from facerf_cli.stage.chart.overlay import write_chart_overlays
+
+        write_chart_overlays(capture, output)
 
 
 def _forget_mended(capture: "Capture", output: Path) -> None:

@@ -5,7 +5,7 @@ before the subject is worked on.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,13 +25,16 @@ _ROWS_LIMIT_BYTES = 256 << 20
 
 
 def check(capture: "Capture", subject: str) -> "list[Finding]":
-    """Findings about a subject's frames, less those that the capture itself gives up."""
+    """Findings about a subject's frames, less those that the capture itself gives up.
+
+    What the camera saw is looked at, before a colour chart's matrix hides which channel was clipped.
+    """
     from facerf_cli.stage.checks.subject import check_subject
 
     marked = capture.marked.get(subject, frozenset())
     return [
         found
-        for found in check_subject(capture, subject)
+        for found in check_subject(replace(capture, charts=()), subject)
         if not (found.check == "missing" and found.light in marked)
     ]
 

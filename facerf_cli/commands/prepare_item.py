@@ -1,7 +1,7 @@
 """What `facerf prepare-dataset` does with one subject of a capture: check, choose, prepare."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,6 +14,7 @@ from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
+    from facerf_cli.stage.chart.correction import ChartCorrection
     from facerf_cli.stage.data.layouts import Capture
     from facerf_cli.stage.data.selection import Selection
 
@@ -29,6 +30,7 @@ class Given:
     layout: str
     subtract_ambient: bool
     align: bool
+    charts: "tuple[ChartCorrection, ...]" = ()
 
     def opened(self) -> "Capture":
         """The capture's description, read once a process; it is an input of the whole run."""
@@ -93,9 +95,10 @@ def _capture(given: Given) -> "Capture":
     from facerf_cli.stage.data.layouts import read_capture
 
     try:
-        return read_capture(given.folder, given.layout, given.subtract_ambient, given.align)
+        capture = read_capture(given.folder, given.layout, given.subtract_ambient, given.align)
     except InputError as error:
         raise UsageError(str(error)) from None
+    return replace(capture, charts=given.charts)
 
 
 @cache

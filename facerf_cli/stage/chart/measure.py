@@ -23,7 +23,7 @@ _LARGEST_DELTA_E = 8.0  # mean; a chart that was found and photographed well has
 _LEAST_PX = 25  # in the middle of a patch
 _LARGEST_NOISE = 0.25  # of a pixel on the white patch, as a share of it
 _LEAST_CHROMA = 0.02  # of a chart's colours; red and blue reach 1 and more
-_CLIPPED_SHARE = 0.1  # of a patch's pixels
+_CLIPPED_SHARE = 0.3  # of a patch's pixels
 _CLIPPED_WHITE = 0.9  # of what the darker greys have white be
 _EXPONENTS = (0.8, 1.25)  # of the greys' brightness over what is published
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import numpy as np
-from skimage.draw import polygon, polygon_perimeter
+from skimage.draw import polygon
 
 from facerf_cli.colour import luminance
 from facerf_cli.files.images import write_display
@@ -14,7 +14,7 @@ from facerf_cli.stage.chart.patches import GREYS, MIDDLE_SIDE, sample, shrunk, s
 from facerf_cli.stage.data.layouts import Capture, read_picture
 
 _SIDE_PX = 1024  # what a screen shows
-_INNER = 0.5  # of the sampled square: the published colour
+_SQUARES = (MIDDLE_SIDE + 0.04, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # the outline's, and the published colour's
 
 
 def write_chart_overlays(capture: Capture, folder: Path) -> None:
@@ -35,13 +35,11 @@ def chart_overlay(capture: Capture, chart: ChartCorrection) -> np.ndarray:
     corners_px = np.array(chart.corners_px)
     white = sample(linear, corners_px).colours[GREYS][0]
     shown, scale = shrunk(linear / luminance(white) * luminance(published_colours()[GREYS][0]), _SIDE_PX)
-    for square, inner, colour in zip(
-        squares_px(corners_px / scale) - 0.5,
-        squares_px(corners_px / scale, _INNER * MIDDLE_SIDE) - 0.5,
-        published_colours(),
-        strict=True,
-    ):
-        outline = polygon_perimeter(square[:, 1], square[:, 0], shown.shape[:2], clip=True)
-        shown[outline] = 0 if luminance(colour) > 0.2 else 0.8
-        shown[polygon(inner[:, 1], inner[:, 0], shown.shape[:2])] = colour
+    plain, corners_px = shown.copy(), corners_px / scale
+    squares = np.stack([squares_px(corners_px, side) for side in _SQUARES], 1) - 0.5
+    for nested, colour in zip(squares, published_colours(), strict=True):
+        outer, middle, inner = (polygon(one[:, 1], one[:, 0], shown.shape[:2]) for one in nested)
+        shown[outer] = 0 if luminance(colour) > 0.2 else 0.8
+        shown[middle] = plain[middle]
+        shown[inner] = colour
     return shown

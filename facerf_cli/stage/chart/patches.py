@@ -15,6 +15,7 @@ PATCHES = ROWS * COLUMNS
 GREYS = slice(18, 24)  # white to black, the last row
 PATCH_SIDE = 0.87  # of the pitch of the grid; the rest is the chart's black frame
 _SIGMA_OF_MAD = 1.4826
+_AT_WHITE = 1e-4
 MIDDLE_SIDE = 0.45  # of the pitch: what is sampled, away from edges and from corners that sit badly
 
 
@@ -25,7 +26,7 @@ class Patches:
     colours: np.ndarray  # [24, 3] medians, float64
     counts: np.ndarray  # [24] pixels in each
     noise: np.ndarray  # [24] spread of a pixel's green, robust
-    at_white: np.ndarray  # [24] share of the pixels of which a channel is 1 or more
+    at_white: np.ndarray  # [24] share of the pixels of which a channel is 1, which is white in integers
 
 
 def centres() -> np.ndarray:
@@ -82,7 +83,7 @@ def sample(pixels: np.ndarray, corners_px: np.ndarray) -> Patches:
             continue
         colours[place], counts[place] = np.median(inside, 0), len(inside)
         noise[place] = _SIGMA_OF_MAD * np.median(np.abs(inside[:, 1] - colours[place, 1]))
-        at_white[place] = (inside >= 1).any(-1).mean()
+        at_white[place] = (np.abs(inside - 1) < _AT_WHITE).any(-1).mean()
     return Patches(colours, counts, noise, at_white)
 
 

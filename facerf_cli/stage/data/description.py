@@ -92,6 +92,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
+            **({"colour_charts": [chart.record() for chart in capture.charts]} if capture.charts else {}),
             "non_finite": "set to 0",
             "negative": "set to 0 after the crop",
         },

@@ -34,6 +34,7 @@ from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
+from facerf_cli.stage.chart.correction import ChartCorrection, corrected
 from facerf_cli.stage.data.documents import Node, read_document, unique_ids
 from facerf_cli.stage.data.moved import moved
 
@@ -67,6 +68,7 @@ class Capture:
     subtract_ambient: bool = False
     marked: Mapping[str, frozenset[str]] = field(default_factory=dict)  # ids of lights that it gives up
     align: bool = False  # head motion is to be undone: `shifts` are to be found for each subject
+    charts: tuple[ChartCorrection, ...] = ()  # what photographed colour charts say of the cameras
     # Pixels down and right that take a frame back to where the head was, by subject, camera and light.
     shifts: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
@@ -75,13 +77,13 @@ class Capture:
         return self.folder / _filled(self.pattern, subject=subject, camera=camera, light=light)
 
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
-        """That picture [H, W, 3] under a light of rgb 1, linear Rec.709, float32.
+        """That picture [H, W, 3] under a light of rgb 1, linear Rec.709, float32, by its camera's chart.
 
         Values that are NaN or infinite count as 0, with a warning. What noise or a wide gamut brings below
         the black level stays negative here, so that sums are not biased.
         """
         path = self.frame_path(subject, camera, self.light_ids[light])
-        pixels = _read_picture(path, self.colour_space)
+        pixels = read_picture(path, self.colour_space)
         posed = self.cameras[camera]
         if pixels.shape[:2] != (posed.height_px, posed.width_px):
             raise InputError(
@@ -91,7 +93,8 @@ class Capture:
         ambient = self.ambient(subject, camera) if self.subtract_ambient else None
         dark = np.float32(self.black_level) if ambient is None else ambient
         shift_px = self.shifts.get((subject, camera, self.light_ids[light]), (0.0, 0.0))
-        return moved((pixels - dark) / self.intensities[light].astype(np.float32), *shift_px)
+        lit = (pixels - dark) / self.intensities[light].astype(np.float32)
+        return moved(corrected(self.charts, camera, lit), *shift_px)
 
     def ambient(self, subject: str, camera: str) -> np.ndarray | None:
         """A subject without any lamp [H, W, 3], black level included; None where none has the right size."""
@@ -115,13 +118,13 @@ def read_capture(
     return replace(capture, subtract_ambient=subtract_ambient, align=align)
 
 
-def _read_picture(path: Path, colour_space: str) -> np.ndarray:
+def read_picture(path: Path, colour_space: str) -> np.ndarray:
     """A picture [H, W, 3], its colour multiplied by its alpha."""
     picture = read_image(path, colour_space, non_finite="zero")
     return picture.pixels if picture.alpha is None else picture.pixels * picture.alpha[..., None]
 
 
-_read_ambient = lru_cache(maxsize=2)(_read_picture)  # one a camera, and every frame needs it
+_read_ambient = lru_cache(maxsize=2)(read_picture)  # one a camera, and every frame needs it
 
 
 def _read_stage(folder: Path) -> Capture:
@@ -159,9 +162,6 @@ def _read_stage(folder: Path) -> Capture:
     )
 
 
-def _read_yale(folder: Path) -> Capture:
-    from facerf_cli.stage.data.yale_layout import read_yale_capture  # it makes captures, too
-
 def _require_filled(root: Node) -> None:
     """Raise where something is null, as in a draft of --describe; traits and provenance may be."""
     said = (root[key] for key in root.table() if key not in ("subjects", "provenance"))
@@ -169,6 +169,9 @@ def _require_filled(root: Node) -> None:
         more = f" (and {len(gaps) - 1} more)" if len(gaps) > 1 else ""
         raise InputError(f"{gaps[0].where} is null; fill it in{more}")
 
+
+def _read_yale(folder: Path) -> Capture:
+    from facerf_cli.stage.data.yale_layout import read_yale_capture  # it makes captures, too
 
     return read_yale_capture(folder)
 
