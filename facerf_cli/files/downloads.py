@@ -4,6 +4,7 @@ import hashlib
 import http.client
 import logging
 import os
+import ssl
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -29,6 +30,7 @@ TIMEOUT_S = 30.0  # of silence on a connection
 _TRIES = 5  # connections to a server; each goes on where the last one broke
 _BLOCK = 2**20
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+_NO_NETWORK = (URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError)
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -84,10 +86,14 @@ def fetch(published: Published, option: str, cache: Path | None = None) -> Path:
         raise FacerfError(
             f"{published.url}: {error}; put the right file at {path}, or give {option}"
         ) from None
-    except (URLError, http.client.HTTPException, OSError) as error:
+    except _NO_NETWORK as error:
         raise FacerfError(
             f"{published.url}: cannot be fetched ({_reason(error)}); run again with a network, "
             f"put the file at {path}, or give {option}"
+        ) from None
+    except OSError as error:
+        raise FacerfError(
+            f"{path}: cannot be kept in the cache ({_reason(error)}); make room there, or give {option}"
         ) from None
     return path
 
@@ -120,7 +126,7 @@ def _download(published: Published, part: Path) -> None:
         try:
             if _one_connection(published, part):
                 return
-        except (URLError, http.client.HTTPException, ConnectionError, TimeoutError) as error:
+        except _NO_NETWORK as error:
             trouble = error
         if _size(part) <= before:
             break

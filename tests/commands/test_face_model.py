@@ -44,11 +44,11 @@ def test_a_file_that_is_there_is_not_replaced_unasked(
 
 
 @pytest.mark.parametrize(("line", "code", "message"), [
-    (["import", "ict-facekit", "nowhere", "-o", "m.npz"], 1, "nowhere: give the ICT-FaceKit folder"),
+    (["import", "ict-facekit", "nowhere", "-o", "m.npz"], 1, "nowhere: no such file; give the ICT-FaceKit"),
     (["import", "ict-facekit", "nowhere", "-o", "m.zip"], 2, "ends in .npz"),
     (["import", "basel", "nowhere", "-o", "m.npz"], 2, "basel"),
     (["import", "ict-facekit", "nowhere"], 2, "--output"),
-    (["import", "flame", "nowhere.pkl", "-o", "m.npz"], 1, "nowhere.pkl: give FLAME's .pkl"),
+    (["import", "flame", "nowhere.pkl", "-o", "m.npz"], 1, "nowhere.pkl: no such file; give FLAME's .pkl"),
     (["import", "basel-2009", "nowhere.mat", "-o", "m.npz"], 1, "01_MorphableModel.mat"),
     (["import", "basel-2009", "a.mat", "-o", "m.npz", "--landmarks", "a.npy"], 1, "a .txt of 68 vertex"),
     (["import"], 2, "KIND"), ([], 2, "Missing command"),

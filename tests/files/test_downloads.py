@@ -1,4 +1,7 @@
+import errno
 import hashlib
+import io
+import os
 import socket
 import threading
 from collections.abc import Iterator
@@ -180,8 +183,26 @@ def test_only_https_is_fetched_from(server: Server, tmp_path: Path, url: str) ->
 
 def test_a_cache_that_cannot_be_written_is_named(server: Server, tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file where the folder should be")
-    with pytest.raises(FacerfError, match=r"cache: File exists.* --weights PATH$"):
+    with pytest.raises(FacerfError, match=r"in the cache \(.*cache: File exists\); make room .* PATH$"):
         fetch(server.published(), OPTION, tmp_path / "cache")
+
+
+def test_a_full_disk_is_named_and_what_came_is_kept(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full(io.FileIO):
+        def write(self, data: Any) -> int:
+            if self.tell() + len(data) > 200_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(data)
+
+    server.cuts = [5000]
+    with monkeypatch.context() as small:
+        small.setattr(Path, "open", lambda path, mode: Full(path, mode.replace("b", "")))
+        with pytest.raises(FacerfError, match=r"in the cache \(No space left on device\); make room"):
+            fetch(server.published(), OPTION, tmp_path)
+    assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
+    assert server.asked[:2] == [None, "bytes=5000-"] and server.asked[2] not in server.asked[:2]
 
 
 def test_two_at_once_fetch_it_once(server: Server, tmp_path: Path) -> None:

@@ -30,4 +30,5 @@ def members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
                 if entry.isfile() and (content := tar.extractfile(entry)):
                     yield entry.name, content.read
     else:
-        raise InputError(f"{path}: give the ICT-FaceKit folder, or its .zip or .tar archive")
+        wrong = "" if path.exists() else "no such file; "
+        raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")

@@ -65,7 +65,10 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
 def _model_file(path: Path) -> Path:
     if not path.is_dir():
         if path.suffix not in (".pkl", ".npz") or not path.is_file():
-            raise InputError(f"{path}: give FLAME's .pkl, an .npz of the same arrays, or the folder of one")
+            wrong = "" if path.exists() else "no such file; "
+            raise InputError(
+                f"{path}: {wrong}give FLAME's .pkl, an .npz of the same arrays, or the folder of one"
+            )
         return path
     models = [file for file in sorted(path.iterdir()) if file.suffix in (".pkl", ".npz")]
     models = [file for file in models if not any(word in file.name.lower() for word in ("embedding", "mask"))]
