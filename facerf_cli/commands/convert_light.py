@@ -18,7 +18,7 @@ from facerf_cli.commands.options import (
     settings_of,
 )
 from facerf_cli.commands.values import parse_directions
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import UsageError
 from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
@@ -117,32 +117,15 @@ def _read(path: Path, from_axes: Axes) -> "tuple[LightForms, Attributes]":
     from facerf_cli import __version__
     from facerf_cli.light.axes import from_map_axes
     from facerf_cli.light.forms import LightForms
-    from facerf_cli.stage.map_files import read_map_file
+    from facerf_cli.stage.map_files import read_light_file, read_map_file
 
     said: Attributes = {"Software": f"facerf {__version__}", "facerf:input": path.name}
     if path.suffix.lower() == ".json":
-        light, known = _read_json(path)
-        return light, known | said
+        light, known = read_light_file(path)
+        return light, {**known, **said}
     if path.suffix.lower() == ".txt":
         return LightForms(coefficients=_read_text(path)), said
     return LightForms(envmap=from_map_axes(read_map_file(path), from_axes)), said
-
-
-def _read_json(path: Path) -> "tuple[LightForms, Attributes]":
-    """The rig's light, or the coefficients where the file has no rig; and its provenance."""
-    from facerf_cli.files.light_files import read_light
-    from facerf_cli.light.forms import LightForms
-    from facerf_cli.light.rig_light import RigLight
-    from facerf_cli.light.sh import CONVENTION
-
-    record = read_light(path)
-    known: Attributes = dict(record.attributes)
-    if len(record.directions):
-        return LightForms(rig=RigLight(record.directions, record.weights)), known
-    assert record.sh is not None
-    if record.sh.convention != CONVENTION:
-        raise InputError(f"{path}: spherical harmonics of another convention; they are to be: {CONVENTION}")
-    return LightForms(coefficients=record.sh.coefficients), known
 
 
 def _read_text(path: Path) -> "Tensor":

@@ -40,9 +40,9 @@ def relight(
         typer.Option(
             "--envmap",
             metavar="SKY.exr|DIR|procedural:N",
-            help="Lat-long maps (.exr, .hdr), twice as wide as high: files, folders or quoted patterns; or N "
-            "maps drawn from --seed, the first N of facerf envmap. May be repeated; .exr and .hdr files that "
-            "follow it directly are maps too.",
+            help="Lat-long maps (.exr, .hdr), twice as wide as high: files, folders or quoted patterns; a "
+            "light of estimate-light or convert-light (.json); or N maps drawn from --seed, the first N of "
+            "facerf envmap. May be repeated; .exr and .hdr files that follow it directly are maps too.",
             show_default=False,
         ),
     ] = None,

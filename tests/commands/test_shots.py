@@ -21,6 +21,8 @@ from facerf_cli.commands.shots import (
 from facerf_cli.commands.values import parse_directions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
 
@@ -43,6 +45,25 @@ def test_maps_may_be_files_folders_and_patterns(tmp_path: Path) -> None:
     for given in ([str(tmp_path)], [str(tmp_path / "*.exr")], [str(tmp_path / f"{n}.exr") for n in "cab"]):
         shots = collect_shots(given, None, [], tmp_path / "out")
         assert [shot.name for shot in shots] == ["a", "b", "c"]
+
+
+def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rig, nothing = rig_directions(60), torch.zeros(0, 3)
+    lamp = (rig @ azel_to_direction(60, 30)).clamp_min(0)[:, None] ** 20
+    weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
+    write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
+    harmonics = Harmonics(torch.ones(9, 3), CONVENTION)
+    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=harmonics))
+    (tmp_path / "c.json").write_text("{}")
+    given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
+    shots = usable(collect_shots(given, "90", [], tmp_path / "out"))
+    assert [shot.name for shot in shots] == ["a_light_rot90", "b_rot90"]
+    assert "c.json: not a light" in caplog.text
+    (shot,) = collect_shots(given[:1], None, [], tmp_path / "out")
+    found = light_stack((shot,), rig, "cell")[0]
+    assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
+    with pytest.raises(UsageError, match="no inputs"):  # a folder is walked for maps alone
+        collect_shots([str(tmp_path)], None, [], tmp_path / "out")
 
 
 def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
