@@ -25,7 +25,7 @@ class Frames:
 
     def ids(self, field: str) -> list[str]:
         """The ids of all subjects, cameras or lights, each once."""
-        return sorted({key[FIELDS.index(field)] for key in self.paths}, key=natural_key)
+        return sorted({key[FIELDS.index(field)] for key in self.paths}, key=natural_order)
 
     def of_camera(self, camera: str) -> list[str]:
         """The paths of a camera's frames."""
@@ -35,7 +35,7 @@ class Frames:
 def sort_frames(paths: Iterable[str], naming: Naming) -> Frames:
     """Which of the paths are frames, and of what."""
     frames = Frames({}, Counter(), Counter(), [], [])
-    for path in sorted(paths, key=natural_key):
+    for path in sorted(paths, key=natural_order):
         match, loose = naming.strict.fullmatch(path), naming.loose.fullmatch(path)
         if loose and (end := other_end(loose["light"])):
             (frames.full if end == "full" else frames.ambient)[loose["light"]] += 1
@@ -64,3 +64,8 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
         (0, int(piece), "") if piece.isascii() and piece.isdigit() and len(piece) < 19 else (1, 0, piece)
         for piece in re.split("([0-9]+)", text)
     )
+
+
+def natural_order(text: str) -> tuple[object, str]:
+    """The same, with an order also of names that are alike in it."""
+    return natural_key(text), text

@@ -7,7 +7,7 @@ is no unit vector is made one, for lists also give lamps' places, seen from the 
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ LIST_SUFFIX, LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
 # A+035E-20, az35_el-20, azimuth_35_elevation_-20: letters alone stand for angles only before a sign.
 ANGLES = re.compile(
     r"(?:a(?=[+-])|az(?:imuth)?)[_=]?(?P<azimuth>[+-]?[0-9]{1,3}(?:\.[0-9]+)?)[_, -]?"
-    r"(?:e(?=[+-])|el(?:ev(?:ation)?)?)[_=]?(?P<elevation>[+-]?[0-9]{1,2}(?:\.[0-9]+)?)",
+    r"(?:e(?=[+-])|el(?:ev(?:ation)?)?)[_=]?(?P<elevation>[+-]?[0-9]{1,3}(?:\.[0-9]+)?)",
     re.IGNORECASE,
 )
 _LIMIT_BYTES = 4 << 20
@@ -43,7 +43,8 @@ def direction_in_name(name: str) -> Direction | None:
     match = ANGLES.search(name)
     if match is None:
         return None
-    return _rounded(azel_to_direction(*(np.float64(match[angle]) for angle in ("azimuth", "elevation"))))
+    azimuth_deg, elevation_deg = np.float64(match["azimuth"]), np.float64(match["elevation"])
+    return _rounded(azel_to_direction(azimuth_deg, elevation_deg).tolist())
 
 
 def read_lamps(path: Path) -> list[Lamp]:
@@ -96,5 +97,5 @@ def by_light(
     return found
 
 
-def _rounded(vector: "np.ndarray | object") -> Direction:
-    return [round(float(value), _DIGITS) + 0.0 for value in np.asarray(vector)]
+def _rounded(vector: Iterable[float]) -> Direction:
+    return [round(float(value), _DIGITS) + 0.0 for value in vector]  # + 0.0: no minus before a zero

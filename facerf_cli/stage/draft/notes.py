@@ -57,7 +57,7 @@ def _assumed(evidence: Evidence) -> Iterator[str]:
     yield from _assumed_of_lights(evidence)
     for camera, sight in evidence.sights.items():
         if len(sight.sizes) > 1:
-            sizes = ", ".join(f"{width} x {height}" for width, height in sight.sizes)
+            sizes = ", ".join(f"{width} x {height}" for (width, height), _ in sight.sizes.most_common())
             yield f"cameras: pictures{f' of {camera}' * bool(camera)} have several sizes: {sizes}"
     if unread := sum(sight.unread for sight in evidence.sights.values()):
         seen = unread + sum(sight.sizes.total() for sight in evidence.sights.values())

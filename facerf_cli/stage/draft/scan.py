@@ -63,6 +63,6 @@ def _look_into(scan: Scan, folder: Path, below: str, suffixes: Collection[str]) 
                 folders += [path] if path.count("/") < _DEEPEST else []
             elif suffix in suffixes:
                 scan.pictures.append(path)
-            elif suffix == LIST_SUFFIX or entry.name.lower() in LIST_NAMES:
+            elif (suffix == LIST_SUFFIX or entry.name.lower() in LIST_NAMES) and entry.is_file():
                 scan.lists.append(path)
     return sorted(folders)

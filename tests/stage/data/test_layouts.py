@@ -128,7 +128,12 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"cameras": camera(world_to_camera="eye")}, "3 x 4"),
         ({"pattern": "../{subject}/{camera}/{light}.exr"}, "below the capture"),
         ({"pattern": "/{subject}/{camera}/{light}.exr"}, "below the capture"),
-        ({"pattern": "{subject}/{light}.exr"}, "below the capture"),
+        ({"pattern": "{camera}/{light}.exr"}, "names {subject} and {light}"),
+        ({"pattern": "{subject}/{light}.exr", "cameras": [*camera(), *camera(id="C1")]}, "and {camera} and"),
+        ({"pattern": "{subject}/{camera}.exr"}, "names {subject} and {light}"),
+        ({"ambient": "{subject}/{light}.exr"}, "names {subject} is needed"),
+        ({"colour_space": None}, "colour_space is null; fill it in$"),
+        ({"lights": light(direction=None), "cameras": camera(K=[None, 3])}, r"direction is null.*and 1 more"),
         ({"pattern": "{subject}/{camera}/{light}{gain}.exr"}, "below the capture"),
         ({"pattern": "{subject.x}/{camera}/{light}{subject}.exr"}, "below the capture"),
         ({"subjects": ["0000"]}, "an object"),
@@ -222,6 +227,14 @@ def test_subjects_are_found_by_their_pictures(tmp_path: Path, pattern: str) -> N
     (tmp_path / ".hidden/C0/L0.exr").touch()
     found = set(read_capture(tmp_path).subjects) - {"0000"}
     assert found == {"anna", "zoe"}
+
+
+def test_what_there_is_one_of_needs_no_place_in_the_pattern(tmp_path: Path) -> None:
+    capture_at(tmp_path, pattern="0000/C0/{light}.exr", subjects={"anna": {"age": None}})
+    capture = read_capture(tmp_path)
+    assert list(capture.subjects) == ["anna"] and capture.frame("anna", "C0", 1)[5, 5] == pytest.approx(
+        [2, 2, 2]
+    )
 
 
 def test_traits_are_kept(tmp_path: Path) -> None:
