@@ -25,19 +25,22 @@ def write_chart_overlays(capture: Capture, folder: Path) -> None:
 
 
 def chart_overlay(capture: Capture, chart: ChartCorrection) -> np.ndarray:
-    """The corrected picture [h, w, 3], linear, with the middles that were sampled outlined.
-
-    It is as bright as the published white. In each outline stands the published colour: the better the
-    correction, the less it is seen.
-    """
+    """The corrected picture [h, w, 3], linear, small enough for a screen, with what was sampled outlined."""
     linear = as_a_frame(capture, read_picture(chart.picture, capture.colour_space))
-    linear = corrected([chart], chart.cameras[0], linear)
-    corners_px = np.array(chart.corners_px)
-    white = sample(linear, corners_px).colours[GREYS][0]
-    shown, scale = shrunk(linear / luminance(white) * luminance(published_colours()[GREYS][0]), _SIDE_PX)
-    plain, corners_px = shown.copy(), corners_px / scale
+    small, scale = shrunk(corrected([chart], chart.cameras[0], linear), _SIDE_PX)
+    return outlined(small, np.array(chart.corners_px) / scale)
+
+
+def outlined(pixels: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
+    """A picture [H, W, 3], as bright as the published white, with the middles that are sampled outlined.
+
+    In each outline stands the published colour: the better the picture's colours, the less it is seen.
+    """
+    white, published = sample(pixels, corners_px).colours[GREYS][0], published_colours()
+    plain = pixels * (luminance(published[GREYS][0]) / luminance(white))
+    shown = plain.copy()
     squares = np.stack([squares_px(corners_px, side) for side in _SQUARES], 1) - 0.5
-    for nested, colour in zip(squares, published_colours(), strict=True):
+    for nested, colour in zip(squares, published, strict=True):
         outer, middle, inner = (polygon(one[:, 1], one[:, 0], shown.shape[:2]) for one in nested)
         shown[outer] = 0 if luminance(colour) > 0.2 else 0.8
         shown[middle] = plain[middle]
