@@ -174,6 +174,7 @@ def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
     os.mkfifo(folder / "s1/cam0/L4.exr")
     stage = draft_stage(folder, SUFFIXES)
     assert noted(stage, "3 subjects, 1 camera") and noted(stage, "rename them")
+    assert not noted(stage, "do not fit")  # nothing was found twice
     assert all(note.isprintable() for note in stage["draft"])
 
 
