@@ -26,7 +26,7 @@ from facerf_cli.commands.evaluation_items import (
 from facerf_cli.commands.evaluation_options import EvaluateOptions
 from facerf_cli.commands.evaluation_photos import portraits
 from facerf_cli.commands.evaluation_run import run_protocol
-from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_stdin
 from facerf_cli.commands.options import FaceModelOption, InputColourspaceOption, settings_of
 from facerf_cli.commands.photo import LandmarksOption, PhotoOptions
 from facerf_cli.errors import UsageError
@@ -159,6 +159,7 @@ class _Couple:
 
 def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     """An item a couple: files two by two as they are named, folders' files two by two in their order."""
+    inputs = list(expand_stdin(inputs))
     files = [name for name in inputs if not os.path.isdir(name)]
     if len(files) % 2:
         raise UsageError(f"{len(files)} photos: give two of each person, A B A B ..., or folders of a person")

@@ -37,7 +37,7 @@ def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozense
     output_real = output_folder.resolve()
     found: dict[Path, Path] = {}  # absolute -> as the user would write it
     roots: set[Path] = set()
-    for path in map(Path, _expand_stdin(inputs)):
+    for path in map(Path, expand_stdin(inputs)):
         absolute = Path(os.path.abspath(path))
         if path.is_dir():
             if path.resolve() == output_real:
@@ -58,7 +58,8 @@ def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozense
     ]
 
 
-def _expand_stdin(inputs: Sequence[str]) -> Iterator[str]:
+def expand_stdin(inputs: Sequence[str]) -> Iterator[str]:
+    """What the user names, with the lines of standard input in the place of `-`."""
     for entry in inputs:
         if entry == "-":
             yield from filter(None, (line.rstrip("\r\n") for line in sys.stdin))

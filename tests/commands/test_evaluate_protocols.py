@@ -1,6 +1,7 @@
 """`facerf evaluate olat`, `reconstruction`, `transfer` and `geometry` on a tiny dataset and a photo."""
 
 import csv
+import io
 import json
 import shutil
 from pathlib import Path
@@ -116,7 +117,9 @@ def test_options_that_would_do_nothing_are_refused(
     assert "is for the field" in refused(capsys, "geometry", PHOTO, *out, *alone, "--mean-checkpoint", "x")
 
 
-def test_couples_are_of_two_photos_and_given_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_couples_are_of_two_photos_and_given_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = "-o", tmp_path / "out"
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(PHOTO, tmp_path / name)
@@ -126,6 +129,9 @@ def test_couples_are_of_two_photos_and_given_once(tmp_path: Path, capsys: pytest
         assert "given twice" in refused(capsys, "transfer", "--photos", *couple, *out)
     assert "a couple twice" in refused(capsys, "transfer", "--photos", a, b, b, a, *out)
     assert not (tmp_path / "out").exists()
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{a}\n{b}\n"))
+    assert run("transfer", "--photos", "-", *out, "--dry-run") == 0
+    assert "a--b" in capsys.readouterr().out
 
 
 def test_what_a_photos_alpha_leaves_out_is_not_compared(
