@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from facerf_cli.commands.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.commands.photo import face_model
 from facerf_cli.commands.photo_light import LightOptions, light_of_photo
 from facerf_cli.commands.values import azel, numbers, parse_directions
 from facerf_cli.errors import InputError, UsageError
@@ -267,7 +268,9 @@ def write_balls(shots: Iterable[Shot], output: Path, exposure_ev: float | None, 
         envmap = read_map(shot.envmap)
         both = [ball(envmap, BALL_PX, kind, shot.rotate_deg) for kind in ("mirror", "diffuse")]
         pixels = torch.cat(both, 1).numpy()
-        metadata = Provenance(shot.envmap.name).attributes()
+        # A light that was estimated depends on the face model.
+        stamp = face_model(shot.envmap.options.photo).stamp if isinstance(shot.envmap, PhotoLight) else {}
+        metadata = Provenance(shot.envmap.name, **stamp).attributes()
         write_exr(path, pixels, metadata=metadata)
         write_display(
             path.with_suffix(".png"),

@@ -103,7 +103,7 @@ class FaceFit:
             len(self.beta),
         ):
             raise ValueError(
-                f"the fit is of the face model {self.model!r}, not of {model.name!r}; give that --face-model"
+                f"the fit is of the face model {self.model!r}, not of {model.name!r}; give its file"
             )
         vertices = model.vertices(self.alpha[None], self.beta[None])[0]
         return vertices @ self.rotation.mT + self.translation_m
