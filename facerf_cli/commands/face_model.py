@@ -8,7 +8,7 @@ import typer
 
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance, json_line, one_line
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance, json_line
 
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
@@ -171,7 +171,7 @@ def _facts(model: "MorphableModel") -> dict[str, str]:
     head = model.head
     return {
         "name": model.name,
-        "licence": one_line(model.licence),
+        "licence": model.licence,
         "unit": "metres; a coefficient of 1 is one standard deviation",
         "face": f"{len(model.mean)} vertices ({GRID} x {GRID}), {len(grid_triangles())} triangles; "
         f"{width:.0f} x {height:.0f} x {depth:.0f} mm",

@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.morphable import DAMAGED, require_bounded
-
-_MAX_WORDS = 2000  # of a name or a licence
+from facerf_cli.face.morphable import DAMAGED, require_bounded, words_of
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ def read_model_facts(path: Path) -> ModelFacts | None:
         with np.load(path, allow_pickle=False) as file:
             if not {"layout_version", "name", "licence", "identity", "expression"} <= set(file.files):
                 return None
-            name, licence = (str(file[key])[:_MAX_WORDS] for key in ("name", "licence"))
+            name, licence = (words_of(file[key]) for key in ("name", "licence"))
             has_head = "head_mean" in file.files
         return ModelFacts(name, licence, _count(path, "identity"), _count(path, "expression"), has_head)
     except (*DAMAGED, InputError):

@@ -19,6 +19,7 @@ from facerf_cli.records import one_line
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 _MAX_COEFFICIENTS = 500
+_MAX_WORDS = 2000  # letters of a name or a licence
 _MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
 DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
 
@@ -149,6 +150,10 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
         raise ValueError("it holds values that are not finite")
     names = tuple(str(name) for name in arrays["expression_names"])
     head = head_from_arrays(arrays, len(identity), len(expression))
-    return MorphableModel(
-        str(arrays["name"]), str(arrays["licence"]), mean, identity, expression, names, head
-    )
+    name, licence = (words_of(arrays[key]) for key in ("name", "licence"))
+    return MorphableModel(name, licence, mean, identity, expression, names, head)
+
+
+def words_of(array: np.ndarray) -> str:
+    """A name or a licence in a face model's file, to be stamped: one line of letters, and not too long."""
+    return "".join(letter for letter in one_line(str(array))[:_MAX_WORDS] if letter.isprintable())

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.face.importers import importing, published
-from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
 
@@ -106,6 +106,17 @@ def test_show_says_what_a_model_is(capsys: Capture) -> None:
     assert list(lines) == ["name", "licence", "unit", "face", "head", "identity", "expression", "landmarks"]
     assert "16641 vertices" in lines["face"] and "metres" in lines["unit"] and lines["head"] == "none"
     assert lines["expression"].startswith("29 shapes: smile_left") and "17 more" in lines["expression"]
+
+
+def test_a_licence_of_many_lines_is_stamped_as_one(tmp_path: Path, capsys: Capture) -> None:
+    """It goes into a mesh's first line, into XML and onto the terminal."""
+    path = tmp_path / "odd.npz"
+    odd = replace(load_face_model(), licence="mine,\nall of it \x1b[31m\x00" + "x" * 10_000)
+    save_face_model(path, odd)
+    licence = load_face_model(path).licence
+    assert licence.startswith("mine, all of it [31m") and len(licence) <= 2000
+    assert main(["face-model", "show", str(path)]) == 0
+    assert f"licence     {licence}\n" in capsys.readouterr().out
 
 
 def test_show_draws_it_with_its_licence(tmp_path: Path, capsys: Capture) -> None:

@@ -35,7 +35,8 @@ def _cast(mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray) ->
     points, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
     if len(rays) < len(origins) * 0.98:
         raise InputError(
-            "the face model does not cover the chart: its surface ends inside forehead, cheeks or chin"
+            "its surface ends inside forehead, cheeks or chin, where textures still need it; "
+            "give the model's larger mesh (of Basel's files bfm or fullHead, not face12)"
         )
     travelled = np.full(len(origins), np.inf)
     travelled[rays] = np.linalg.norm(points - origins[rays], axis=-1)
