@@ -21,11 +21,13 @@ from facerf_cli.stage.chart.patches import (
     homography,
     project,
     sample,
+    shrunk,
 )
 
+_SEARCHED_PX = 800  # a picture is made no longer than that
 _EDGES = (0.01, 0.02, 0.04, 0.08)  # changes a pixel, of the encoded picture, that bound an even spot
 _BRIGHT_PERCENTILE, _GAMMA = 99.0, 2.4
-_LEAST_SPOT_PX, _LARGEST_SPOT = 16, 0.03  # the latter of the picture
+_LEAST_SPOT_PX, _LARGEST_SPOT = 16, 0.045  # the latter of the picture: a chart may fill it
 _LEAST_FULL, _LONGEST = 0.68, 3.0  # area over the product of the axes, 0.75 for a rectangle; and their ratio
 _LEAST_ON_GRID = 12  # of 24; the dark ones are lost in the chart's frame
 _MOST_GRIDS = 4
@@ -36,17 +38,18 @@ def find_chart(pixels: np.ndarray, largest_delta_e: float) -> np.ndarray | None:
 
     pixels [H, W, 3] are linear. The 24 colours are the chart's to a mean delta E of `largest_delta_e`.
     """
-    points, sides = even_spots(pixels)
-    grids = find_lattices(points, sides, _LEAST_ON_GRID)[:_MOST_GRIDS]
+    small, scale = shrunk(pixels, _SEARCHED_PX)
+    points, sides = even_spots(small)
+    grids = find_lattices(points, sides, _LEAST_ON_GRID, COLUMNS - 1)[:_MOST_GRIDS]
     tries = [
-        (float(fit_colours(sample(pixels, turned).colours).delta_e_after.mean()), turned)
+        (float(fit_colours(sample(small, turned).colours).delta_e_after.mean()), turned)
         for grid in grids
         for corners_px in _placed(grid, points)
-        if ((corners_px > 0) & (corners_px < pixels.shape[1::-1])).all()
+        if ((corners_px > 0) & (corners_px < small.shape[1::-1])).all()
         for turned in four_turns(corners_px)[::2]
     ]
-    best = min(tries, key=lambda found: found[0], default=(np.inf, None))
-    return best[1] if best[0] <= largest_delta_e else None
+    delta_e, best = min(tries, key=lambda found: found[0], default=(np.inf, np.empty(0)))
+    return best * scale if delta_e <= largest_delta_e else None
 
 
 def even_spots(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

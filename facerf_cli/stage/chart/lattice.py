@@ -15,10 +15,11 @@ _LEAST_SINE = 0.8  # of the angle between steps along and across; a grid's diago
 _MISS = 0.25  # of a step, that a point may lie beside where it is looked for
 
 
-def find_lattices(points: np.ndarray, sides: np.ndarray, least: int) -> list[dict[Place, int]]:
+def find_lattices(points: np.ndarray, sides: np.ndarray, least: int, reach: int) -> list[dict[Place, int]]:
     """Grids among points [N, 2] of things with sides [N]: index by place, `least` at least; the best first.
 
-    Places count from the point that a grid was begun at: along, then across, clockwise from it on the screen.
+    Places count from the point that a grid was begun at, `reach` either way: along, then across, clockwise
+    from it on the screen.
     """
     if len(points) < least:
         return []
@@ -28,7 +29,7 @@ def find_lattices(points: np.ndarray, sides: np.ndarray, least: int) -> list[dic
     for seed in range(len(points)):
         if seed in done:
             continue
-        grown = [_grow(tree, sides, seed, *steps) for steps in _steps(tree, sides, seed)]
+        grown = [_grow(tree, sides, seed, reach, *steps) for steps in _steps(tree, sides, seed)]
         best = max(grown, key=_weight, default={})
         if len(best) >= least:
             found[frozenset(best.values())] = best
@@ -59,22 +60,24 @@ def _alike(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _grow(
-    tree: cKDTree, sides: np.ndarray, seed: int, along: np.ndarray, across: np.ndarray
+    tree: cKDTree, sides: np.ndarray, seed: int, reach: int, along: np.ndarray, across: np.ndarray
 ) -> dict[Place, int]:
     """The grid that a point and two steps begin; each step is taken as long as the one before it was."""
     grid, steps = {(0, 0): seed}, {(0, 0): (along, across)}
-    todo = [(0, 0)]
+    todo, members = [(0, 0)], {seed}
     while todo:
         place = todo.pop(0)
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
             there = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
+            if there in grid or max(map(abs, there)) > reach:
+                continue
             step = steps[place][axis]
             start = tree.data[grid[place]]
             off, index = tree.query(start + sign * step)
-            if there in grid or index in grid.values() or off > _MISS * np.hypot(*step):
+            fits = off < _MISS * np.hypot(*step) and _alike(sides[index], sides[grid[place]])
+            if index in members or not fits:
                 continue
-            if not _alike(sides[index], sides[grid[place]]):
-                continue
+            members.add(index)
             taken = sign * (tree.data[index] - start)
             grid[there] = int(index)
             steps[there] = (taken, steps[place][1]) if axis == 0 else (steps[place][0], taken)

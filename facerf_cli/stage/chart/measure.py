@@ -45,7 +45,7 @@ def read_charts(capture: Capture, picture: str, corners_px: np.ndarray | None) -
 def as_a_frame(capture: Capture, decoded: np.ndarray) -> np.ndarray:
     """Values [..., 3] of a chart's picture less the black level, over the lamps' mean rgb of luminance 1."""
     mean = capture.intensities.mean(0)
-    return (decoded - capture.black_level) / (mean / luminance(mean))
+    return (decoded - capture.black_level) / (mean / luminance(mean)).astype(decoded.dtype)
 
 
 def _read_chart(

@@ -54,6 +54,6 @@ def test_a_lattice_in_perspective_with_gaps_and_strangers() -> None:
     points = project(homography(area_corners(), CORNERS), centres())
     kept = np.delete(points, [3, 11, 23], axis=0)
     strangers = draw.uniform([0, 0], [330, 240], (8, 2))
-    grid = find_lattices(np.r_[kept, strangers], np.full(29, 25.0), 12)[0]
+    grid = find_lattices(np.r_[kept, strangers], np.full(29, 25.0), 12, 5)[0]
     places = np.array([place for place, index in grid.items() if index < 21])
     assert len(places) == 21 and sorted(np.ptp(places, axis=0)) == [3, 5]
