@@ -1,11 +1,13 @@
 """How often a colour chart is found in a picture, how well it corrects, and what else is taken for one.
 
     python benchmarks/colour_charts.py --pictures 300 --sheet charts.png
+    python benchmarks/colour_charts.py --photos PICTURE ... --sheet charts.png
 
 Pictures are rendered: charts of 15 to 85 % of a picture's width, turned any way, tilted up to 40 degrees, out
 of focus, noisy, with vignetting, under light that falls off, before walls, clouds of colour and rectangles;
 by cameras whose colours are up to a quarter off. As many pictures have such surroundings and no chart.
 What the matrix is worth is told by the published colours, as the camera sees them without noise, corrected.
+Real photographs (sRGB, or as their files say) have no truth: what is left of delta E after the fit is told.
 """
 
 import argparse
@@ -16,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from skimage.transform import resize
 
-from facerf_cli.files.images import write_display
+from facerf_cli.files.images import read_image, write_display
 from facerf_cli.report import contact_sheet
 from facerf_cli.stage.chart.colours import delta_e_2000, fit_colours, neutral_matrix, published_colours
 from facerf_cli.stage.chart.find import find_chart
@@ -37,22 +40,43 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--pictures", type=int, default=60)
     parser.add_argument("--sheet", type=Path, help="a picture of some, with what was sampled outlined")
+    parser.add_argument(
+        "--photos", type=Path, nargs="+", help="photographs in the place of rendered pictures"
+    )
     options = parser.parse_args()
+    tiles = [told(path) for path in options.photos] if options.photos else counted(options.pictures)
+    if options.sheet:
+        sized = [resize(tile, (*SHAPE, 3), anti_aliasing=True) for tile in tiles[:_SHOWN]]
+        write_display(options.sheet, contact_sheet(np.stack(sized)))
+
+
+def told(path: Path) -> np.ndarray:
+    """A photograph [H, W, 3], outlined, after a line of what is found in it."""
+    picture = read_image(path).pixels
+    found = find_chart(picture, LARGEST_DELTA_E)
+    if found is None:
+        print(f"{path.name}: not found")
+        return picture
+    fit = fit_colours(sample(picture, found).colours)
+    before, after = fit.delta_e_before.mean(), fit.delta_e_after.mean()
+    print(f"{path.name}: found; mean delta E 2000 {before:.1f} before, {after:.1f} after the fit")
+    return outlined(picture, found)
+
+
+def counted(pictures: int) -> list[np.ndarray]:
+    """Rendered pictures [H, W, 3], outlined, after lines of what is found in all."""
     rows, tiles, seconds = [], [], 0.0
-    for seed in range(options.pictures):
+    for seed in range(pictures):
         picture, corners_px, camera = draw_photograph(seed)
         begun_s = time.perf_counter()
         found = find_chart(picture, LARGEST_DELTA_E)
         seconds += time.perf_counter() - begun_s
         rows.append(figures(picture, corners_px, camera, found))
         tiles += [picture if found is None else outlined(picture, found)]
-    print(summary(np.array(rows)), f"{seconds / options.pictures:.2f} s a picture", sep="\n")
-    false = sum(
-        find_chart(surroundings(seed), LARGEST_DELTA_E) is not None for seed in range(options.pictures)
-    )
-    print(f"without a chart: {false} of {options.pictures} pictures taken for one")
-    if options.sheet:
-        write_display(options.sheet, contact_sheet(np.stack(tiles[:_SHOWN])))
+    print(summary(np.array(rows)), f"{seconds / pictures:.2f} s a picture", sep="\n")
+    false = sum(find_chart(surroundings(seed), LARGEST_DELTA_E) is not None for seed in range(pictures))
+    print(f"without a chart: {false} of {pictures} pictures taken for one")
+    return tiles
 
 
 def draw_photograph(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
