@@ -55,8 +55,12 @@ class Provenance:
 
 
 def json_line(row: Mapping[str, Any]) -> str:
-    """A row as one line of strict JSON: paths as text, numpy scalars as numbers, NaN and infinity as null."""
-    return json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
+    """A row as one line of strict JSON: paths as text, numpy scalars as numbers, NaN and infinity as null.
+
+    What is no UTF-8 in a file's name stands as an escape, so that the line can be written.
+    """
+    text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Damage that a decoder reports badly, found before it starts: libpng prints to stderr by itself."""
+"""What a decoder reports badly, found before it starts: names that are no UTF-8, PNG files cut short."""
 
 import struct
 import zlib
@@ -7,6 +7,17 @@ from pathlib import Path
 from facerf_cli.errors import InputError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def utf8_path(path: Path) -> str:
+    """The path as OpenImageIO takes it: an InputError where it is not UTF-8, as names on disk may be."""
+    try:
+        path.as_posix().encode()
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
+        ) from None
+    return str(path)
 
 
 def require_whole_png(path: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import OpenImageIO as oiio
 
 from facerf_cli.colour import ColourSpace
+from facerf_cli.files.damage import utf8_path
 from facerf_cli.files.images import is_floating, space_of_file
 
 
@@ -22,7 +23,7 @@ class Header:
 
 def read_header(path: Path) -> Header | None:
     """The header of a picture's first part; None where it is no picture that can be read."""
-    stream = oiio.ImageInput.open(str(path)) if path.is_file() else None
+    stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
     if stream is None:
         oiio.geterror()  # or it prints its own words at exit
         return None

@@ -28,7 +28,7 @@ from facerf_cli.colour import (
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.damage import require_whole_png
+from facerf_cli.files.damage import require_whole_png, utf8_path
 from facerf_cli.files.xmp import embed_xmp
 from facerf_cli.records import LOGGER_NAME, one_line
 
@@ -91,7 +91,7 @@ def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
     require_whole_png(path)
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(str(path), settings)
+    stream = oiio.ImageInput.open(utf8_path(path), settings)
     if stream is None:
         advice = f"save it anew as EXR, PNG or JPEG ({_reason(path, oiio.geterror())})"
         raise InputError(f"{path}: not a picture that can be read; {advice}")
@@ -290,7 +290,7 @@ def _write(path: Path, spec: oiio.ImageSpec, data: np.ndarray, metadata: Attribu
     for name, value in (metadata or {}).items():
         spec.attribute(name, value)
     with atomic_path(path) as temporary:
-        stream = oiio.ImageOutput.create(str(temporary))
+        stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:
             oiio.geterror()  # or it prints its own words at exit
             raise UsageError(f"{path}: no picture format has this suffix; use .exr, .png or .jpg")

@@ -22,6 +22,7 @@ from torch import Tensor
 from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.damage import utf8_path
 from facerf_cli.files.images import HALF_MAX, Attributes
 from facerf_cli.records import one_line
 
@@ -79,7 +80,7 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
 
 def is_olat_stack(path: Path) -> bool:
     """Whether a file is an OLAT stack of ours; False for whatever cannot be opened."""
-    stream = oiio.ImageInput.open(str(path))
+    stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
         oiio.geterror()  # or it prints its own words at exit
         return False
@@ -111,7 +112,7 @@ def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None
 def _opened(path: Path) -> Iterator[oiio.ImageInput]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
-    stream = oiio.ImageInput.open(str(path))
+    stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
         raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
     try:

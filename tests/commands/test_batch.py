@@ -71,6 +71,13 @@ def test_same_stem_in_different_folders_and_a_file_given_twice(photos: Path, tmp
     assert names == ["a", "x/a.jpg", "x/a.png"]
 
 
+def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
+    photo = tmp_path / os.fsdecode(b"a\xff.png")
+    photo.write_bytes(b"bad")
+    assert run([photo], tmp_path / "out") == 1
+    assert rows(tmp_path / "out")["a\udcff"]["status"] == "failed"
+
+
 def test_a_single_file_has_no_folders_in_its_output(photos: Path, tmp_path: Path) -> None:
     (item,) = collect_items([str(photos / "x" / "a.png")], tmp_path / "out", PHOTO_SUFFIXES)
     assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"

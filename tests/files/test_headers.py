@@ -1,13 +1,17 @@
 """Headers of pictures, read without their pixels."""
 
+import os
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
+import pytest
 
 from facerf_cli.colour import LINEAR, SRGB
+from facerf_cli.errors import InputError
 from facerf_cli.files.headers import read_header
-from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.olat_stack import is_olat_stack
 
 
 def test_size_kind_and_space(tmp_path: Path) -> None:
@@ -33,6 +37,16 @@ def test_the_size_is_upright(tmp_path: Path) -> None:
     stream.close()
     header = read_header(tmp_path / "a.jpg")
     assert header is not None and (header.width_px, header.height_px) == (6, 9)
+
+
+def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
+    name = tmp_path / os.fsdecode(b"\xff.png")
+    name.write_bytes(b"no picture")
+    for read in (read_header, read_image, is_olat_stack):
+        with pytest.raises(InputError, match="not UTF-8; rename"):
+            read(name)
+    with pytest.raises(InputError, match="not UTF-8"):
+        write_display(name, np.zeros((2, 2, 3), np.float32))
 
 
 def test_no_picture_has_no_header(tmp_path: Path) -> None:
