@@ -1,8 +1,8 @@
 """Head motion undone: the shifts that take each frame back to where the others have the head.
 
-First on coarse frames, which see far; then on finer ones. What is found is good to about a quarter of a fine
-pixel, so shorter shifts are left alone. Lamps from the side and from behind tell too little of the head's
-place; their frames stay as they are.
+First the path of a head that drifts, against photometric stereo, which tells far but not finely (`path.py`);
+then each frame's own motion, against the frames under the lamps around it (`neighbours.py`). A head that is
+still is left alone: shifts that are shorter than what is found on one are not made.
 """
 
 from collections.abc import Mapping
@@ -14,12 +14,18 @@ import torch.nn.functional as F
 from scipy import ndimage
 
 from facerf_cli.stage.checks.frames import CameraFrames, read_frames
-from facerf_cli.stage.checks.motion import measure_motion
-from facerf_cli.stage.checks.stereo import fit_stereo
+from facerf_cli.stage.checks.motion import measure_motion, motion_between
+from facerf_cli.stage.checks.neighbours import own_motion, weights_of_others
+from facerf_cli.stage.checks.path import head_path
+from facerf_cli.stage.checks.stereo import fit_stereo, lit_pixels
 from facerf_cli.stage.data.layouts import Capture
 
 _FINE_PX, _COARSER = 192, 2  # the longer side of the fine frames; fine pixels to a coarse one
-_NOISE_PX = 0.3  # of a fine pixel
+_PATH_FRONT, _OWN_FRONT = -0.2, 0.2  # cosines to the camera's axis: lamps further behind light rims alone
+_LEAST_PEAK = 0.5  # of a perfect match with the lamps around; shadows agree there
+_SHRINK = {_COARSER: 0.1, 1: 0.03}  # by pixels: what the lamps of a region share, see `own_motion`
+_PATH_ROUNDS, _OWN_ROUNDS = 3, (_COARSER, _COARSER, _COARSER, 1, 1)
+_OWN_PX = 0.6  # of a fine pixel: on still synthetic faces up to 0.55 is found
 
 
 def with_alignment(capture: Capture, subject: str, broken: Mapping[str, set[str]]) -> Capture:
@@ -36,20 +42,43 @@ def align_shifts(
 ) -> dict[str, tuple[float, float]]:
     """By light, the camera's pixels down and right that undo the head's motion; none where it is small."""
     frames = read_frames(replace(capture, shifts={}), subject, camera, _FINE_PX)[0].less(broken)
-    moved_px = np.zeros((len(frames.light_ids), 2))
-    for size in (_COARSER, 1):
-        view = _coarser(_moved_back(frames, moved_px), size)
-        stereo = fit_stereo(view)
-        if stereo is None:
-            return {}
-        moved_px = moved_px + size * measure_motion(view, stereo).moved_px
-    undone = -moved_px * frames.scale
-    far = np.hypot(*moved_px.T) > _NOISE_PX
+    undone = -head_motion(frames) * frames.scale
     return {
         light: (round(float(down), 3), round(float(right), 3))
-        for light, (down, right), is_far in zip(frames.light_ids, undone, far, strict=True)
-        if is_far
+        for light, (down, right) in zip(frames.light_ids, undone, strict=True)
+        if down or right
     }
+
+
+def head_motion(frames: CameraFrames) -> np.ndarray:
+    """How far the head has moved in each frame [L, 2], pixels of the frames down and right."""
+    path = _path(frames)
+    own = np.zeros(path.shape)
+    if fit_stereo(frames) is None:
+        return own
+    weights = weights_of_others(frames.directions)
+    asked = frames.directions[:, 2] > _OWN_FRONT
+    for size in _OWN_ROUNDS:
+        grey = _coarser(_moved_back(frames, path + own), size).grey
+        predicted = np.tensordot(weights.astype(np.float32), grey, 1)
+        found = motion_between(grey, predicted, lit_pixels(grey), asked, _LEAST_PEAK)
+        more = own_motion(weights, found.moved_px, found.trusted, _SHRINK[size])
+        own += size * np.where(asked[:, None], more, 0)
+    return path + np.where((np.hypot(*own.T) > _OWN_PX)[:, None], own, 0)
+
+
+def _path(frames: CameraFrames) -> np.ndarray:
+    path = np.zeros((len(frames.light_ids), 2))
+    for _ in range(_PATH_ROUNDS):
+        view = _coarser(_moved_back(frames, path), _COARSER)
+        stereo = fit_stereo(view)
+        if stereo is None:
+            return path
+        found = measure_motion(view, stereo, _PATH_FRONT)
+        path = head_path(path + _COARSER * found.moved_px, found.trusted, frames.directions)
+        if not path.any():
+            return path
+    return path
 
 
 def _moved_back(frames: CameraFrames, moved_px: np.ndarray) -> CameraFrames:

@@ -32,17 +32,27 @@ class Motion:
     trusted: np.ndarray
 
 
-def measure_motion(frames: CameraFrames, stereo: Stereo) -> Motion:
-    """Each frame against its prediction; frames that cannot be trusted have 0."""
+def measure_motion(frames: CameraFrames, stereo: Stereo, least_front: float = _IN_FRONT) -> Motion:
+    """Each frame against its prediction; frames that cannot be trusted have 0.
+
+    `least_front`: the cosine of lamp and camera axis that frames must have.
+    """
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
-    front = frames.directions[:, 2] > _IN_FRONT
-    moved, peaks, gain = np.zeros((len(front), 2)), np.zeros(len(front)), np.zeros(len(front))
-    for row in np.flatnonzero(front):
-        seen, guess = (orientation(picture) * stereo.lit for picture in (frames.grey[row], predicted[row]))
-        moved[row], peaks[row], gain[row] = register(seen, guess)
+    front = frames.directions[:, 2] > least_front
+    return motion_between(frames.grey, predicted, stereo.lit, front, _LEAST_PEAK)
+
+
+def motion_between(
+    seen: np.ndarray, predicted: np.ndarray, where: np.ndarray, asked: np.ndarray, least_peak: float
+) -> Motion:
+    """Frames [L, h, w] against predictions, over `where` [h, w]; those that are not `asked` [L] have 0."""
+    moved, peaks, gain = np.zeros((len(asked), 2)), np.zeros(len(asked)), np.zeros(len(asked))
+    for row in np.flatnonzero(asked):
+        pair = (orientation(picture) * where for picture in (seen[row], predicted[row]))
+        moved[row], peaks[row], gain[row] = register(*pair)
     moved[(gain < _LEAST_GAIN) & (np.hypot(*moved.T) > _MOVED_PX)] = 0
-    trusted = front & (peaks > _LEAST_PEAK)
+    trusted = asked & (peaks > least_peak)
     return Motion(np.where(trusted[:, None], moved, 0), trusted)
 
 
