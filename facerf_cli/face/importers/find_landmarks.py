@@ -27,6 +27,7 @@ _NOISE_M = (0.010, 0.0007)  # of a pair's distance along the normal, likewise; a
 _SLIDE = 6.0  # times as much noise along the surface, which keeps the face from drifting
 _KNOWN_NOISE_M = 0.0005
 _FACING = 0.6  # cosine between the normals of a pair, at least
+_BESIDE_M = 0.004  # further from the surface, a landmark lies beyond its border, and stays there
 _FEW = 4  # known landmarks that fix a pose
 
 
@@ -52,11 +53,14 @@ def find_landmarks(mean: np.ndarray, triangles: np.ndarray, known: dict[int, np.
     mesh = trimesh.Trimesh(mean, triangles, process=False)
     rotation, translation = _start(mean[np.unique(triangles)], known)
     alpha = np.zeros(_face().basis.shape[-1])
+    inner = _inner(mesh)
     for share in np.linspace(0, 1, _ROUNDS):
-        rotation, translation, alpha = _round(mesh, known, rotation, translation, alpha, share)
+        rotation, translation, alpha = _round(mesh, inner, known, rotation, translation, alpha, share)
     found = (_face().points(alpha) @ rotation.T + translation)[_face().rows :]
     found = found if len(known) < _FEW else found + _missed(found, known)
-    found, _ = nearest_on_mesh(mesh, found)
+    onto, _ = nearest_on_mesh(mesh, found)
+    there = np.linalg.norm(onto - found, axis=-1) < _BESIDE_M
+    found[there] = onto[there]
     for index, point in known.items():
         found[index] = point
     return found
@@ -90,8 +94,15 @@ def _start(points: np.ndarray, known: dict[int, np.ndarray]) -> tuple[np.ndarray
     return np.eye(3), tip - LANDMARKS_M[_NOSE_TIP]
 
 
+def _inner(mesh: trimesh.Trimesh) -> np.ndarray:
+    """The faces [F] away from any border, which all that lies beyond it would be drawn to."""
+    border = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    return np.logical_not(np.isin(mesh.faces, border).any(1))
+
+
 def _round(
     mesh: trimesh.Trimesh,
+    inner: np.ndarray,
     known: dict[int, np.ndarray],
     rotation: np.ndarray,
     translation: np.ndarray,
@@ -107,7 +118,7 @@ def _round(
     reach, noise = (low ** (1 - share) * high**share for low, high in (_REACH_M, _NOISE_M))
     normals = mesh.face_normals[faces]
     facing = np.abs((normals * (_normals() @ rotation.T)).sum(-1)) > _FACING  # of either winding
-    used = facing & (np.linalg.norm(off, axis=-1) < reach)
+    used = facing & inner[faces] & (np.linalg.norm(off, axis=-1) < reach)
     if used.sum() < count // 3:
         raise InputError("no face is found on its mean; y should be up, and z out of the face")
     along = normals[:, :, None] * normals[:, None]  # [M, 3, 3] projections onto the normals

@@ -12,37 +12,46 @@ from facerf_cli.face.topology import GRID, LANDMARK_UV, chart_rays, chart_uv, gr
 
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
 _PULL_M = 0.005  # how far around a landmark the grid is pulled onto it
+_COVERED = 0.75  # of the chart, by a model's surface
 _CANDIDATES = 12  # triangles by their centres, among which the nearest point is sought
 
 
-def register(mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the canonical vertices lie on a mesh: vertex ids [V, 3] and barycentric weights [V, 3].
+def register(
+    mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the canonical vertices lie on a mesh: ids and barycentric weights [V, 3], and if they do [V].
 
     The displacement of the landmarks [68, 3] from their canonical (u, v) bends the whole grid (thin plate).
     """
     warp = RBFInterpolator(LANDMARK_UV, chart_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
     uv = grid_uv().double().numpy()
     mesh = trimesh.Trimesh(mean, triangles, process=False)
-    points = _cast(mesh, *chart_rays(uv + warp(uv)))
+    points, covered = _cast(mesh, *chart_rays(uv + warp(uv)))
     points, faces = nearest_on_mesh(mesh, _pulled(points, landmarks))
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
     weights = np.clip(weights, 0, None)
-    return triangles[faces], weights / weights.sum(-1, keepdims=True)
+    return triangles[faces], weights / weights.sum(-1, keepdims=True), covered
 
 
-def _cast(mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Where the grid's rays meet the mesh [V, 3]; one that slips into a slit ends where its neighbours do."""
+def _cast(
+    mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the grid's rays meet the mesh [V, 3], and if they do [V].
+
+    One that slips into a slit ends where its neighbours do.
+    """
     points, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
-    if len(rays) < len(origins) * 0.98:
+    if len(rays) < len(origins) * _COVERED:
         raise InputError(
-            "its surface ends inside forehead, cheeks or chin, where textures still need it; "
-            "give the model's larger mesh (of Basel's files bfm or fullHead, not face12)"
+            f"its surface covers {100 * len(rays) / len(origins):.0f} % of the face, from the forehead to "
+            f"below the chin; {100 * _COVERED:.0f} % are needed, so give the model's larger mesh"
         )
     travelled = np.full(len(origins), np.inf)
     travelled[rays] = np.linalg.norm(points - origins[rays], axis=-1)
     filled = np.where(np.isfinite(travelled), travelled, travelled[rays].max())
     usual = median_filter(filled.reshape(GRID, GRID), 5).ravel()
-    return origins + directions * np.where(travelled < usual + _SLIP_M, travelled, usual)[:, None]
+    ends = origins + directions * np.where(travelled < usual + _SLIP_M, travelled, usual)[:, None]
+    return ends, np.isfinite(travelled)
 
 
 def _pulled(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ from facerf_cli.face.importers.basel_2009 import read_basel_2009
 from facerf_cli.face.importers.basel_2017 import read_basel_2017
 from facerf_cli.face.importers.carry import carry_over, landmarks_of
 from facerf_cli.face.importers.importing import import_face_model
+from facerf_cli.face.importers.registration import rigid_alignment
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, head, off_mm
 
 h5py = pytest.importorskip("h5py")
@@ -164,6 +168,28 @@ def test_basel_2017_s_names_help_to_find_the_other_landmarks(tmp_path: Path) -> 
     model = carry_over(source)
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
     assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS + 1
+
+
+def test_a_surface_that_ends_early_goes_on_as_the_built_in_face(tmp_path: Path) -> None:
+    whole = head(120, 120, turn_deg=4)
+    source = read_basel_2017(h5(tmp_path / "face12.h5", whole, whole.mean * 0))
+    away = (whole.mean - whole.landmarks[30]) @ rigid_alignment(LANDMARKS_M, whole.landmarks)[0]
+
+    def oval(width_m: float, height_m: float) -> SourceModel:
+        inside = (away[:, 0] / width_m) ** 2 + ((away[:, 1] + 0.005) / height_m) ** 2 < 1
+        return replace(source, triangles=whole.triangles[inside[whole.triangles].all(1)])
+
+    part = oval(0.070, 0.105)  # without the chart's corners, and without the contour's ends
+    off = 1000 * np.linalg.norm(landmarks_of(part) - whole.landmarks, axis=-1)
+    assert off[:17].max() < 2.5  # also of those that are cut away
+    model = carry_over(part)
+    off = off_mm(model, whole)
+    assert np.median(off) < 0.5 and off.max() < 12
+    moved = model.identity[0].norm(dim=-1)
+    corners = moved.reshape(129, 129)[[0, 0, -1, -1], [0, -1, 0, -1]]
+    assert 0.5 * moved.mean() < corners.mean() < 2 * moved.mean()
+    with pytest.raises(InputError, match=r"covers \d+ % of the face"):
+        carry_over(oval(0.060, 0.085))
 
 
 def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_path: Path) -> None:
