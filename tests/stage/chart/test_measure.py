@@ -103,6 +103,7 @@ DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
 REFUSED: dict[str, tuple[np.ndarray, np.ndarray | None, str]] = {
     "clipped at 1": (chart_picture(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "patches are clipped"),
     "clipped below 1": (chart_picture().clip(max=0.5), CORNERS, "white patch is clipped"),
+    "a channel clipped": (chart_picture().clip(max=[9, 9, 0.57]), CORNERS, "white patch is clipped"),
     "grey": (chart_picture().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
     "a face": (FACE, CORNERS, "delta E"),
     "a face, no corners": (FACE, None, "give its corners|say where its 24 patches are"),
