@@ -58,7 +58,7 @@ def test_a_stage_may_name_its_ambient_pictures(tmp_path: Path) -> None:
     write_exr(tmp_path / "0000/C0/dark.exr", np.full((60, 64, 3), 0.5, np.float32))
     capture = read_capture(tmp_path, "stage", subtract_ambient=True)
     assert capture.frame("0000", "C0", 0)[5, 5] == pytest.approx([1.75, 0.875, 0.4375])  # the black level too
-    with pytest.raises(InputError, match=r"{subject} and {camera} in it"):
+    with pytest.raises(InputError, match=r"names {subject} is needed"):
         read_capture(capture_at(tmp_path, ambient="dark.exr"))
     with pytest.raises(UsageError, match="names no 'ambient'"):
         read_capture(capture_at(tmp_path), "stage", subtract_ambient=True)
