@@ -32,7 +32,7 @@ def added_exponent(capture: Capture, frames: CameraFrames) -> Curve | None:
     together = full[lit].astype(float)
     errors = np.array([_error(each, together, exponent) for exponent in _EXPONENTS])
     at_one = _error(each, together, 1.0)
-    return Curve(float(_EXPONENTS[errors.argmin()]), at_one / max(float(errors.min()), _NOISE))
+    return Curve(float(_EXPONENTS[errors.argmin()]), at_one / max(float(errors.min()), _NOISE), exact=True)
 
 
 def _error(each: np.ndarray, together: np.ndarray, exponent: float) -> float:

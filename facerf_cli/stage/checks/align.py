@@ -64,6 +64,7 @@ def head_motion(frames: CameraFrames) -> np.ndarray:
         found = motion_between(grey, predicted, lit_pixels(grey), asked, _LEAST_PEAK)
         more = own_motion(weights, found.moved_px, found.trusted, _SHRINK[size])
         own += size * np.where(asked[:, None], more, 0)
+        own[asked] -= np.median(own[asked], axis=0)  # the others' motion is nobody's
     return path + np.where((np.hypot(*own.T) > _OWN_PX)[:, None], own, 0)
 
 

@@ -27,10 +27,10 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_shifts_undo_the_motion(stage: Path) -> None:
     shifts = align_shifts(read_capture(stage), SUBJECT, CAMERA, set())
     for row, (down, right) in PLANTED.items():
-        assert shifts[IDS[row]] == pytest.approx((-down, -right), abs=0.6)  # of 40 lamps far apart
+        assert shifts[IDS[row]] == pytest.approx((-down, -right), abs=0.7)  # of a few lamps, far apart
     front = [light for light, way in zip(IDS, directions(), strict=True) if way[2] > 0.5]
     still = set(front) - {IDS[row] for row in PLANTED}
-    assert not any(np.hypot(*shifts.get(light, (0, 0))) > 0.5 for light in still)
+    assert not any(np.hypot(*shifts.get(light, (0, 0))) > 0.7 for light in still)
 
 
 def test_frames_are_read_where_the_head_was(stage: Path) -> None:
