@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +22,10 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
+from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.stage.data.dataset import Dataset, read_dataset
 from facerf_cli.stage.data.layouts import read_capture
+from facerf_cli.stage.data.prepare import _Subject
 from tests.stage.data.capture import Truth, write_capture
 
 LIGHTS = 12
@@ -85,6 +88,13 @@ def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
     assert b'facerf:face_model="builtin"' in sheet and b"facerf:face_model_licence" in sheet
 
 
+def test_what_comes_of_a_synthetic_capture_says_so(given: Given) -> None:
+    capture = replace(read_capture(given[0]), provenance={"synthetic": True})
+    made = _Subject(capture, "0000", (), load_face_model()).provenance("C1")
+    assert made["facerf:input"] == "0000/C1" and made["facerf:synthetic"] == 1
+    assert made["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
+
+
 def test_the_fit_lies_on_the_true_face_in_every_camera(given: Given, prepared: Dataset) -> None:
     """Also in the one that saw no face: the calibration knows where it is."""
     model, capture = load_face_model(), read_capture(given[0])
@@ -121,8 +131,10 @@ def test_the_stack_is_relit_like_any_other(prepared: Dataset, tmp_path: Path) ->
     assert main(line) == 0
     header = read_olat_stack(stack).header
     seen = header.seen > 0
-    relit = read_image(tmp_path / "out/C2_white.exr").pixels
-    assert np.abs(relit - header.source)[seen].max() < 2e-3 * header.source.max()
+    relit = read_image(tmp_path / "out/C2_white.exr")
+    assert np.abs(relit.pixels - header.source)[seen].max() < 2e-3 * header.source.max()
+    assert relit.metadata["facerf:synthetic"] == 1 and relit.metadata["facerf:input"] == "0001/C2"
+    assert relit.metadata["facerf:face_model_licence"] == load_face_model().licence
 
 
 def test_the_page_shows_everybody(prepared: Dataset) -> None:
