@@ -35,12 +35,12 @@ log = logging.getLogger(LOGGER_NAME)
 
 def with_charts(given: Given, picture: str, corners: str) -> Given:
     """The capture with the corrections by `picture`, each told in a line; as it is without a picture."""
-    from facerf_cli.stage.chart.measure import read_charts
-
     if not picture:
         if corners:
             raise UsageError("--chart-corners: of what picture? give --colour-chart too")
         return given
+    from facerf_cli.stage.chart.measure import read_charts
+
     try:
         charts = tuple(read_charts(given.opened(), picture, parse_corners(corners) if corners else None))
     except InputError as error:

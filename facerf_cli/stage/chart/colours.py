@@ -7,7 +7,10 @@ squares technique for nonuniform intensity color correction'.
 """
 
 import importlib
+import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -37,16 +40,33 @@ class ColourFit:
 
 @cache
 def colour_science() -> Any:
-    """The package, which the type checker need not know; its import changes neither print options nor warns.
+    """The package, which the type checker need not know; a user sees nothing of its import.
 
     It comes with the extra `chart`; a FacerfError says so where it is missing.
     """
     try:
-        with np.printoptions(), warnings.catch_warnings():
+        with np.printoptions(), warnings.catch_warnings(), _without("OpenImageIO"):
             warnings.simplefilter("ignore")  # it warns of optional packages that are not there
             return importlib.import_module("colour")
     except ImportError:
         raise FacerfError("--colour-chart needs colour-science; run pip install 'facerf[chart]'") from None
+
+
+@contextmanager
+def _without(name: str) -> Iterator[None]:
+    """Hide a module from what is imported in the block.
+
+    colour-science would hold types of OpenImageIO, which it prints as leaks when the program ends.
+    """
+    modules: dict[str, Any] = sys.modules
+    hidden = modules.get(name)
+    modules[name] = None  # Python's own way to say that there is none
+    try:
+        yield
+    finally:
+        del modules[name]
+        if hidden is not None:
+            modules[name] = hidden
 
 
 @cache
