@@ -90,7 +90,7 @@ class _Measure:
 
     @property
     def stamp(self) -> dict[str, str]:
-        """The name and licence of the face model that the pictures are made with, if they are with one."""
+        """That of the face model that the pictures are made with, if they are with one."""
         return face_model(self.photo).stamp if self.photo else {}
 
     def path_of(self, item: Item) -> Path:
@@ -229,6 +229,6 @@ def _about(work: _Measure) -> "About":
     facts["values compared"] = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}[
         work.options.space
     ]
-    if stamp := work.stamp:
-        facts["face model"] = f"{stamp['face_model']} ({stamp['face_model_licence']})"
+    if work.photo:
+        facts["face model"] = face_model(work.photo).credit
     return About(shlex.join(["facerf", *sys.argv[1:]]), __version__, facts)

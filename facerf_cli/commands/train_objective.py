@@ -215,7 +215,7 @@ def _fill_bank(options: TrainOptions, folder: Path) -> "Bank":
     fitted = load_face_model(fitted_with)
     views = folder / f"views-{fitted.name}"
     add_views(folder / "heads", views, fitted_with, options.sizes.views, options.jobs, options.settings.seed)
-    fit = {"fitted_with": f"{fitted.name} ({fitted.licence})", "skin": "procedural (facerf)"}
+    fit = {"fitted_with": fitted.credit, "skin": "procedural (facerf)"}
     return load_bank(folder / "heads", views, provenance | fit)
 
 
@@ -235,7 +235,7 @@ def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     build_geometries(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
     found = len(list((folder / "heads").glob("*.safetensors")))
     return {
-        "heads": f"{found} synthetic heads drawn from {drawn.name} ({drawn.licence})",
+        "heads": f"{found} synthetic heads drawn from {drawn.credit}",
         "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
 

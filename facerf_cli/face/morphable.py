@@ -45,6 +45,11 @@ class MorphableModel:
         """Its name and licence, for whatever is made with it."""
         return {"face_model": self.name, "face_model_licence": self.licence}
 
+    @property
+    def credit(self) -> str:
+        """The same in one text."""
+        return f"{self.name} ({self.licence})"
+
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
         """v = mean + M_id alpha + M_exp beta, for alpha [B, Ki] and beta [B, Ke], as [B, V, 3]."""
         offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)

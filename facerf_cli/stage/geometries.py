@@ -73,7 +73,7 @@ def _build_shard(
     for index in indices:
         tensors = bake_head(model, index, seed, settings)
         unfinished = folder / f"{index:05d}.partial"
-        save_file(tensors, unfinished, metadata=model.stamp)
+        save_file(tensors, unfinished, metadata={"face_model": model.name})
         unfinished.rename(folder / f"{index:05d}.safetensors")
 
 

@@ -288,4 +288,5 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
         "bounce": in_chart(np.sqrt(bounce)),
     }
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary, metadata=subject_model(settings.face_model).stamp)
+        # One entry: safetensors writes several in an order that changes from run to run.
+        save_file(tensors, temporary, metadata={"face_model": subject_model(settings.face_model).credit})

@@ -208,7 +208,7 @@ def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
     return {
         "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",
         "dataset": dataset.provenance,
-        "fitted_with": f"{model.name} ({model.licence})",
+        "fitted_with": model.credit,
         "licence": _licence(dataset.provenance, name),
     }
 
