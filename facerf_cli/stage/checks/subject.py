@@ -14,13 +14,14 @@ from facerf_cli.stage.checks.frames import CameraFrames, read_frames
 from facerf_cli.stage.checks.gamma import Curve, check_gamma, fit_exponent
 from facerf_cli.stage.checks.missing import check_missing
 from facerf_cli.stage.checks.motion import check_motion
-from facerf_cli.stage.checks.order import check_frames_order, check_rig, check_rig_roughly
+from facerf_cli.stage.checks.order import check_frames_order
 from facerf_cli.stage.checks.readable import check_readable
+from facerf_cli.stage.checks.rig import Rig, check_rig_roughly, check_rigs, measure_rig
 from facerf_cli.stage.checks.stereo import Stereo, fit_stereo
 from facerf_cli.stage.checks.unlit import check_unlit
 from facerf_cli.stage.data.layouts import Capture
 
-_FACE_TRIES = 3  # cameras that are searched for the face; each costs a second or more where there is none
+_FACE_TRIES = 3  # cameras without a face that are searched for one; each costs a second or more
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,7 @@ def check_subject(capture: Capture, subject: str, settings: CheckSettings = _USU
     checks = _Checks(capture, subject, settings)
     found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
     found += check_gamma(subject, checks.curves)
-    if not checks.rig_known:
-        found += checks.rough
+    found += check_rigs(subject, checks.rigs) if checks.rigs else checks.rough
     return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
 
 
@@ -54,7 +54,7 @@ class _Checks:
         self.capture, self.subject, self.settings = capture, subject, settings
         self.curves: list[Curve] = []
         self.rough: list[Finding] = []  # of the rig, without a face to compare
-        self.rig_known = False
+        self.rigs: list[Rig] = []
         self._digests: dict[str, str] = {}
         self._face_tries = _FACE_TRIES
 
@@ -90,24 +90,22 @@ class _Checks:
         found = list(check_frames_order(frames, stereo))
         if is_disordered(found):
             return found  # no normals are to be trusted
-        self._look_at_rig(frames, stereo, found)
+        self._look_at_rig(frames, stereo)
         found += check_motion(frames.less(left_out(found)), stereo)
         curve = added_exponent(self.capture, frames)
         curve = curve or fit_exponent(frames.less(left_out(found)), stereo.lit)
         self.curves += [] if curve is None else [curve]
         return found
 
-    def _look_at_rig(self, frames: CameraFrames, stereo: Stereo, found: list[Finding]) -> None:
-        """Hold the rig against the face until a camera has shown one."""
-        if self.rig_known:
-            return
-        self.rough += check_rig_roughly(frames, stereo)
+    def _look_at_rig(self, frames: CameraFrames, stereo: Stereo) -> None:
+        """Hold the rig against the face, if the camera shows one."""
+        if not self.rigs:
+            self.rough += check_rig_roughly(frames, stereo)
         if self._face_tries:
-            self._face_tries -= 1
             face = find_face_normals(frames, self.capture.cameras[frames.camera])
-            if face is not None:
-                self.rig_known = True
-                found += check_rig(frames, stereo, face)
+            rig = None if face is None else measure_rig(frames, stereo, face, self.capture.cameras)
+            self.rigs += [] if rig is None else [rig]
+            self._face_tries -= face is None
 
 
 def is_disordered(findings: Iterable[Finding]) -> bool:

@@ -215,6 +215,25 @@ def test_a_turned_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> No
     assert found[0].check == "rig" and float(found[0].figures["turned_deg"]) == pytest.approx(40, abs=6)
 
 
+@pytest.mark.parametrize(("first", "second"), [("C0", "C1"), ("C1", "C0")])
+def test_two_cameras_under_each_others_names(tmp_path: Path, first: str, second: str) -> None:
+    """The egg turns with the camera; the lamps do not, and tell one from the other."""
+    turn = np.array([[np.cos(0.4), 0, np.sin(0.4)], [0, 1, 0], [-np.sin(0.4), 0, np.cos(0.4)]])
+    aside = camera_of("C1")
+    aside["world_to_camera"] = np.c_[np.diag([1, -1, -1]) @ turn, [0, 0, 1.2]].tolist()
+    folder = write_stage(tmp_path / "s", cameras=[camera_of("C0"), aside])
+    (folder / SUBJECT / CAMERA).rename(folder / SUBJECT / "front")
+    (folder / SUBJECT / second).mkdir()
+    for light, picture in zip(IDS, pictures(directions() @ turn.T), strict=True):
+        write_frame(folder / SUBJECT / second / f"{light}.exr", picture)
+    (folder / SUBJECT / "front").rename(folder / SUBJECT / first)
+    found = findings(folder)
+    assert [(one.check, one.camera) for one in found] == (
+        [] if first == "C0" else [("camera", "C0"), ("camera", "C1")]
+    )
+    assert not found or ("C1" in found[0].words and stopping(found))
+
+
 def test_without_a_face_a_mirrored_rig_shows_in_the_shape(
     tmp_path: Path, sound: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:

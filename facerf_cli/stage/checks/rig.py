@@ -1,0 +1,134 @@
+"""All lamps mirrored or turned together, or two cameras' frames swapped: the face alone tells.
+
+Frames then agree with each other. But the face's normals, known from a mean face laid over it, are mirrored
+or turned against those of photometric stereo: by what is wrong with the rig, or by the turn from one camera
+to the other.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from facerf_cli.face.joint_fit import PosedCamera
+from facerf_cli.stage.checks.face_normals import FaceNormals
+from facerf_cli.stage.checks.findings import Finding
+from facerf_cli.stage.checks.frames import CameraFrames
+from facerf_cli.stage.checks.order import angle_deg
+from facerf_cli.stage.checks.stereo import Stereo
+
+_TURN_DEG = 20.0  # sound rigs are found turned by 1 to 11, on Extended Yale B and synthetic faces
+_SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # and two cameras each turned to the other, as near as that
+_BETTER = 0.03  # of the mean cosine between normals, by which a mirrored rig must win
+_APART_DEG = 45.0  # between normals after the first turn: glasses, hair
+_LEAN = 0.3  # correlation of a normal's x with the pixel's: 0.6 to 0.9 on heads
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """The rotation [3, 3] that takes the normals found onto those of the face, and their mean cosine then."""
+
+    rotation: np.ndarray
+    likeness: float
+
+    @property
+    def degrees(self) -> float:
+        """How far it turns."""
+        return float(np.degrees(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1))))
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """How the lamps lie against the face that a camera sees, as they are and mirrored left to right.
+
+    `other`: the camera whose place explains the turn, if there is one.
+    """
+
+    camera: str
+    turn: Turn
+    mirrored: Turn
+    other: str
+
+
+def measure_rig(
+    frames: CameraFrames, stereo: Stereo, face: FaceNormals, cameras: Mapping[str, PosedCamera]
+) -> Rig | None:
+    """None where too little of the face is lit."""
+    place = np.full(stereo.lit.size, -1)
+    place[stereo.lit.ravel()] = np.arange(stereo.lit.sum())
+    rows = place[face.pixels]
+    found, known = stereo.normals[rows[rows >= 0]], face.normals[rows >= 0]
+    if len(found) < 100:
+        return None
+    turn = best_turn(found, known)
+    other = _other_camera(turn, frames.camera, cameras)
+    return Rig(frames.camera, turn, best_turn(found * [-1, 1, 1], known), other)
+
+
+def best_turn(found: np.ndarray, known: np.ndarray) -> Turn:
+    """Of normals onto others [N, 3] (Kabsch)."""
+    near = np.ones(len(found), bool)
+    for _ in range(2):
+        u, _, vh = np.linalg.svd(found[near].T @ known[near])
+        rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vh))]) @ vh).T
+        turned = found @ rotation.T
+        near = angle_deg(turned, known) < _APART_DEG
+        if near.sum() < 50:
+            near[:] = True
+    return Turn(rotation, float((turned * known).sum(1).mean()))
+
+
+def _other_camera(turn: Turn, camera: str, cameras: Mapping[str, PosedCamera]) -> str:
+    """The camera that one would have to be for its normals to be the face's; empty where none comes near."""
+    back = turn.rotation @ cameras[camera].rotation.double().numpy()
+    off_deg = {
+        name: Turn(back @ posed.rotation.double().numpy().T, 1.0).degrees
+        for name, posed in cameras.items()
+        if name != camera
+    }
+    nearest = min(off_deg, key=lambda name: off_deg[name], default="")
+    return nearest if nearest and turn.degrees > _SWAP_DEG and off_deg[nearest] < _LIKE_DEG else ""
+
+
+def check_rigs(subject: str, rigs: Sequence[Rig]) -> Iterator[Finding]:
+    """An error for each camera whose place is that of another, and the other's its own; one for the rig."""
+    others = {rig.camera: rig.other for rig in rigs}
+    swapped = [rig for rig in rigs if rig.other and others.get(rig.other) == rig.camera]
+    for rig in swapped:
+        words = (
+            f"is lit as camera {rig.other} would be, and that one as this; swap their frames, or K and poses"
+        )
+        figures = {"turned_deg": round(rig.turn.degrees, 1)}
+        yield Finding("error", "camera", subject, words, rig.camera, figures=figures)
+    for rig in [rig for rig in rigs if rig not in swapped][:1]:
+        yield from _check_rig(subject, rig)
+
+
+def _check_rig(subject: str, rig: Rig) -> Iterator[Finding]:
+    """One error where the rig as a whole is mirrored or turned against the face."""
+    turn_deg, mirrored_deg = rig.turn.degrees, rig.mirrored.degrees
+    figures = {
+        "turned_deg": round(turn_deg, 1),
+        "likeness": round(rig.turn.likeness, 3),
+        "mirrored": round(rig.mirrored.likeness, 3),
+    }
+    if rig.mirrored.likeness > rig.turn.likeness + _BETTER:
+        turned = f" and turned by {mirrored_deg:.0f} degrees" if mirrored_deg > _TURN_DEG else ""
+        words = f"the lights are mirrored left to right{turned} against the face; mend their directions"
+        yield Finding("error", "rig", subject, words, rig.camera, figures=figures)
+    elif turn_deg > _TURN_DEG:
+        words = (
+            f"the lights are turned by {turn_deg:.0f} degrees against the face as this camera sees it; mend "
+            "their directions or world_to_camera"
+        )
+        yield Finding("error", "rig", subject, words, rig.camera, figures=figures)
+
+
+def check_rig_roughly(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
+    """One error where normals lean left on the right of the object: for cameras without a face to compare."""
+    columns = np.nonzero(stereo.lit)[1].astype(float)
+    leaning = float(np.corrcoef(stereo.normals[:, 0], columns)[0, 1])
+    if leaning < -_LEAN:
+        words = "what is lit is hollow from left to right; are the lights mirrored, or the pictures?"
+        figures = {"leaning": round(leaning, 2)}
+        yield Finding("error", "rig", frames.subject, words, frames.camera, figures=figures)
