@@ -14,7 +14,7 @@ from facerf_cli.stage.chart.patches import GREYS, MIDDLE_SIDE, sample, shrunk, s
 from facerf_cli.stage.data.layouts import Capture, read_picture
 
 _SIDE_PX = 1024  # what a screen shows
-_SQUARES = (MIDDLE_SIDE + 0.04, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # the outline's, and the published colour's
+_SQUARES = (MIDDLE_SIDE + 0.08, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # the outline's, and the published colour's
 
 
 def write_chart_overlays(capture: Capture, folder: Path) -> None:
