@@ -24,7 +24,8 @@ from scipy import ndimage
 from facerf_cli.stage.checks.align import with_alignment
 from facerf_cli.stage.checks.findings import frames_left_out
 from facerf_cli.stage.checks.subject import check_subject
-from facerf_cli.stage.data.layouts import Capture, read_capture
+from facerf_cli.stage.data.capture import Capture
+from facerf_cli.stage.data.layouts import read_capture
 from facerf_cli.stage.data.yale_b import read_shifts
 
 _OWN_PX = 0.3  # what each frame has of its own beside the path

@@ -19,7 +19,8 @@ from pathlib import Path
 from facerf_cli.evaluation.yale_b_cases import SETTINGS_SUBJECTS
 from facerf_cli.stage.checks.findings import Finding
 from facerf_cli.stage.checks.subject import check_subject
-from facerf_cli.stage.data.layouts import Capture, read_capture
+from facerf_cli.stage.data.capture import Capture
+from facerf_cli.stage.data.layouts import read_capture
 from facerf_cli.stage.data.yale_b import UNMARKED_DAMAGE
 
 

@@ -13,7 +13,7 @@ log = logging.getLogger(LOGGER_NAME)
 def describe_capture(folder: Path, output: Path | None) -> None:
     """Write the draft to FOLDER/stage.json, or where `output` says, never over anything; print its path."""
     from facerf_cli.files.atomic import atomic_path
-    from facerf_cli.stage.data.layouts import STAGE_FILE
+    from facerf_cli.stage.data.stage_file import STAGE_FILE
     from facerf_cli.stage.draft.draft import as_text, draft_stage
 
     path = folder / STAGE_FILE if output is None else output

@@ -23,7 +23,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.records import LOGGER_NAME
 
 if TYPE_CHECKING:
-    from facerf_cli.stage.data.layouts import Capture
+    from facerf_cli.stage.data.capture import Capture
     from facerf_cli.stage.data.splits import Split
 
 _CROP_STEP_PX = 8

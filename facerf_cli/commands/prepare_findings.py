@@ -18,7 +18,7 @@ from facerf_cli.records import STDERR, json_line
 
 if TYPE_CHECKING:
     from facerf_cli.stage.checks.findings import Finding
-    from facerf_cli.stage.data.layouts import Capture
+    from facerf_cli.stage.data.capture import Capture
 
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
 _ROWS_LIMIT_BYTES = 256 << 20

@@ -15,7 +15,7 @@ from facerf_cli.records import LOGGER_NAME
 if TYPE_CHECKING:
     from facerf_cli.face.morphable import MorphableModel
     from facerf_cli.stage.chart.correction import ChartCorrection
-    from facerf_cli.stage.data.layouts import Capture
+    from facerf_cli.stage.data.capture import Capture
     from facerf_cli.stage.data.selection import Selection
 
 Checks = Literal["on", "off", "only"]

@@ -29,7 +29,7 @@ from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.stage import bake_renderer, path_tracer
 from facerf_cli.stage.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.stage.data.documents import write_document
-from facerf_cli.stage.data.layouts import STAGE_FILE, STAGE_FORMAT
+from facerf_cli.stage.data.stage_file import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.stage.geometries import GeometrySettings, draw_coefficients
 from facerf_cli.stage.head.clothes import draw_clothes
 from facerf_cli.stage.head.glasses import draw_glasses

@@ -8,8 +8,8 @@ import pytest
 
 from facerf_cli.main import main
 from facerf_cli.stage.checks.findings import Finding
+from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.dataset import read_dataset
-from facerf_cli.stage.data.layouts import Capture
 from facerf_cli.stage.data.selection import LEAST_LIGHTS
 from tests.stage.data.capture import write_capture
 

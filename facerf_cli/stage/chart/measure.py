@@ -16,7 +16,7 @@ from facerf_cli.stage.chart.colours import ColourFit, fit_colours, published_col
 from facerf_cli.stage.chart.correction import ChartCorrection
 from facerf_cli.stage.chart.find import find_chart
 from facerf_cli.stage.chart.patches import GREYS, Patches, four_turns, is_convex, sample
-from facerf_cli.stage.data.layouts import Capture, read_picture
+from facerf_cli.stage.data.capture import Capture, read_picture
 
 CAMERA_FIELD = "{camera}"
 _LARGEST_DELTA_E = 8.0  # mean; a chart that was found and photographed well has 1 to 4

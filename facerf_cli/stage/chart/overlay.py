@@ -11,7 +11,7 @@ from facerf_cli.stage.chart.colours import published_colours
 from facerf_cli.stage.chart.correction import ChartCorrection, corrected
 from facerf_cli.stage.chart.measure import as_a_frame
 from facerf_cli.stage.chart.patches import GREYS, MIDDLE_SIDE, sample, shrunk, squares_px
-from facerf_cli.stage.data.layouts import Capture, read_picture
+from facerf_cli.stage.data.capture import Capture, read_picture
 
 _SIDE_PX = 1024  # what a screen shows
 _SQUARES = (MIDDLE_SIDE + 0.08, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # the outline's, and the published colour's

@@ -11,7 +11,7 @@ from facerf_cli.files.images import read_image
 from facerf_cli.stage.checks.frames import CameraFrames, grey_of, small
 from facerf_cli.stage.checks.gamma import EXPONENTS, Curve
 from facerf_cli.stage.checks.missing import FULL_NAMES
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 _EXPONENTS = np.geomspace(EXPONENTS[0], EXPONENTS[-1], 80)  # a sharp minimum wants fine steps
 _NOISE = 1e-3  # of log ratios: no sum is better than that

@@ -18,7 +18,7 @@ from facerf_cli.stage.checks.motion import measure_motion, motion_between
 from facerf_cli.stage.checks.neighbours import own_motion, weights_of_others
 from facerf_cli.stage.checks.path import head_path
 from facerf_cli.stage.checks.stereo import fit_stereo, lit_pixels
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 _FINE_PX, _COARSER = 192, 2  # the longer side of the fine frames; fine pixels to a coarse one
 _PATH_FRONT, _OWN_FRONT = -0.2, 0.2  # cosines to the camera's axis: lamps further behind light rims alone

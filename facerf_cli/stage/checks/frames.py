@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.images import read_image
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 _FACE_PX = 512  # the longer side of the picture that the face is found on
 _BRIGHT = 0.2  # of the brightest blocks

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 _SHOWN = 3
 FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # a frame with every lamp on, see `additivity.py`

@@ -19,7 +19,7 @@ from facerf_cli.stage.checks.readable import check_readable
 from facerf_cli.stage.checks.rig import Rig, check_rig_roughly, check_rigs, measure_rig
 from facerf_cli.stage.checks.stereo import Stereo, fit_stereo
 from facerf_cli.stage.checks.unlit import check_unlit
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 _FACE_TRIES = 3  # cameras without a face that are searched for one; each costs a second or more
 

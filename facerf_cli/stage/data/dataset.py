@@ -22,7 +22,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.stage.data.documents import Node, read_document, unique_ids
-from facerf_cli.stage.data.layouts import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
+from facerf_cli.stage.data.stage_file import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 
 FORMAT = "facerf-dataset-1"
 DATASET_FILE = "dataset.json"

@@ -10,9 +10,9 @@ import torch
 
 from facerf_cli import __version__
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.dataset import FORMAT, SPLITS
 from facerf_cli.stage.data.documents import digest
-from facerf_cli.stage.data.layouts import Capture
 from facerf_cli.stage.data.splits import Split
 
 _COLOUR_SPACE = "lin_rec709"

@@ -28,9 +28,9 @@ from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.records import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 from facerf_cli.report import contact_sheet
+from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.stage.data.documents import read_document, write_document
-from facerf_cli.stage.data.layouts import Capture
 from facerf_cli.stage.data.selection import Selection
 from facerf_cli.stage.data.sheets import lights_shown, sheet_tiles
 from facerf_cli.stage.data.stacks import constant_weights, stack_header

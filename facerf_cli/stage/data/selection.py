@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from facerf_cli.errors import InputError
 from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 
 LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # of the rig's: with fewer, what is left is no OLAT stack of the stage
 MISSING, MARKED = "missing", "marked as damaged"

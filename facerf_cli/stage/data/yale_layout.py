@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from facerf_cli.face.joint_fit import PosedCamera
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB, read_yale_b
 
 CAMERA = "P00"  # the frontal pose, the only one of the cropped database

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.stage.data.documents import is_name
-from facerf_cli.stage.data.layouts import STAGE_FORMAT
+from facerf_cli.stage.data.stage_file import STAGE_FORMAT
 from facerf_cli.stage.draft.cameras import describe_camera
 from facerf_cli.stage.draft.evidence import Evidence, look_into
 from facerf_cli.stage.draft.notes import notes_on

@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.stage.data.documents import Node
-from facerf_cli.stage.data.layouts import require_pattern
+from facerf_cli.stage.data.patterns import require_pattern
 from facerf_cli.stage.draft.cameras import Sight, look_at
 from facerf_cli.stage.draft.frames import Frames, sort_frames
 from facerf_cli.stage.draft.lamps import by_light, direction_in_name, read_lamps

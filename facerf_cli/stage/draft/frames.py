@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from facerf_cli.stage.checks.missing import other_end
 from facerf_cli.stage.data.documents import is_name
-from facerf_cli.stage.data.layouts import FIELDS
+from facerf_cli.stage.data.patterns import FIELDS
 from facerf_cli.stage.draft.naming import Naming
 
 Key = tuple[str, str, str]  # subject, camera and light, empty where the pattern does not name them

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 
 from facerf_cli.errors import UsageError
-from facerf_cli.stage.data.layouts import FIELDS, MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
+from facerf_cli.stage.data.patterns import FIELDS
+from facerf_cli.stage.data.stage_file import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.stage.draft.lamps import ANGLES
 from facerf_cli.stage.draft.parts import ANY, Part, is_crossed, parts_of
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from facerf_cli.stage.data.layouts import FIELDS
+from facerf_cli.stage.data.patterns import FIELDS
 from facerf_cli.stage.draft.evidence import Evidence
 from facerf_cli.stage.draft.frames import alike
 

@@ -17,7 +17,8 @@ from facerf_cli.stage.chart.correction import ChartCorrection, corrected
 from facerf_cli.stage.chart.measure import read_charts
 from facerf_cli.stage.chart.overlay import write_chart_overlays
 from facerf_cli.stage.chart.patches import four_turns, squares_px
-from facerf_cli.stage.data.layouts import Capture, read_capture
+from facerf_cli.stage.data.capture import Capture
+from facerf_cli.stage.data.layouts import read_capture
 from tests.stage.chart.chart_picture import CAMERA, CORNERS, SHAPE, chart_picture
 from tests.stage.chart.test_colours import kept_luminance
 from tests.stage.data.test_layouts import GOOD, capture_at

@@ -7,7 +7,7 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.data.layouts import Capture
+from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.selection import is_mended, select_frames
 from facerf_cli.stage.data.yale_b import Flash
 from facerf_cli.stage.data.yale_layout import read_yale_capture
