@@ -70,23 +70,22 @@ class _Checks:
         self._digests |= {of.digest: name for of, name in zip(frames.figures, names, strict=True)}
         doubles = {frames.light_ids[row] for rows in same_frames(frames) for row in rows}
         sound = frames.less(left_out(found) | doubles)
-        stereo = fit_stereo(sound)
+        stereo, fitted_to = fit_stereo(sound), sound.light_ids
         found += check_duplicates(frames, stereo)
         sound = frames.less(left_out(found))
         if stereo is None:
             return found
         found += check_unlit(sound, stereo)
-        sound = frames.less(left_out(found))
-        by_shading = self._of_shading(sound)
+        whole = frames.less(left_out(found))
+        if whole.light_ids != fitted_to:
+            stereo = fit_stereo(whole)
+        by_shading = [] if stereo is None else self._of_shading(whole, stereo)
         if is_disordered(by_shading):  # then nobody knows how bright a frame should be
             found = [finding for finding in found if finding.check != "unlit"]
         return found + by_shading
 
-    def _of_shading(self, frames: CameraFrames) -> list[Finding]:
-        """Findings about frames that are whole and lit, as far as shading tells."""
-        stereo = fit_stereo(frames)
-        if stereo is None:
-            return []
+    def _of_shading(self, frames: CameraFrames, stereo: Stereo) -> list[Finding]:
+        """Findings about frames that are whole and lit, as far as shading tells; `stereo` is theirs."""
         found = list(check_frames_order(frames, stereo))
         if is_disordered(found):
             return found  # no normals are to be trusted
