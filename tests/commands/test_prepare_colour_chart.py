@@ -78,7 +78,8 @@ def test_what_was_done_is_told(wrong: Path, corrected: Path, tmp_path: Path, cap
     )
     np.testing.assert_allclose(chart["matrix"], kept_luminance(CAMERA), atol=0.02)
     assert chart["delta_e_2000"]["after"]["mean"] < 0.5 < 5 < chart["delta_e_2000"]["before"]["mean"]
-    assert read_image(corrected / "colour_chart.png").pixels.max() > 0.5
+    assert read_image(corrected / chart["overlay"]).pixels.max() > 0.5
+    assert f'src="{chart["overlay"]}"' in (corrected / "index.html").read_text()
     line = ["--colour-chart", str(wrong / "chart.exr"), "--dry-run"]
     assert prepare(wrong, tmp_path / "out", *SPLIT, *line) == 0
     said = capsys.readouterr().err

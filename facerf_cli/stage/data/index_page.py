@@ -10,6 +10,7 @@ _STYLE = """
 body { font: 15px/1.5 sans-serif; margin: 2em; background: #181818; color: #ddd }
 a { color: #8bf } h2 { margin: 2em 0 0 } p { margin: .2em 0 } img { max-width: 100%; margin-top: .5em }
 table { border-spacing: 1.2em 0; margin-left: -1.2em } td, th { text-align: left }
+img.chart { max-width: 24em }
 .fair { color: #fc6 } .poor, .failed { color: #f66 }
 """
 _COLUMNS = (
@@ -40,10 +41,22 @@ def _lines(
     split_of = {name: split for split, names in dataset["splits"].items() for name in names}
     counts = ", ".join(f"{len(names)} {split}" for split, names in dataset["splits"].items())
     yield f"<p>{counts}. {len(dataset['rig']['lights'])} lights, {len(dataset['cameras'])} cameras.</p>"
+    for chart in dataset["normalisation"].get("colour_charts", ()):
+        yield from _chart(chart)
     yield f"<p>{escape(_COLUMNS)}</p>"
     for subject in dataset["subjects"]:
         yield from _subject(subject, split_of.get(subject, "in no split"), records.get(subject))
         yield from _findings(findings.get(subject, ()))
+
+
+def _chart(chart: Mapping[str, Any]) -> Iterator[str]:
+    """What a colour chart brought, and its picture."""
+    before, after = (chart["delta_e_2000"][when]["mean"] for when in ("before", "after"))
+    words = (
+        f"Colour chart of {', '.join(chart['cameras'])}: CIE delta E 2000 {after:.1f}, before {before:.1f}"
+    )
+    file = escape(chart["overlay"])
+    yield f'<p>{escape(words)}</p>\n<a href="{file}"><img class="chart" src="{file}" alt="colour chart"></a>'
 
 
 def _findings(rows: Rows) -> Iterator[str]:
