@@ -1,13 +1,27 @@
 """What a picture's header says, without its pixels: its size, kind of numbers and colour space."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import OpenImageIO as oiio
 
-from facerf_cli.colour import ColourSpace
+from facerf_cli.colour import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    LINEAR,
+    REC2020,
+    SRGB,
+    ColourSpace,
+    find_space,
+    matrix_to_rec709,
+)
 from facerf_cli.files.damage import utf8_path
-from facerf_cli.files.images import is_floating, space_of_file
+from facerf_cli.records import LOGGER_NAME
+
+_ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
@@ -34,3 +48,32 @@ def read_header(path: Path) -> Header | None:
         width, height = height, width
     floating, bits = is_floating(spec), 8 * spec.format.size()
     return Header(width, height, floating, bits, space_of_file(path, spec))
+
+
+def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
+    """What the file says of its colours; else floats are linear Rec.709 and integers sRGB."""
+    default = LINEAR if is_floating(spec) else SRGB
+    profile = spec.get_string_attribute("ICCProfile:profile_description")
+    name = profile or spec.get_string_attribute("oiio:ColorSpace")
+    if profile:
+        named = next((space for part, space in _ICC_SPACES.items() if part in profile.lower()), None)
+    elif name in ("", "Rec709"):  # the latter is OpenImageIO's word for every PNM file, whatever made it
+        named = default
+    else:
+        named = find_space(name)
+    if named is None:
+        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
+        named = default
+    chromaticities = spec.getattribute("chromaticities")
+    if chromaticities and named.is_linear and not _is_rec709(chromaticities):
+        return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
+    return named
+
+
+def _is_rec709(chromaticities: tuple[float, ...]) -> bool:
+    return bool(np.allclose(matrix_to_rec709(chromaticities), np.eye(3), atol=1e-3))
+
+
+def is_floating(spec: oiio.ImageSpec) -> bool:
+    """Whether values are of half, single or double precision."""
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)

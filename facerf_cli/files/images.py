@@ -11,24 +11,18 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.colour import (
-    ADOBE_RGB,
-    DISPLAY_P3,
     LINEAR,
     REC709_CHROMATICITIES,
-    REC2020,
-    SRGB,
-    ColourSpace,
     auto_exposure_ev,
-    find_space,
     in_blocks,
     linear_to_srgb,
-    matrix_to_rec709,
     named_space,
     to_linear_rec709,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.damage import require_whole_png, utf8_path
+from facerf_cli.files.headers import is_floating, space_of_file
 from facerf_cli.files.xmp import embed_xmp
 from facerf_cli.records import LOGGER_NAME, one_line
 
@@ -38,7 +32,6 @@ HALF_MAX = 65504.0
 JPEG_QUALITY = 95
 # Layers whose values are places, not light, keep full floats: half a float is half a millimetre at a metre.
 _LAYER_CHANNELS = {"normal": ("XYZ", "half"), "position": ("XYZ", "float"), "uv": ("UV", "float")}
-_ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
 
 Attributes = Mapping[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
@@ -165,35 +158,6 @@ def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
         raise InputError(f"{path}: {count} of {total} pixels are NaN or infinite; mend them first")
     log.warning("%s: %d pixels are NaN or infinite; their values are set to 0", path, count)
     return np.where(bad, np.float32(0), values)
-
-
-def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
-    """What the file says of its colours; else floats are linear Rec.709 and integers sRGB."""
-    default = LINEAR if is_floating(spec) else SRGB
-    profile = spec.get_string_attribute("ICCProfile:profile_description")
-    name = profile or spec.get_string_attribute("oiio:ColorSpace")
-    if profile:
-        named = next((space for part, space in _ICC_SPACES.items() if part in profile.lower()), None)
-    elif name in ("", "Rec709"):  # the latter is OpenImageIO's word for every PNM file, whatever made it
-        named = default
-    else:
-        named = find_space(name)
-    if named is None:
-        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
-        named = default
-    chromaticities = spec.getattribute("chromaticities")
-    if chromaticities and named.is_linear and not _is_rec709(chromaticities):
-        return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
-    return named
-
-
-def _is_rec709(chromaticities: tuple[float, ...]) -> bool:
-    return bool(np.allclose(matrix_to_rec709(chromaticities), np.eye(3), atol=1e-3))
-
-
-def is_floating(spec: oiio.ImageSpec) -> bool:
-    """Whether values are of half, single or double precision."""
-    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 
 
 def _metadata(spec: oiio.ImageSpec) -> dict[str, Any]:

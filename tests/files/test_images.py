@@ -159,7 +159,7 @@ def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour
 def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
     spec = oiio.ImageSpec(4, 4, 3, "uint8")
     spec.attribute("ICCProfile:profile_description", "Display P3")
-    from facerf_cli.files.images import space_of_file
+    from facerf_cli.files.headers import space_of_file
 
     assert space_of_file(tmp_path, spec) is colour.DISPLAY_P3
     spec.attribute("ICCProfile:profile_description", "Scanner 7")
