@@ -81,5 +81,7 @@ def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:
     told = lamps[:, 2] > -0.2
     assert not head_path(shading, told, lamps).any()
     assert not head_path(shading + jumps, told, lamps).any()
+    listed = np.argsort(lamps[:, 0])  # then errors of shading bend slowly, too
+    assert not head_path(shading[listed], told[listed], lamps[listed]).any()
     off = np.hypot(*(head_path(shading + path, told, lamps) - path).T)
     assert off[told].mean() < 0.4 < np.hypot(*path.T).mean() and off[~told][:10].max() < 1.0
