@@ -14,7 +14,7 @@ _TIMES = (8.0, 20.0, 50.0)  # frames over which a path bends
 _REACHES_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # standard deviation of a path, down and right each
 _MODELS_PX, _MODEL_WIDTH = (0.3, 0.6), 0.6  # and of the shading model's error
 _OWN_PX = (0.15, 0.4, 1.0, 2.0)  # and of what each frame has beside
-_SURE = 2.0  # natural log by which a path must be likelier than none
+_SURE = 5.0  # natural log by which a path must be likelier than none; less sees paths in Extended Yale B
 
 
 def head_path(moved_px: np.ndarray, trusted: np.ndarray, directions: np.ndarray) -> np.ndarray:
