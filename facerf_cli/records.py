@@ -20,6 +20,9 @@ COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/composit
 # The same for pictures that are computed throughout.
 COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
 
+# The same for sums of photographs.
+_CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeCapture"
+
 # Shared by the log and the progress bars, so that they do not overwrite each other.
 STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
@@ -52,6 +55,15 @@ class Provenance:
             "facerf:face_model_licence": self.face_model_licence,
         }
         return {name: value for name, value in attributes.items() if value != ""}
+
+
+def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "") -> dict[str, Any]:
+    """Metadata of pictures that are weighted sums of a stack's, by the stack's own.
+
+    Under a light that never was they are synthetic, be the stack made of photographs.
+    """
+    default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
+    return default.attributes() | dict(stack) | Provenance(source_type="").attributes()
 
 
 def json_line(row: Mapping[str, Any]) -> str:

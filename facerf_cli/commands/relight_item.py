@@ -22,7 +22,7 @@ from facerf_cli.commands.photo import (
 from facerf_cli.commands.shots import Sampling, Shot, light_photos, light_stack
 from facerf_cli.commands.values import parse_pose
 from facerf_cli.errors import InputError
-from facerf_cli.records import Provenance
+from facerf_cli.records import attributes_of_sum
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -139,8 +139,7 @@ class Relight:
             batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
             return weigh_batches(batches, weights[rows])
 
-        made = Provenance(item.input_path.name).attributes()
-        metadata = made | stack.header.metadata | Provenance(source_type="").attributes()
+        metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
         return dict(self._write_shots(item, "", canvas, relit, metadata)), facts
 
     def _stack_canvas(self, item: Item, stack: "OlatStack") -> tuple[Canvas | ImageCanvas, dict[str, Any]]:

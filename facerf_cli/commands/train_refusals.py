@@ -8,7 +8,6 @@ from facerf_cli.errors import UsageError
 if TYPE_CHECKING:
     import typer
 
-_BAKED = ("heads_from", "heads", "bank")
 _IN_CHART = ("reflectance", "light-features", "diffuse-sh")  # stages that learn from textures alone
 _STAGES = {  # that an option means something to
     "vgg_weights": ("joint",),

@@ -79,7 +79,7 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
 
 
 def is_olat_stack(path: Path) -> bool:
-    """Whether a file is an OLAT stack of ours; False for whatever cannot be opened."""
+    """Whether a file is an OLAT stack of ours; no for what cannot be opened, an InputError by `utf8_path`."""
     stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
         oiio.geterror()  # or it prints its own words at exit

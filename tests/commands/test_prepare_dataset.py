@@ -134,6 +134,7 @@ def test_the_stack_is_relit_like_any_other(prepared: Dataset, tmp_path: Path) ->
     relit = read_image(tmp_path / "out/C2_white.exr")
     assert np.abs(relit.pixels - header.source)[seen].max() < 2e-3 * header.source.max()
     assert relit.metadata["facerf:synthetic"] == 1 and relit.metadata["facerf:input"] == "0001/C2"
+    assert relit.metadata["IPTC:DigitalSourceType"].endswith("/compositeCapture")  # of photographs
     assert relit.metadata["facerf:face_model_licence"] == load_face_model().licence
 
 

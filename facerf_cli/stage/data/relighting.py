@@ -18,7 +18,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import HALF_MAX, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.records import Provenance
+from facerf_cli.records import attributes_of_sum
 from facerf_cli.stage.data.dataset import Dataset
 from facerf_cli.stage.data.pair_weights import pair_weights
 from facerf_cli.stage.data.recipes import Pair, picture_path
@@ -45,11 +45,11 @@ def relight_subject(
         rows = [row for row in todo if pairs[row].source_camera == camera]
         path = dataset.stack_path(pairs[rows[0]].subject, camera)
         pictures = relit_pictures(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
-        of_stack = read_olat_header(path).metadata
+        made = attributes_of_sum(read_olat_header(path).metadata)
         for row, picture in zip(rows, pictures, strict=True):
             pixels = picture.permute(1, 2, 0).float().numpy()
-            metadata = of_stack | _attributes(pairs[row])
-            write_exr(picture_path(dataset, *pairs[row].key), pixels, metadata=metadata)
+            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
+            write_exr(picture_path(dataset, *pairs[row].key), pixels, metadata=made | recipe)
     return len(todo)
 
 
@@ -61,12 +61,6 @@ def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
     pair = row if isinstance(row, Pair) else Pair.from_row(dict(row))
     weights = pair_weights(dataset, pair)
     return next(relit_pictures(dataset.stack_path(pair.subject, pair.source_camera), weights[None]))
-
-
-def _attributes(pair: Pair) -> dict[str, str | int | float]:
-    """The pair's recipe and the software; where the face comes from, its stack says."""
-    named = {f"facerf:{name}": value for name, value in asdict(pair).items()}
-    return Provenance(source_type="").attributes() | named
 
 
 def relit_pictures(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY_BYTES) -> Iterator[Tensor]:

@@ -73,6 +73,7 @@ def test_written_sources_are_their_rows_bit_for_bit(fresh: Dataset) -> None:
         assert picture.metadata["facerf:envmap"] == row["envmap"] and picture.pixels.max() > 0.02
         of_stack = read_olat_header(fresh.stack_path(row["subject"], row["source_camera"])).metadata
         assert picture.metadata.items() >= of_stack.items() and picture.metadata["facerf:face_model"]
+        assert picture.metadata["facerf:synthetic"] == 1
 
 
 def test_weights_are_made_anew_where_they_are_missing(fresh: Dataset) -> None:
