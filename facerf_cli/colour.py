@@ -18,6 +18,7 @@ from facerf_cli.errors import UsageError
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _P3_CHROMATICITIES = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.3290)
 _REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+_AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 _AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 
@@ -25,6 +26,8 @@ _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _ADOBE_GAMMA = 563 / 256
 _BLOCK_VALUES = 2**18
+# The same primaries, what no camera's or display's go beyond, and the least that spans colours.
+_SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # where that percentile of the luminance is put
@@ -77,6 +80,8 @@ ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, _adobe_to_linear)
 ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
 REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
+LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
+ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
 
 # Compared without case, spaces and punctuation; with the interchange names that OpenImageIO uses.
 _ALIASES = {
@@ -87,6 +92,8 @@ _ALIASES = {
     ACESCG: "acescg linap1 linap1scene",
     REC2020: "rec2020 bt2020",
     LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
+    LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
+    ACES: "aces20651 linap0 linap0scene",
 }
 _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
 
@@ -97,6 +104,24 @@ def find_space(name: str) -> ColourSpace | None:
     if plain in _BY_ALIAS:
         return _BY_ALIAS[plain]
     return ColourSpace(name, None) if name.casefold() in _ocio_names() else None
+
+
+def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
+    """The linear space of these primaries and white, under its name where it is known here.
+
+    None where they are no such thing: white is to lie within the triangle of the primaries.
+    """
+    xy = np.array(chromaticities, float).reshape(4, 2)
+    if not (np.abs(xy) < _LARGEST_XY).all() or not (np.abs(xy[:, 1]) > _LEAST_XY).all():
+        return None
+    columns = np.vstack([xy.T, np.ones(4)])
+    is_flat = abs(np.linalg.det(columns[:, :3])) < _LEAST_XY
+    if is_flat or not (np.linalg.solve(columns[:, :3], columns[:, 3]) > _LEAST_XY).all():
+        return None
+    for space in _ALIASES:
+        if space.is_linear and np.allclose(np.array(space.chromaticities), xy.ravel(), 0, _SAME_XY):
+            return space
+    return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
 
 
 def named_space(name: str) -> ColourSpace:

@@ -18,6 +18,8 @@ ORACLE_NAMES = {
     ours.ACESCG: "ACEScg",
     ours.REC2020: "ITU-R BT.2020",
     ours.LINEAR_REC2020: "ITU-R BT.2020",
+    ours.LINEAR_P3: "Display P3",
+    ours.ACES: "ACES2065-1",
     ours.DISPLAY_P3: "Display P3",
     ours.LINEAR: "ITU-R BT.709",
 }
@@ -65,7 +67,9 @@ def test_srgb_there_and_back_beyond_the_gamut() -> None:
     np.testing.assert_allclose(ours.srgb_to_linear(ours.linear_to_srgb(RGB)), RGB, rtol=2e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["ACEScg", "lin_rec2020", "sRGB", "Display P3", "linear", "Adobe RGB"])
+@pytest.mark.parametrize(
+    "name", ["ACES2065-1", "ACEScg", "lin_rec2020", "lin_p3d65", "sRGB", "Display P3", "linear", "Adobe RGB"]
+)
 def test_openColorIO_agrees(name: str) -> None:
     ocio_names = {"Display P3": "srgb_p3d65_scene", "linear": "lin_rec709_scene", "sRGB": "srgb_rec709_scene",
                   "Adobe RGB": "g22_adobergb_scene"}  # fmt: skip

@@ -4,7 +4,6 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.colour import (
@@ -15,7 +14,7 @@ from facerf_cli.colour import (
     SRGB,
     ColourSpace,
     find_space,
-    matrix_to_rec709,
+    linear_space,
 )
 from facerf_cli.files.damage import utf8_path
 from facerf_cli.records import LOGGER_NAME
@@ -64,14 +63,13 @@ def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     if named is None:
         log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
         named = default
-    chromaticities = spec.getattribute("chromaticities")
-    if chromaticities and named.is_linear and not _is_rec709(chromaticities):
-        return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
-    return named
-
-
-def _is_rec709(chromaticities: tuple[float, ...]) -> bool:
-    return bool(np.allclose(matrix_to_rec709(chromaticities), np.eye(3), atol=1e-3))
+    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
+    if not chromaticities or not named.is_linear:
+        return named
+    by_primaries = linear_space(chromaticities)
+    if by_primaries is None:
+        log.warning("%s: primaries of no colours that can be, taken for those of %s", path, named.name)
+    return named if by_primaries in (None, LINEAR) else by_primaries
 
 
 def is_floating(spec: oiio.ImageSpec) -> bool:

@@ -1,5 +1,6 @@
 """Headers of pictures, read without their pixels."""
 
+import math
 import os
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from facerf_cli.colour import LINEAR, SRGB
+from facerf_cli.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.errors import InputError
 from facerf_cli.files.headers import read_header
 from facerf_cli.files.images import read_image, write_display, write_exr
@@ -37,6 +38,48 @@ def test_the_size_is_upright(tmp_path: Path) -> None:
     stream.close()
     header = read_header(tmp_path / "a.jpg")
     assert header is not None and (header.width_px, header.height_px) == (6, 9)
+
+
+def write_primaries(path: Path, chromaticities: tuple[float, ...], kind: str = "float[8]") -> Path:
+    spec = oiio.ImageSpec(9, 6, 3, "half")
+    spec.attribute("chromaticities", oiio.TypeDesc(kind), chromaticities)
+    stream = oiio.ImageOutput.create(path.name)
+    assert stream.open(str(path), spec) and stream.write_image(np.full((6, 9, 3), 0.5, np.float32))
+    stream.close()
+    return path
+
+
+@pytest.mark.parametrize(
+    "space", [ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020], ids=lambda space: space.name
+)
+def test_primaries_that_are_known_have_their_name(tmp_path: Path, space: ColourSpace) -> None:
+    assert space.chromaticities is not None
+    path = write_primaries(tmp_path / "a.exr", space.chromaticities)
+    header = read_header(path)
+    assert header is not None and header.space == space
+    assert read_image(path).colourspace_name == space.name
+
+
+@pytest.mark.parametrize(
+    "chromaticities",
+    [
+        (0.3, 0.3) * 4,
+        (0.0,) * 8,
+        (math.nan,) * 8,
+        (1e30, 0.3, 0.3, 1e30, 0.1, 0.1, 0.3, 0.3),
+        (0.6, 0.0, 0.3, 0.6, 0.1, 0.1, 0.3, 0.3),
+        (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.7, 0.7),
+    ],
+    ids=["one point", "zero", "NaN", "huge", "a primary without luminance", "white outside"],
+)
+def test_primaries_that_span_no_colours_are_left(
+    tmp_path: Path, chromaticities: tuple[float, ...], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_primaries(tmp_path / "a.exr", chromaticities)
+    header = read_header(path)
+    assert header is not None and header.space == LINEAR
+    assert "no colours that can be" in caplog.text
+    assert read_image(path).pixels == pytest.approx(0.5)
 
 
 def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
