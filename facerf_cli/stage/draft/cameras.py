@@ -22,6 +22,7 @@ class Sight:
 
     sizes: Counter[tuple[int, int]]
     spaces: Counter[str | None]  # None where the header does not tell
+    nameless: int  # that have primaries of no space known here
     unread: int
 
 
@@ -33,6 +34,7 @@ def look_at(paths: Sequence[Path]) -> Sight:
     return Sight(
         Counter((header.width_px, header.height_px) for _, header in read),
         Counter(_space_name(path, header) for path, header in read),
+        sum(find_space(header.space.name) is None for _, header in read),
         len(headers) - len(read),
     )
 

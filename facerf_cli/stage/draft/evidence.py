@@ -89,16 +89,17 @@ def _require_sizes(sights: Mapping[str, Sight]) -> None:
 def _find_rig(folder: Path, scan: Scan, frames: Frames) -> Rig:
     """Directions from a list of lights, else from the lights' names."""
     lights, unused = frames.ids("light"), ""
-    for name in scan.lists[:1]:
+    if scan.lists:
+        name = scan.lists[0]
+        stems = {PurePosixPath(path).stem: light for (_, _, light), path in frames.paths.items()}
         try:
             lamps = read_lamps(folder / name)
         except InputError as error:
             unused = str(error)
-            continue
-        stems = {PurePosixPath(path).stem: light for (_, _, light), path in frames.paths.items()}
-        if found := by_light(lamps, lights, stems):
-            lengths = [lamp.length for lamp in lamps]
-            return Rig(found, name, (min(lengths), max(lengths)))
-        unused = f"{folder / name}: its {len(lamps)} lines name none of the {len(lights)} lights"
+        else:
+            if found := by_light(lamps, lights, stems):
+                lengths = [lamp.length for lamp in lamps]
+                return Rig(found, name, (min(lengths), max(lengths)))
+            unused = f"{folder / name}: its {len(lamps)} lines name none of the {len(lights)} lights"
     named = {light: direction for light in lights if (direction := direction_in_name(light))}
     return Rig(named, unused=unused)

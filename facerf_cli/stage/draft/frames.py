@@ -35,7 +35,7 @@ class Frames:
 def sort_frames(paths: Iterable[str], naming: Naming) -> Frames:
     """Which of the paths are frames, and of what."""
     frames = Frames({}, Counter(), Counter(), [], [])
-    for path in sorted(paths, key=natural_order):
+    for path in sorted(paths):
         match, loose = naming.strict.fullmatch(path), naming.loose.fullmatch(path)
         if loose and (end := other_end(loose["light"])):
             (frames.full if end == "full" else frames.ambient)[loose["light"]] += 1

@@ -19,7 +19,7 @@ from facerf_cli.light.sphere import azel_to_direction
 LIST_SUFFIX, LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
 # A+035E-20, az35_el-20, azimuth_35_elevation_-20: letters alone stand for angles only before a sign.
 ANGLES = re.compile(
-    r"(?:a(?=[+-])|az(?:imuth)?)[_=]?(?P<azimuth>[+-]?[0-9]{1,3}(?:\.[0-9]+)?)[_, -]?"
+    r"(?<![^\W\d_])(?:a(?=[+-])|az(?:imuth)?)[_=]?(?P<azimuth>[+-]?[0-9]{1,3}(?:\.[0-9]+)?)[_, -]?"
     r"(?:e(?=[+-])|el(?:ev(?:ation)?)?)[_=]?(?P<elevation>[+-]?[0-9]{1,3}(?:\.[0-9]+)?)",
     re.IGNORECASE,
 )
@@ -44,6 +44,8 @@ def direction_in_name(name: str) -> Direction | None:
     if match is None:
         return None
     azimuth_deg, elevation_deg = np.float64(match["azimuth"]), np.float64(match["elevation"])
+    if abs(azimuth_deg) > 360 or abs(elevation_deg) > 90:
+        return None
     return _rounded(azel_to_direction(azimuth_deg, elevation_deg).tolist())
 
 

@@ -7,7 +7,7 @@ the lights come last, the subjects first.
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, permutations
+from itertools import combinations, permutations, takewhile
 
 from facerf_cli.errors import UsageError
 from facerf_cli.stage.data.patterns import FIELDS
@@ -43,6 +43,8 @@ def find_naming(paths: Sequence[str]) -> Naming:
     hints = _hints(parts)
     for place, (piece, _, _) in same.items():
         hints[piece] = hints[piece] or hints[place]
+    if _ends_in_lights(varying, hints):
+        hints[varying[-1]] = ""
     fields = _assigned(parts, varying, hints)
     by_place = tuple(field for place, field in fields.items() if hints[place] != field)
     settled = len(fields) == 1 or (len(fields) == len(FIELDS) and len(by_place) == 1)  # nothing else is left
@@ -98,7 +100,7 @@ def _shown(part: Part) -> str:
 
 
 def _hints(parts: Sequence[Part]) -> list[str]:
-    """By part, the field that its letters, or those before it, speak of; empty where none do."""
+    """By part, the field that the word right before its number speaks of; empty where none does."""
     hints, before = [], ""
     for part in parts:
         hints.append(_hint(part, before))
@@ -109,13 +111,19 @@ def _hints(parts: Sequence[Part]) -> list[str]:
 def _hint(part: Part, before: str) -> str:
     if all(ANGLES.search(text) for text in part.values):
         return "light"
-    words = {re.sub(r"[\W\d_].*", "", text, flags=re.DOTALL) for text in part.values}
-    if words == {""}:
-        words = {re.split(r"[\W\d_]+", before.rstrip("_- ."))[-1]}
-    if len(words) > 1 or not all(re.search("[0-9]", text) for text in part.values):
+    texts = [text.casefold() for text in part.values]
+    pairs = takewhile(lambda pair: pair[0] == pair[1], zip(min(texts), max(texts), strict=False))
+    same = "".join(letter for letter, _ in pairs).rstrip("0123456789")
+    if not all(re.match("[0-9]", text[len(same) :]) for text in texts):
         return ""
-    word = words.pop().lower()
+    word = re.split(r"[\W\d_]+", (same or before.casefold()).rstrip("_- ."))[-1]
     return next((field for field, known in _WORDS.items() if {word, word.removesuffix("s")} & {*known}), "")
+
+
+def _ends_in_lights(varying: Sequence[int], hints: Sequence[str]) -> bool:
+    """Whether the last part is the light against its word: one is needed, and `anna/face_1` is no face 1."""
+    told = [hints[place] for place in varying]
+    return "light" not in told and (len(told) < len(FIELDS) or told[-1] == "subject")
 
 
 def _assigned(parts: Sequence[Part], varying: Sequence[int], hints: Sequence[str]) -> dict[int, str]:

@@ -47,8 +47,8 @@ def _gaps(content: Mapping[str, Any]) -> Iterator[str]:
                 yield f"{name} of {len(empty)} of {_count(len(entries), key[:-1])} ({_WANTED[name]})"
     if content["colour_space"] is None:
         yield (
-            "colour_space: the headers do not tell it; 'linear' where values are in proportion to light, "
-            "'sRGB' where pictures were made to be looked at"
+            "colour_space: the headers do not settle it; 'linear' where values are in proportion to light "
+            "and of Rec.709's primaries, 'sRGB' where pictures were made to be looked at"
         )
 
 
@@ -65,6 +65,12 @@ def _assumed(evidence: Evidence) -> Iterator[str]:
     yield "cameras: K is a guess, with a focal length of 4 times the longer side; calibrate them"
     if len(evidence.sights) == 1:
         yield "cameras: the one camera is the world: x to the picture's right, y up, z toward the camera"
+    if nameless := sum(sight.nameless for sight in evidence.sights.values()):
+        read = sum(sight.sizes.total() for sight in evidence.sights.values())
+        yield (
+            f"colour_space: {nameless} of {_count(read, 'header')} have primaries that no space known here "
+            "has, so no name is right; write these pictures anew as linear Rec.709"
+        )
     if evidence.colour_space:
         yield f"colour_space: {evidence.colour_space}, by the headers of some pictures"
     yield "black_level: 0 is assumed"

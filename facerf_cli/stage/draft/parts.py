@@ -3,7 +3,7 @@
 A name is cut into runs of digits, runs of letters and single other characters; an azimuth and elevation such
 as A+035E-20 stay one. Names that are cut alike are laid over each other. What lies between separators and
 varies is one part, and so is a whole folder's or file's name in which only one thing varies: `light_017` is a
-light's id as it stands.
+light's id as it stands. In a file's name a number that stays is of something else, as in `cam01_L017`.
 """
 
 import re
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from pathlib import PurePosixPath
+from random import Random
 
 from facerf_cli.stage.draft.lamps import ANGLES
 
@@ -23,6 +24,7 @@ _WORD = ("digits", "letters")  # the kinds that separators part
 _ALIKE = 0.6  # of the names: with fewer cut alike, a folder's or file's name is one part as it stands
 _CROSSED = 1.2  # pairs of two parts over the values of either: about 1 where one says what the other is
 _NEARLY_ALL = 0.9
+_MOST_PATHS = 10_000  # that are cut, which takes up to 20 kB a name; more than a capture has lights
 ANY = "[^/]+"
 
 Cut = tuple[tuple[str, str], ...]  # kind and text of each token
@@ -49,9 +51,11 @@ class Part:
 def parts_of(paths: Iterable[str]) -> list[Part]:
     """The parts, in order, of the paths that are named alike: each / is one, and the last is the suffix.
 
-    The paths, with / between names, are as deep as most are and end as most do.
+    The paths, with / between names, are as deep as most are and end as most do; of very many, some.
     """
-    rows = [path.split("/") for path in _of_one_kind(paths)]
+    alike = _of_one_kind(paths)
+    some = alike if len(alike) <= _MOST_PATHS else Random(0).sample(sorted(alike), _MOST_PATHS)
+    rows = [path.split("/") for path in some]
     suffix = PurePosixPath(rows[0][-1]).suffix
     names = [(*row[:-1], row[-1].removesuffix(suffix)) for row in rows]
     cuts: list[dict[str, Cut]] = []
@@ -120,7 +124,7 @@ def _part(column: Sequence[tuple[str, str]]) -> Part:
 def _whole_where_one_varies(parts: Sequence[Part], fixed_too: bool) -> list[Part]:
     """The parts, those put together that say the same; one part where no two are left that vary.
 
-    The fixed parts of a file's name stay as they are, for one of them may name the only camera.
+    Without `fixed_too` what is fixed alone stays as it is, and so does a fixed number: it may name a camera.
     """
     apart = list(parts)
     places = [place for place, part in enumerate(apart) if part.varies]
@@ -128,7 +132,8 @@ def _whole_where_one_varies(parts: Sequence[Part], fixed_too: bool) -> list[Part
         if not is_crossed(apart[first], apart[second]) and not _counts_files(apart[first], apart[second]):
             apart[first : second + 1] = [_together(apart[first : second + 1])]
     varying = sum(part.varies for part in apart)
-    return [_together(apart)] if varying == 1 or (fixed_too and not varying) else apart
+    numbered = any(re.search("[0-9]", part.texts[0]) for part in apart if not part.varies)
+    return [_together(apart)] if varying < 2 and (fixed_too or (varying and not numbered)) else apart
 
 
 def _counts_files(a: Part, b: Part) -> bool:

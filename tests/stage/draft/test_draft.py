@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facerf_cli.colour import ACESCG
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.stage.data.layouts import read_capture
@@ -128,6 +129,29 @@ def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None
         stream.close()
     stage = draft_stage(folder, SUFFIXES)
     assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
+
+
+def with_primaries(folder: Path, chromaticities: tuple[float, ...]) -> Path:
+    """Linear pictures whose headers have other primaries."""
+    import OpenImageIO as oiio
+
+    for path in stage_at(folder).rglob("*.exr"):
+        spec = oiio.ImageSpec(8, 6, 3, "half")
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), chromaticities)
+        stream = oiio.ImageOutput.create(path.name)
+        assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.float32))
+        stream.close()
+    return folder
+
+
+def test_primaries_are_named_or_said_to_be_unknown(tmp_path: Path) -> None:
+    assert ACESCG.chromaticities is not None
+    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES)
+    assert stage["colour_space"] == "ACEScg" and noted(stage, "ACEScg, by the headers")
+    camera_s = (0.78, 0.31, 0.22, 0.88, 0.09, -0.08, 0.3127, 0.329)
+    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES)
+    assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
+    assert noted(stage, "16 of 16 headers have primaries that no space known here has")
 
 
 def test_what_is_amiss_is_said(tmp_path: Path) -> None:

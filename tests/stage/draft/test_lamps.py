@@ -22,6 +22,11 @@ HALF, ROOT = 0.5, math.sqrt(3) / 2
         ("Azimuth_180.0_Elevation_0.0", [0, 0, -1]),
         ("A030E10", None),  # letters alone may be anything
         ("L034", None),
+        ("data+3e+5", None),
+        ("L_sea+1e-3", None),
+        ("az720_el500", None),
+        ("az400_el0", None),
+        ("az0_el91", None),
     ],
 )
 def test_angles_in_a_name(name: str, direction: list[float] | None) -> None:

@@ -6,6 +6,7 @@ from itertools import product
 import pytest
 
 from facerf_cli.errors import UsageError
+from facerf_cli.stage.draft import parts
 from facerf_cli.stage.draft.frames import Frames, alike, sort_frames
 from facerf_cli.stage.draft.naming import Naming, find_naming
 
@@ -44,6 +45,51 @@ NAMES: dict[str, tuple[list[str], str, tuple[str, str, str], str]] = {
         "{subject}/{light}.exr",
         ("anna", "", "L001"),
         "subject",
+    ),
+    "one camera, in the file's name": (
+        crossed("{s}/cam01_L{l:03}.exr", ["anna", "bob"], [1]),
+        "{subject}/{camera}_{light}.exr",
+        ("anna", "cam01", "L001"),
+        "subject",
+    ),
+    "its number alone": (
+        crossed("s{s}/cam01_{l:03}.exr", cameras=[1]),
+        "{subject}/{camera}_{light}.exr",
+        ("s1", "cam01", "001"),
+        "light",
+    ),
+    "a light's word apart": (
+        crossed("{s}/view0_led_{l}.png", ["anna", "bob"], [1]),
+        "{subject}/{camera}_led_{light}.png",
+        ("anna", "view0", "1"),
+        "subject",
+    ),
+    "a word before the light's": (
+        crossed("{s}/scan_light_{l}.png", ["anna", "bob"], [1]),
+        "{subject}/{light}.png",
+        ("anna", "", "scan_light_1"),
+        "subject",
+    ),
+    "a fixed number that says nothing": (
+        crossed("{s}/face01_2021_light{l}.png", ["anna", "bob"], [1]),
+        "{subject}/face01_2021_{light}.png",
+        ("anna", "", "light1"),
+        "subject",
+    ),
+    **{
+        f"files of {word}": (
+            crossed(f"{{s}}/{word}{{l:03}}.png", ["anna", "bob", "carl"], [1]),
+            "{subject}/{light}.png",
+            ("anna", "", f"{word}001"),
+            "subject light",
+        )
+        for word in ("face_", "s_", "C_", "c")
+    },
+    "faces by cameras": (
+        crossed("{s}/cam{c}/face_{l:03}.png", ["anna", "bob", "carl"]),
+        "{subject}/{camera}/{light}.png",
+        ("anna", "cam1", "face_001"),
+        "subject light",
     ),
     "its name stands": (
         crossed("{s}/C0/L{l}.exr", cameras=[0]),
@@ -151,6 +197,14 @@ def test_the_pattern_gives_the_paths_again(paths: list[str]) -> None:
     naming, frames = read(paths)
     for (subject, camera, light), path in frames.paths.items():
         assert filled(naming.pattern, {"subject": subject, "camera": camera, "light": light}) == path
+
+
+def test_of_many_names_some_tell_the_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known of each name takes memory: 20 kB of one of 250 letters."""
+    monkeypatch.setattr(parts, "_MOST_PATHS", 100)
+    naming, frames = read(crossed("s{s:02}/cam{c}/light_{l:03}.exr", range(40)))
+    assert naming.pattern == "{subject}/{camera}/{light}.exr"
+    assert len(frames.paths) == 40 * len(CAMERAS) * len(LIGHTS)
 
 
 def test_pictures_that_do_not_fit_are_told_apart() -> None:
