@@ -112,7 +112,7 @@ def prepare_dataset(
     from facerf_cli.stage.data.splits import Split
 
     if describe:
-        describe_capture(capture, output)
+        describe_capture(context, capture, output, dry_run)
         return
     if output is None:
         raise UsageError("give -o DATASET, a folder for the data (or --describe, for a draft of stage.json)")
