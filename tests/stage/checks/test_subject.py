@@ -63,6 +63,16 @@ def only(found: list[Finding]) -> Finding:
     return found[0]
 
 
+def about_y(angle_rad: float) -> np.ndarray:
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
+
+
+def pose(turn: np.ndarray) -> list[list[float]]:
+    """World to camera of one that is turned."""
+    return np.c_[np.diag([1, -1, -1]) @ turn, [0, 0, 1.2]].tolist()
+
+
 def frame(folder: Path, light: int) -> Path:
     return folder / SUBJECT / CAMERA / f"{IDS[light]}.exr"
 
@@ -209,18 +219,16 @@ def test_a_mirrored_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> 
 
 
 def test_a_turned_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    angle = np.radians(40)
-    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-    found = findings(write_stage(tmp_path / "s", sound, lights=lights_of(directions() @ turn.T)))
+    turned = directions() @ about_y(np.radians(40)).T
+    found = findings(write_stage(tmp_path / "s", sound, lights=lights_of(turned)))
     assert found[0].check == "rig" and float(found[0].figures["turned_deg"]) == pytest.approx(40, abs=6)
 
 
 @pytest.mark.parametrize(("first", "second"), [("C0", "C1"), ("C1", "C0")])
 def test_two_cameras_under_each_others_names(tmp_path: Path, first: str, second: str) -> None:
     """The egg turns with the camera; the lamps do not, and tell one from the other."""
-    turn = np.array([[np.cos(0.4), 0, np.sin(0.4)], [0, 1, 0], [-np.sin(0.4), 0, np.cos(0.4)]])
-    aside = camera_of("C1")
-    aside["world_to_camera"] = np.c_[np.diag([1, -1, -1]) @ turn, [0, 0, 1.2]].tolist()
+    turn = about_y(0.4)
+    aside = camera_of("C1") | {"world_to_camera": pose(turn)}
     folder = write_stage(tmp_path / "s", cameras=[camera_of("C0"), aside])
     (folder / SUBJECT / CAMERA).rename(folder / SUBJECT / "front")
     (folder / SUBJECT / second).mkdir()
@@ -232,6 +240,26 @@ def test_two_cameras_under_each_others_names(tmp_path: Path, first: str, second:
         [] if first == "C0" else [("camera", "C0"), ("camera", "C1")]
     )
     assert not found or ("C1" in found[0].words and stopping(found))
+
+
+@pytest.mark.parametrize(("misplaced", "check", "camera"), [((1,), "camera", "C1"), ((0, 1, 2), "rig", "C0")])
+def test_a_camera_whose_pose_is_wrong_is_named_and_that_of_all_is_the_rigs(
+    tmp_path: Path, misplaced: tuple[int, ...], check: str, camera: str
+) -> None:
+    true_rad = (0.0, 0.4, -0.4)
+    told_rad = [true + (1.0 if place in misplaced else 0.0) for place, true in enumerate(true_rad)]
+    cameras = [
+        camera_of(f"C{place}") | {"world_to_camera": pose(about_y(angle))}
+        for place, angle in enumerate(told_rad)
+    ]
+    folder = write_stage(tmp_path / "s", cameras=cameras)
+    for place, angle in enumerate(true_rad[1:], 1):
+        (folder / SUBJECT / f"C{place}").mkdir()
+        for light, picture in zip(IDS, pictures(directions() @ about_y(angle).T), strict=True):
+            write_frame(folder / SUBJECT / f"C{place}" / f"{light}.exr", picture)
+    found = only(findings(folder))
+    assert (found.check, found.camera) == (check, camera) and stopping([found])
+    assert float(found.figures["turned_deg"]) == pytest.approx(57, abs=6) and "world_to_camera" in found.words
 
 
 def test_without_a_face_a_mirrored_rig_shows_in_the_shape(
