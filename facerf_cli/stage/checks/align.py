@@ -53,11 +53,10 @@ def align_shifts(
 def head_motion(frames: CameraFrames) -> np.ndarray:
     """How far the head has moved in each frame [L, 2], pixels of the frames down and right."""
     path = _path(frames)
-    own = np.zeros(path.shape)
-    if fit_stereo(frames) is None:
-        return own
-    weights = weights_of_others(frames.directions)
     asked = frames.directions[:, 2] > _OWN_FRONT
+    if not asked.any() or fit_stereo(frames) is None:
+        return path
+    own, weights = np.zeros(path.shape), weights_of_others(frames.directions)
     for size in _OWN_ROUNDS:
         grey = _coarser(_moved_back(frames, path + own), size).grey
         predicted = np.tensordot(weights.astype(np.float32), grey, 1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from facerf_cli.stage.checks import path as path_module
 from facerf_cli.stage.checks.align import align_shifts, with_alignment
 from facerf_cli.stage.checks.path import head_path
 from facerf_cli.stage.data.layouts import read_capture
@@ -66,6 +67,27 @@ def test_a_shift_in_the_capture_moves_its_frame_alone(stage: Path) -> None:
 
 def test_a_still_head_is_left_alone(tmp_path: Path) -> None:
     assert not align_shifts(read_capture(write_stage(tmp_path / "s")), SUBJECT, CAMERA, set())
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_camera_that_sees_no_lamp_in_front_is_left_alone(tmp_path: Path) -> None:
+    capture = read_capture(write_stage(tmp_path / "s"))
+    behind = replace(capture, directions_world=capture.directions_world * [1, 1, -1])
+    assert not align_shifts(behind, SUBJECT, CAMERA, set(IDS[35:]))
+
+
+def test_a_path_of_thousands_of_frames_costs_no_more_than_hundreds(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, turn = np.random.default_rng(0), np.arange(2000) * 2.399963
+    lamps = np.stack([np.cos(turn), np.sin(turn), np.full(2000, 1.0)], 1) / np.sqrt(2)
+    path = 2 * np.stack([np.sin(np.arange(2000) / 40), np.cos(np.arange(2000) / 50)], 1)
+    sizes, likelihood = [], path_module._log_likelihood
+    monkeypatch.setattr(
+        path_module, "_log_likelihood", lambda *given: sizes.append(len(given[1])) or likelihood(*given)
+    )
+    measured = path + generator.normal(size=path.shape) * 0.2
+    off = np.hypot(*(head_path(measured, np.ones(2000, bool), lamps) - path).T)
+    assert off.mean() < 0.1 and max(sizes) <= 300
+    assert not head_path(measured, np.zeros(2000, bool), lamps).any()
 
 
 def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:
