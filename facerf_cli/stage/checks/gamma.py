@@ -12,6 +12,7 @@ import numpy as np
 
 from facerf_cli.stage.checks.findings import Finding
 from facerf_cli.stage.checks.frames import CameraFrames
+from facerf_cli.stage.checks.parabola import vertex
 
 EXPONENTS = np.array([0.35, 0.4, 0.45, 0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8, 2.2, 2.6, 3.0])
 # Linear frames of Extended Yale B's subjects 05, 15 and 22 come out at 0.85 to 1, synthetic ones at 1;
@@ -48,7 +49,7 @@ def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> Curve | None:
         return None
     errors = np.array([_error(values, used, frames.directions, exponent) for exponent in EXPONENTS])
     place = int(errors.argmin())
-    exponent = _vertex(np.log(EXPONENTS), errors, place)
+    exponent = vertex(np.log(EXPONENTS), errors, place)
     at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
     return Curve(float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9))
 
@@ -67,14 +68,6 @@ def _error(values: np.ndarray, used: np.ndarray, directions: np.ndarray, exponen
         weights = (shaded > _FACING * np.linalg.norm(g, axis=1)) / (1 + (residual / (2 * spread)) ** 2)
     back = np.maximum(shaded, 0) ** (1 / exponent)
     return float(np.median(np.abs(values - back)[used]))
-
-
-def _vertex(x: np.ndarray, y: np.ndarray, place: int) -> float:
-    """Where the parabola through the least value and its neighbours is least."""
-    if not 0 < place < len(x) - 1:
-        return float(x[place])
-    a, b, _ = np.polyfit(x[place - 1 : place + 2], y[place - 1 : place + 2], 2)
-    return float(np.clip(-b / (2 * a), x[place - 1], x[place + 1])) if a > 0 else float(x[place])
 
 
 def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:

@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from facerf_cli.stage.checks.findings import Finding
 from facerf_cli.stage.checks.frames import CameraFrames
+from facerf_cli.stage.checks.parabola import vertex
 from facerf_cli.stage.checks.stereo import Stereo
 
 _SMOOTH_PX = 1.0
@@ -79,16 +80,9 @@ def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, f
     near = np.roll(correlation, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     norm = np.sqrt((np.abs(a) ** 2).sum() * (np.abs(b) ** 2).sum()) + 1e-12
     row, column = (int(index) for index in np.unravel_index(near.argmax(), near.shape))
-    shift = np.array([_vertex(near[:, column], row), _vertex(near[row], column)]) - reach
+    px = np.arange(-reach, reach + 1.0)
+    shift = np.array([vertex(px, near[:, column], row), vertex(px, near[row], column)])
     return shift, float(near[row, column] / norm), float((near[row, column] - near[reach, reach]) / norm)
-
-
-def _vertex(values: np.ndarray, place: int) -> float:
-    """The top of the parabola through the highest value and its neighbours."""
-    if not 0 < place < len(values) - 1:
-        return float(place)
-    before, top, after = values[place - 1 : place + 2]
-    return place + float((before - after) / (2 * (before - 2 * top + after) - 1e-12))
 
 
 def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
