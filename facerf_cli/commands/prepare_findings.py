@@ -13,7 +13,7 @@ from facerf_cli.commands.capture_checks import show_findings
 from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.workers import spread
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.records import STDERR, json_line
 
 if TYPE_CHECKING:
@@ -69,7 +69,12 @@ def collect_findings(folder: Path, subjects: Iterable[str]) -> dict[str, list[di
 def check_all(
     work: "CheckOnly", items: Sequence[Item], output: Path, jobs: int, strict: bool, settings: Settings
 ) -> int:
-    """Check all subjects, print the table, write `findings.jsonl`; 1 where a subject would be stopped."""
+    """Check all subjects, print the table, write `findings.jsonl`; 1 where a subject would be stopped.
+
+    A UsageError with `--shard`: the file is of all subjects, and no shard would know that it is the last.
+    """
+    if settings.shard.of > 1:
+        raise UsageError("--checks only looks at all subjects; leave --shard out, and give --jobs or --ray")
     from rich.progress import track
 
     from facerf_cli.stage.checks.findings import stopping

@@ -119,6 +119,12 @@ def test_only_checks_write_their_findings_and_nothing_else(
     assert all(found.words in said.err for found in findings) and "findings.jsonl" in said.out
 
 
+def test_only_checks_have_no_shards(capture: Path, tmp_path: Path, capsys: Said) -> None:
+    assert prepare(capture, tmp_path / "out", "--checks", "only", "--shard", "1/2") == 2
+    said = capsys.readouterr().err
+    assert "leave --shard out" in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
 def test_real_checks_in_processes_find_the_missing_frame(capture: Path, tmp_path: Path, capsys: Said) -> None:
     hidden = capture / "0001/C2/L002.exr"
     hidden.rename(tmp_path / "hidden.exr")
