@@ -31,7 +31,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # the renderer is the tests'
 from tests.stage.chart.chart_picture import background, chart_picture
 
 SHAPE = (360, 480)
-LARGEST_DELTA_E = 8.0  # as `prepare-dataset` has it
 _DISTANCE = 2.5  # of the camera, in widths of the chart
 _SHOWN = 12
 
@@ -53,7 +52,7 @@ def main() -> None:
 def told(path: Path) -> np.ndarray:
     """A photograph [H, W, 3], outlined, after a line of what is found in it."""
     picture = read_image(path).pixels
-    found = find_chart(picture, LARGEST_DELTA_E)
+    found = find_chart(picture)
     if found is None:
         print(f"{path.name}: not found")
         return picture
@@ -69,12 +68,12 @@ def counted(pictures: int) -> list[np.ndarray]:
     for seed in range(pictures):
         picture, corners_px, camera = draw_photograph(seed)
         begun_s = time.perf_counter()
-        found = find_chart(picture, LARGEST_DELTA_E)
+        found = find_chart(picture)
         seconds += time.perf_counter() - begun_s
         rows.append(figures(picture, corners_px, camera, found))
         tiles += [picture if found is None else outlined(picture, found)]
     print(summary(np.array(rows)), f"{seconds / pictures:.2f} s a picture", sep="\n")
-    false = sum(find_chart(surroundings(seed), LARGEST_DELTA_E) is not None for seed in range(pictures))
+    false = sum(find_chart(surroundings(seed)) is not None for seed in range(pictures))
     print(f"without a chart: {false} of {pictures} pictures taken for one")
     return tiles
 

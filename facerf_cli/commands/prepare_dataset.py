@@ -135,8 +135,6 @@ def prepare_dataset(
         (output / DATASET_FILE).unlink(missing_ok=True)  # it speaks of what is about to go
     elif not dry_run:
         _forget_mended(found, output)
-    if not dry_run:
-        _show_charts(found, output)
     code = run_items("prepare-dataset", items, work, work.outputs_of, options, settings)
     if not dry_run and sums_up(items, work.outputs_of, options, settings):
         _finish(work, found, drawn, settings.seed, model_sha256)
@@ -178,7 +176,9 @@ def _check_earlier(capture: "Capture", output: Path, key: str, overwrite: bool) 
 
 
 def _show_charts(capture: "Capture", output: Path) -> None:
-    """Write pictures of the colour charts, so that a person sees what was sampled."""
+    """Write pictures of the colour charts, so that a person sees what was sampled; older ones go."""
+    for older in output.glob("colour_chart*.png"):
+        older.unlink()
     if capture.charts:
         from facerf_cli.stage.chart.overlay import write_chart_overlays
 
@@ -212,6 +212,7 @@ def _finish(work: Prepare, capture: "Capture", split: "Split", seed: int, model_
     show_findings([row for rows in findings.values() for row in rows])
     if not records:
         return
+    _show_charts(capture, work.folder)
     model = face_model_of(work.face_model)
     dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
     with atomic_path(work.folder / "index.html") as temporary:

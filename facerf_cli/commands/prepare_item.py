@@ -34,7 +34,8 @@ class Given:
 
     def opened(self) -> "Capture":
         """The capture's description, read once a process; it is an input of the whole run."""
-        return _capture(self)
+        capture = _capture(self.folder, self.layout, self.subtract_ambient, self.align)
+        return replace(capture, charts=self.charts)
 
 
 @dataclass(frozen=True)
@@ -91,14 +92,13 @@ class Prepare:
 
 
 @cache
-def _capture(given: Given) -> "Capture":
+def _capture(folder: Path, layout: str, subtract_ambient: bool, align: bool) -> "Capture":
     from facerf_cli.stage.data.layouts import read_capture
 
     try:
-        capture = read_capture(given.folder, given.layout, given.subtract_ambient, given.align)
+        return read_capture(folder, layout, subtract_ambient, align)
     except InputError as error:
         raise UsageError(str(error)) from None
-    return replace(capture, charts=given.charts)
 
 
 @cache

@@ -99,6 +99,21 @@ def test_jobs_corners_and_a_second_run(wrong: Path, corrected: Path, tmp_path: P
         assert "or colour chart; give --overwrite" in capsys.readouterr().err and tree(corrected) == before
 
 
+def test_an_older_charts_picture_does_not_outlive_its_dataset(
+    wrong: Path, corrected: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(corrected, tmp_path / "again")
+    assert prepare(wrong, tmp_path / "again", *SPLIT, "--overwrite") == 0
+    assert "colour_charts" not in normalisation(tmp_path / "again")
+    assert (corrected / "colour_chart.png").is_file() and not (tmp_path / "again/colour_chart.png").exists()
+
+
+def test_a_file_is_no_dataset(wrong: Path, tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "file").touch()
+    assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr")) == 2
+    assert "file: cannot write to such a folder" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [

@@ -1,6 +1,6 @@
 """What a photographed colour chart says of a camera's colours, and how a frame is corrected by it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ class ChartCorrection:
     delta_e_before: tuple[float, float]  # CIE 2000, mean and largest of the 24 patches
     delta_e_after: tuple[float, float]
     light_span: float  # of the light over the chart, brightest over darkest; it was taken off
+    overlay: str  # name of its picture for people, in a dataset
 
     def record(self) -> dict[str, Any]:
         """What `dataset.json` says of it."""
@@ -36,6 +37,7 @@ class ChartCorrection:
                 "after": dict(zip(("mean", "max"), self.delta_e_after, strict=True)),
             },
             "light_span": self.light_span,
+            "overlay": self.overlay,
         }
 
     def in_words(self) -> str:
@@ -45,12 +47,6 @@ class ChartCorrection:
             f"{self.picture}: colour chart of {', '.join(self.cameras)}: CIE delta E 2000 mean {mean:.1f}, "
             f"max {most:.1f} (before: {mean_before:.1f}, {max_before:.1f})"
         )
-
-
-def overlay_names(charts: Sequence[ChartCorrection]) -> list[str]:
-    """Each chart's picture for people in a dataset: named after its camera where there are several."""
-    cameras = [f"_{chart.cameras[0]}" for chart in charts] if len(charts) > 1 else [""] * len(charts)
-    return [f"colour_chart{camera}.png" for camera in cameras]
 
 
 def corrected(charts: Iterable[ChartCorrection], camera: str, linear: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from facerf_cli.stage.chart.patches import (
     shrunk,
 )
 
+LARGEST_DELTA_E = 8.0  # mean of the patches'; a chart that was photographed well has 1 to 4
 _SEARCHED_PX = 800  # a picture is made no longer than that
 _EDGES = (0.01, 0.02, 0.04, 0.08)  # changes a pixel, of the encoded picture, that bound an even spot
 _BRIGHT_PERCENTILE, _GAMMA = 99.0, 2.4
@@ -33,10 +34,10 @@ _LEAST_ON_GRID = 12  # of 24; the dark ones are lost in the chart's frame
 _MOST_GRIDS = 4
 
 
-def find_chart(pixels: np.ndarray, largest_delta_e: float) -> np.ndarray | None:
+def find_chart(pixels: np.ndarray) -> np.ndarray | None:
     """The corners [4, 2] of the patches' area, clockwise from dark skin's; None where no chart is seen.
 
-    pixels [H, W, 3] are linear. The 24 colours are the chart's to a mean delta E of `largest_delta_e`.
+    pixels [H, W, 3] are linear. The 24 colours are the chart's to a mean delta E of `LARGEST_DELTA_E`.
     """
     small, scale = shrunk(pixels, _SEARCHED_PX)
     points, sides = even_spots(small)
@@ -49,7 +50,7 @@ def find_chart(pixels: np.ndarray, largest_delta_e: float) -> np.ndarray | None:
         for turned in four_turns(corners_px)[::2]
     ]
     delta_e, best = min(tries, key=lambda found: found[0], default=(np.inf, np.empty(0)))
-    return best * scale if delta_e <= largest_delta_e else None
+    return best * scale if delta_e <= LARGEST_DELTA_E else None
 
 
 def even_spots(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,14 +12,14 @@ import numpy as np
 
 from facerf_cli.colour import luminance
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.headers import read_header
 from facerf_cli.stage.chart.colours import ColourFit, fit_colours, published_colours
 from facerf_cli.stage.chart.correction import ChartCorrection
-from facerf_cli.stage.chart.find import find_chart
+from facerf_cli.stage.chart.find import LARGEST_DELTA_E, find_chart
 from facerf_cli.stage.chart.patches import GREYS, Patches, four_turns, is_convex, sample
 from facerf_cli.stage.data.capture import Capture, read_picture
 
 CAMERA_FIELD = "{camera}"
-_LARGEST_DELTA_E = 8.0  # mean; a chart that was found and photographed well has 1 to 4
 _LEAST_PX = 25  # in the middle of a patch
 _LARGEST_NOISE = 0.25  # of a pixel on the white patch, as a share of it
 _LEAST_CHROMA = 0.02  # of a chart's colours; red and blue reach 1 and more
@@ -34,12 +34,13 @@ def read_charts(capture: Capture, picture: str, corners_px: np.ndarray | None) -
     corners_px [4, 2]: of the patches' area, in turn; None has the chart looked for.
     """
     if CAMERA_FIELD not in picture:
-        yield _read_chart(capture, Path(picture), tuple(capture.cameras), corners_px)
+        yield _read_chart(capture, Path(picture), tuple(capture.cameras), corners_px, "colour_chart.png")
         return
     if corners_px is not None:
         raise UsageError(f"--chart-corners are of one picture; --colour-chart {picture} names one a camera")
     for camera in capture.cameras:
-        yield _read_chart(capture, Path(picture.replace(CAMERA_FIELD, camera)), (camera,), None)
+        named = Path(picture.replace(CAMERA_FIELD, camera))
+        yield _read_chart(capture, named, (camera,), None, f"colour_chart_{camera}.png")
 
 
 def as_a_frame(capture: Capture, decoded: np.ndarray) -> np.ndarray:
@@ -49,11 +50,11 @@ def as_a_frame(capture: Capture, decoded: np.ndarray) -> np.ndarray:
 
 
 def _read_chart(
-    capture: Capture, picture: Path, cameras: tuple[str, ...], corners_px: np.ndarray | None
+    capture: Capture, picture: Path, cameras: tuple[str, ...], corners_px: np.ndarray | None, overlay: str
 ) -> ChartCorrection:
     raw = read_picture(picture, capture.colour_space)
     if corners_px is None:
-        corners_px = find_chart(as_a_frame(capture, raw), _LARGEST_DELTA_E)
+        corners_px = find_chart(as_a_frame(capture, raw))
         if corners_px is None:
             raise InputError(
                 f"{picture}: no ColorChecker Classic found in it; say where its 24 patches are with "
@@ -77,6 +78,7 @@ def _read_chart(
         delta_e_before=_mean_and_max(fit.delta_e_before),
         delta_e_after=_mean_and_max(fit.delta_e_after),
         light_span=round(float(fit.light.max() / fit.light.min()), 3),
+        overlay=overlay,
     )
 
 
@@ -108,7 +110,8 @@ def _require_light(picture: Path, patches: Patches, black_level: float) -> None:
     if brightest.min() <= 0 or patches.noise[GREYS].max() > _LARGEST_NOISE * brightest[1]:
         raise InputError(f"{picture}: the chart is too dark, or too noisy; expose it longer")
     clipped = int((patches.at_white > _CLIPPED_SHARE).sum())
-    if clipped:
+    header = read_header(picture) if clipped else None
+    if header and not header.is_floating:  # floats go on beyond 1
         raise InputError(f"{picture}: {clipped} of the chart's patches are clipped at white; expose it less")
     spread = np.ptp(patches.colours, -1) / greys.max()
     if spread.max() < _LEAST_CHROMA:
@@ -118,7 +121,7 @@ def _require_light(picture: Path, patches: Patches, black_level: float) -> None:
 def _require_chart(picture: Path, patches: Patches, fit: ColourFit, colour_space: str) -> None:
     """Raise for colours that are no chart's, or not linear."""
     mean = fit.delta_e_after.mean()
-    if mean > _LARGEST_DELTA_E:
+    if mean > LARGEST_DELTA_E:
         raise InputError(
             f"{picture}: the patches' colours are off a ColorChecker Classic's by a mean CIE delta E 2000 of "
             f"{mean:.0f}; look whether the corners are its patches', and '{colour_space}' its colour space"

@@ -8,7 +8,7 @@ from skimage.draw import polygon
 from facerf_cli.colour import luminance
 from facerf_cli.files.images import write_display
 from facerf_cli.stage.chart.colours import published_colours
-from facerf_cli.stage.chart.correction import ChartCorrection, corrected, overlay_names
+from facerf_cli.stage.chart.correction import ChartCorrection, corrected
 from facerf_cli.stage.chart.measure import as_a_frame
 from facerf_cli.stage.chart.patches import GREYS, MIDDLE_SIDE, sample, shrunk, squares_px
 from facerf_cli.stage.data.capture import Capture, read_picture
@@ -18,9 +18,9 @@ _SQUARES = (MIDDLE_SIDE + 0.08, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # the outline's, 
 
 
 def write_chart_overlays(capture: Capture, folder: Path) -> None:
-    """Write each chart's picture, under its name of `overlay_names`."""
-    for chart, name in zip(capture.charts, overlay_names(capture.charts), strict=True):
-        write_display(folder / name, chart_overlay(capture, chart))
+    """Write each chart's picture, under its name of `ChartCorrection.overlay`."""
+    for chart in capture.charts:
+        write_display(folder / chart.overlay, chart_overlay(capture, chart))
 
 
 def chart_overlay(capture: Capture, chart: ChartCorrection) -> np.ndarray:

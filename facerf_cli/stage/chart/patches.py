@@ -88,8 +88,11 @@ def sample(pixels: np.ndarray, corners_px: np.ndarray) -> Patches:
 
 
 def shrunk(pixels: np.ndarray, side_px: int) -> tuple[np.ndarray, int]:
-    """A picture [H, W, 3] no longer than `side_px`, squares of its pixels averaged to one, and their side."""
-    scale = math.ceil(max(pixels.shape[:2]) / side_px)
+    """A picture [H, W, 3] no longer than `side_px`, squares of its pixels averaged to one, and their side.
+
+    One that is too thin for such squares stays longer.
+    """
+    scale = min(math.ceil(max(pixels.shape[:2]) / side_px), *pixels.shape[:2])
     height, width = (side // scale for side in pixels.shape[:2])
     blocks = pixels[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
     return blocks.mean((1, 3), dtype=np.float32), scale

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,6 @@ import torch
 
 from facerf_cli import __version__
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.stage.chart.correction import ChartCorrection, overlay_names
 from facerf_cli.stage.data.capture import Capture
 from facerf_cli.stage.data.dataset import FORMAT, SPLITS
 from facerf_cli.stage.data.documents import digest
@@ -93,16 +92,11 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
-            **({"colour_charts": _charts(capture.charts)} if capture.charts else {}),
+            **({"colour_charts": [chart.record() for chart in capture.charts]} if capture.charts else {}),
             "non_finite": "set to 0",
             "negative": "set to 0 after the crop",
         },
     }
-
-
-def _charts(charts: Sequence[ChartCorrection]) -> list[dict[str, Any]]:
-    names = overlay_names(charts)
-    return [chart.record() | {"overlay": name} for chart, name in zip(charts, names, strict=True)]
 
 
 def sha256_of(path: Path) -> str:

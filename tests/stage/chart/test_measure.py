@@ -102,7 +102,7 @@ def test_the_overlay_shows_published_colours_in_corrected_ones(tmp_path: Path) -
 
 DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
 REFUSED: dict[str, tuple[np.ndarray, np.ndarray | None, str]] = {
-    "clipped at 1": (chart_picture(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "patches are clipped"),
+    "clipped at 1": (chart_picture(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "white patch is clipped"),
     "clipped below 1": (chart_picture().clip(max=0.5), CORNERS, "white patch is clipped"),
     "a channel clipped": (chart_picture().clip(max=[9, 9, 0.57]), CORNERS, "white patch is clipped"),
     "grey": (chart_picture().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
@@ -135,6 +135,11 @@ def test_a_white_of_eight_bits_is_clipped(tmp_path: Path) -> None:
     write_display(tmp_path / "chart.png", chart_picture(matrix=CAMERA, exposure=0.8))
     chart = next(read_charts(stage, str(tmp_path / "chart.png"), CORNERS))
     np.testing.assert_allclose(chart.matrix, kept_luminance(CAMERA), atol=0.03)
+
+
+def test_a_white_of_floats_that_is_one_is_not_clipped(tmp_path: Path) -> None:
+    picture = chart_picture(noise=0.0)
+    assert correction(tmp_path, picture * np.float32((1 - LEVEL) / picture.max())).delta_e_after[0] < 0.5
 
 
 def test_no_such_picture(tmp_path: Path) -> None:
