@@ -7,6 +7,7 @@ from pathlib import Path
 from facerf_cli.stage.data.documents import Node
 
 FIELDS = ("subject", "camera", "light")
+_ODD = r"{}\:*?"  # what stands for other things in patterns, or in no file's name
 
 
 def require_pattern(node: Node, needed: Collection[str], fields: tuple[str, ...] = FIELDS) -> str:
@@ -15,14 +16,16 @@ def require_pattern(node: Node, needed: Collection[str], fields: tuple[str, ...]
     parts = pattern.split("/")
     plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
     words = [f"{{{field}}}" for field in fields if field in needed]
+    odd = sorted({letter for letter in plain if letter in _ODD or not letter.isprintable()})
     if (
-        any(word not in pattern for word in words)
-        or not plain.isprintable()
-        or re.search(r"[{}\\:*?]", plain)
+        odd
+        or any(word not in pattern for word in words)
         or any(part in ("", ".", "..") for part in parts)
         or len(pattern) > 500
     ):
-        raise node.wrong(f"a path below the capture{' that names ' * bool(words)}{' and '.join(words)}")
+        named = " that names " * bool(words) + " and ".join(words)
+        free = f", without {' '.join(map(ascii, odd))} elsewhere," * bool(odd)
+        raise node.wrong(f"a path below the capture{named}{free}")
     return pattern
 
 
