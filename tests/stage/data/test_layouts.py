@@ -131,7 +131,7 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"pattern": "{camera}/{light}.exr"}, "names {subject} and {light}"),
         ({"pattern": "{subject}/{light}.exr", "cameras": [*camera(), *camera(id="C1")]}, "and {camera} and"),
         ({"pattern": "{subject}/{camera}.exr"}, "names {subject} and {light}"),
-        ({"ambient": "{subject}/{light}.exr"}, "names {subject} is needed"),
+        ({"ambient": "{subject}/{light}.exr"}, "names {subject}, without"),
         ({"colour_space": None}, "colour_space is null; fill it in$"),
         ({"lights": light(direction=None), "cameras": camera(K=[None, 3])}, r"direction is null.*and 1 more"),
         ({"pattern": "{subject}/{camera}/{light}{gain}.exr"}, "and {light}, without '{' '}' elsewhere, is"),
