@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from planted_faults import Copy
+from capture_copy import Copy
 from scipy import ndimage
 
 from facerf_cli.stage.checks.align import with_alignment
