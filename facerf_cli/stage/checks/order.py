@@ -15,14 +15,14 @@ from facerf_cli.stage.checks.stereo import Stereo
 # On Extended Yale B's subjects 05, 15 and 22 and synthetic faces the light of a frame is found to 14 degrees
 # at worst where its lamp is in front.
 _OFF_DEG = 30.0
-_IN_FRONT, _BELOW = 0.4, -0.7  # cosine to the camera's axis; sine of elevation: others are half in shadow
+IN_FRONT, _BELOW = 0.4, -0.7  # cosine to the camera's axis; sine of elevation: others are half in shadow
 _MOST = 0.25  # of the frames: when more are off it is the list that is wrong
 _ROUNDS = 4
 
 
 def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     """A finding for each frame under another lamp than declared, or one for all where they are many."""
-    rows = np.flatnonzero((frames.directions[:, 2] > _IN_FRONT) & (frames.directions[:, 1] > _BELOW))
+    rows = np.flatnonzero((frames.directions[:, 2] > IN_FRONT) & (frames.directions[:, 1] > _BELOW))
     if len(rows) < 4:
         return
     found = np.stack([solve_light(frames.grey[row][stereo.lit], stereo) for row in rows])

@@ -18,6 +18,7 @@ from facerf_cli.stage.checks.order import check_frames_order
 from facerf_cli.stage.checks.readable import check_readable
 from facerf_cli.stage.checks.rig import Rig, check_rig_roughly, check_rigs, measure_rig
 from facerf_cli.stage.checks.stereo import Stereo, fit_stereo
+from facerf_cli.stage.checks.too_bright import check_too_bright
 from facerf_cli.stage.checks.unlit import check_unlit
 from facerf_cli.stage.data.capture import Capture
 
@@ -89,6 +90,7 @@ class _Checks:
         found = list(check_frames_order(frames, stereo))
         if is_disordered(found):
             return found  # no normals are to be trusted
+        found += check_too_bright(frames, stereo)
         self._look_at_rig(frames, stereo)
         found += check_motion(frames.less(left_out(found)), stereo)
         curve = added_exponent(self.capture, frames)

@@ -200,6 +200,15 @@ def test_two_frames_under_each_others_names(tmp_path: Path, sound: np.ndarray) -
     assert all(one.leaves_out for one in found) and IDS[FRONT + 9] in found[0].words
 
 
+def test_a_frame_behind_that_is_as_bright_as_one_in_front(tmp_path: Path, sound: np.ndarray) -> None:
+    def brighten(frames: np.ndarray) -> None:
+        frames[-1] = 3 * frames[FRONT]
+
+    found = only(changed(brighten, sound, tmp_path / "s"))
+    assert found.check == "order" and found.light == IDS[-1] and found.leaves_out
+    assert "times as bright" in found.words
+
+
 def test_lights_in_another_order_stop_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
     order = np.random.default_rng(1).permutation(LIGHTS)
     found = only(findings(write_stage(tmp_path / "s", sound, lights=lights_of(directions()[order]))))
