@@ -202,7 +202,7 @@ def test_two_frames_under_each_others_names(tmp_path: Path, sound: np.ndarray) -
 
 def test_a_frame_behind_that_is_as_bright_as_one_in_front(tmp_path: Path, sound: np.ndarray) -> None:
     def brighten(frames: np.ndarray) -> None:
-        frames[-1] = 3 * frames[FRONT]
+        frames[-1] = 1.2 * frames[FRONT]
 
     found = only(changed(brighten, sound, tmp_path / "s"))
     assert found.check == "order" and found.light == IDS[-1] and found.leaves_out
