@@ -132,8 +132,8 @@ def check_rigs(subject: str, rigs: Sequence[Rig]) -> Iterator[Finding]:
         return
     for rig in off:
         if rig.is_mirrored or rig.looking_away > _LOOK_AWAY:
-            here = "only here (or in few cameras) the lights are"
-            yield _off(subject, rig, "camera", here, "the camera's world_to_camera, or its frames")
+            here = "unlike in other cameras, the lights are"
+            yield _off(subject, rig, "camera", here, "its world_to_camera, or its frames")
 
 
 def _off(subject: str, rig: Rig, check: str, what: str, mend: str) -> Finding:
