@@ -87,17 +87,26 @@ def _of_one_kind(paths: Iterable[str]) -> list[str]:
 
 
 def _cut_alike(names: list[tuple[str, ...]], depth: int) -> tuple[dict[str, Cut], list[tuple[str, ...]]]:
-    """How the names at a depth are cut, and the paths whose are cut as most; where few are, none is cut."""
+    """How the names at a depth are cut, and the paths whose are cut as most; where few are, at _ alone."""
     cut = {name: _cut(name) for name in {path[depth] for path in names}}
     shapes = {name: _shape(tokens) for name, tokens in cut.items()}
     [(most, count)] = Counter(shapes[path[depth]] for path in names).most_common(1)
     if count < _ALIKE * len(names):
-        return {name: (("name", name),) for name in cut}, names
+        return _cut_at_lines(cut), names
     return cut, [path for path in names if shapes[path[depth]] == most]
 
 
 def _cut(name: str) -> Cut:
     return tuple((match.lastgroup or match[0], match[0]) for match in _TOKEN.finditer(name))
+
+
+def _cut_at_lines(names: Iterable[str]) -> dict[str, Cut]:
+    """Names that are unlike but for as many _ in each, as `anna_L1` and `bob 2_L1`, cut there; else whole."""
+    cut = {
+        name: tuple(("_" if text == "_" else "name", text) for text in re.split("(_)", name))
+        for name in names
+    }
+    return cut if len(set(map(_shape, cut.values()))) == 1 else {name: (("name", name),) for name in cut}
 
 
 def _shape(tokens: Cut) -> tuple[str, ...]:

@@ -85,6 +85,12 @@ NAMES: dict[str, tuple[list[str], str, tuple[str, str, str], str]] = {
         )
         for word in ("face_", "s_", "C_", "c")
     },
+    "people's names unlike each other": (
+        crossed("{s}_cam01_L{l:03}.png", ["anna", "anna2", "bob-x", "zoe 3"], [1]),
+        "{subject}_{camera}_{light}.png",
+        ("anna", "cam01", "L001"),
+        "subject",
+    ),
     "faces by cameras": (
         crossed("{s}/cam{c}/face_{l:03}.png", ["anna", "bob", "carl"]),
         "{subject}/{camera}/{light}.png",
