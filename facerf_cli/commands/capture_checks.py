@@ -16,8 +16,13 @@ _PLAIN_WIDTH = 160  # of a log file, which has no width of its own
 Row = Mapping[str, Any]  # as `Finding.row` makes it
 
 
-def show_findings(rows: Sequence[Row], console: Console = STDERR) -> None:
-    """Print the rows as a table, if there are any; findings.jsonl has all of them, here like ones are cut."""
+def show_findings(rows: Sequence[Row], strict: bool = False, console: Console = STDERR) -> None:
+    """Print the rows as a table, if there are any; findings.jsonl has all of them, here like ones are cut.
+
+    With `strict` each of them stops its subject.
+    """
+    if strict:
+        rows = [{**row, "severity": "error", "leaves_out": False} for row in rows]
     if rows:
         wide = console if console.is_terminal else Console(file=console.file, width=_PLAIN_WIDTH)
         wide.print(findings_table(rows))

@@ -94,7 +94,12 @@ def is_dataset(path: Path) -> bool:
 
 
 def only_dataset(inputs: Sequence[str]) -> Path | None:
-    """The dataset that the inputs name, or None where they are photos; UsageError for both."""
+    """The dataset that the inputs name, or None where they are photos; UsageError for both, or a capture."""
+    from facerf_cli.stage.data.stage_file import STAGE_FILE
+
+    for path in map(Path, inputs):
+        if (path / STAGE_FILE).is_file():
+            raise UsageError(f"{path}: is a capture; give the dataset that prepare-dataset makes of it")
     datasets = [path for path in map(Path, inputs) if is_dataset(path)]
     if datasets and len(inputs) > 1:
         raise UsageError(f"{datasets[0]}: give one dataset alone, or photos")

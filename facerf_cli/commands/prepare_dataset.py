@@ -209,7 +209,7 @@ def _finish(work: Prepare, capture: "Capture", split: "Split", seed: int, model_
     found = prepared_subjects(capture, work.folder).items()
     records = {subject: record for subject, record in found if record.get("prepared") == work.key}
     findings = collect_findings(work.folder, capture.subjects)
-    show_findings([row for rows in findings.values() for row in rows])
+    show_findings([row for rows in findings.values() for row in rows], work.strict)
     if not records:
         return
     _show_charts(capture, work.folder)

@@ -4,6 +4,7 @@ A dataset's findings.jsonl has them all; findings/SUBJECT.jsonl each subject's, 
 before the subject is worked on.
 """
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.workers import spread
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.records import STDERR, json_line
+from facerf_cli.records import LOGGER_NAME, STDERR, json_line
 
 if TYPE_CHECKING:
     from facerf_cli.stage.checks.findings import Finding
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
 _ROWS_LIMIT_BYTES = 256 << 20
+log = logging.getLogger(LOGGER_NAME)
 
 
 def check(capture: "Capture", subject: str) -> "list[Finding]":
@@ -85,7 +87,9 @@ def check_all(
     findings = [found for of_subject in bar for found in of_subject]
     rows = [found.row() for found in findings]
     _write_rows(output / FINDINGS_FILE, rows)
-    show_findings(rows)
+    show_findings(rows, strict)
+    if not rows:
+        log.info("checked: %d subjects, nothing found", len(items))
     print(output / FINDINGS_FILE)
     return 1 if stopping(findings, strict) else 0
 

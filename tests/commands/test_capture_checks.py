@@ -15,9 +15,9 @@ UNLIT = [
 ]
 
 
-def shown(findings: list[Finding], width: int = 200) -> str:
+def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:
     console = Console(file=io.StringIO(), width=width)
-    show_findings([finding.row() for finding in findings], console)
+    show_findings([finding.row() for finding in findings], strict, console)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -34,6 +34,11 @@ def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
 
 def test_a_log_file_is_no_narrow_terminal() -> None:
     assert "the lights are mirrored [left] to right" in shown([STOPS], width=60)
+
+
+def test_strict_stops_subjects_whatever_it_is() -> None:
+    assert "warning" not in shown([WARNS, *UNLIT, STOPS], strict=True)
+    assert "left out" not in shown(UNLIT, strict=True)
 
 
 def test_many_alike_are_counted() -> None:

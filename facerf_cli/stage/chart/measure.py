@@ -132,7 +132,7 @@ def _require_chart(picture: Path, patches: Patches, fit: ColourFit, colour_space
     if not _EXPONENTS[0] < exponent < _EXPONENTS[1]:
         raise InputError(
             f"{picture}: the chart's greys are not linear (as their power {exponent:.2f}); "
-            f"'{colour_space}' is not how it was encoded"
+            f"'{colour_space}' is not how it was encoded, or a shadow or highlight lies on them"
         )
     values, wanted = fit.even[GREYS], published_colours()[GREYS]
     slopes = (values[1:4] * wanted[1:4]).sum(0) / (wanted[1:4] ** 2).sum(0)

@@ -27,8 +27,8 @@ def check_clipped(frames: CameraFrames) -> Iterator[Finding]:
         return
     worst = clipped[share[clipped].argmax()]
     words = (
-        f"{len(clipped)} of {len(highest)} frames are clipped over more than {_SHARE:.0%} of their pixels "
-        f"({frames.light_ids[worst]}: {share[worst]:.1%}); expose less, their highlights are lost"
+        f"clipped over more than {_SHARE:.0%} of their pixels: {len(clipped)} of {len(highest)} frames "
+        f"({frames.light_ids[worst]}: {share[worst]:.1%}); expose less, highlights are lost"
     )
     figures = {"frames": len(clipped), "worst_share": round(float(share[worst]), 4)}
     yield Finding("warning", "clipped", frames.subject, words, frames.camera, figures=figures)

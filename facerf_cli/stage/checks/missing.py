@@ -24,7 +24,7 @@ def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Findi
     extra = extra_names(capture, subject, camera)
     if extra:
         names = ", ".join(extra[:_SHOWN]) + (", ..." if len(extra) > _SHOWN else "")
-        words = f"{len(extra)} files are of no lamp in the list ({names}); are lamps missing from it?"
+        words = f"files of no lamp in the list: {len(extra)} ({names}); are lamps missing from it?"
         yield Finding("warning", "extra", subject, words, camera, figures={"files": len(extra)})
 
 

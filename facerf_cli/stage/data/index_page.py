@@ -40,7 +40,8 @@ def _lines(
     yield f"<h1>{escape(title)}</h1>"
     split_of = {name: split for split, names in dataset["splits"].items() for name in names}
     counts = ", ".join(f"{len(names)} {split}" for split, names in dataset["splits"].items())
-    yield f"<p>{counts}. {len(dataset['rig']['lights'])} lights, {len(dataset['cameras'])} cameras.</p>"
+    lights, cameras = (len(entries) for entries in (dataset["rig"]["lights"], dataset["cameras"]))
+    yield f"<p>Subjects: {counts}. Lights: {lights}. Cameras: {cameras}.</p>"
     for chart in dataset["normalisation"].get("colour_charts", ()):
         yield from _chart(chart)
     yield f"<p>{escape(_COLUMNS)}</p>"
