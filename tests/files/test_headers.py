@@ -82,6 +82,11 @@ def test_primaries_that_span_no_colours_are_left(
     assert read_image(path).pixels == pytest.approx(0.5)
 
 
+def test_primaries_of_another_form_are_none(tmp_path: Path) -> None:
+    header = read_header(write_primaries(tmp_path / "a.exr", (0.3,) * 6, "float[6]"))
+    assert header is not None and header.space == LINEAR
+
+
 def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
     name = tmp_path / os.fsdecode(b"\xff.png")
     name.write_bytes(b"no picture")
