@@ -11,7 +11,7 @@ from facerf_cli.stage.checks.rig import Rig, Turn, check_rigs
 def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrored: float = 0.8) -> Rig:
     """With a likeness of 0.9 to the face, mirrored of `mirrored`."""
     rotation = Rotation.from_euler("y", turned_deg, degrees=True).as_matrix()
-    return Rig(camera, Turn(rotation, 0.9), Turn(np.eye(3), mirrored), looking_away, "")
+    return Rig(camera, Turn(rotation, 0.9), Turn(np.eye(3), mirrored), rotation, looking_away, "")
 
 
 @pytest.mark.parametrize(
@@ -22,8 +22,10 @@ def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrore
         ([rig("C0"), rig("C1", 40, 0.01), rig("C2")], []),  # a face laid on wrongly from the side
         ([rig("C0"), rig("C1", mirrored=0.95), rig("C2")], [("camera", "C1")]),
         ([rig("C0", 60, 0.2), rig("C1")], [("camera", "C0")]),
-        ([rig("C0", 25), rig("C1", 25), rig("C2")], [("rig", "C0")]),
-        ([rig("C0"), rig("C1", 25), rig("C2", mirrored=0.95)], [("rig", "C1")]),
+        ([rig("C0", 35), rig("C1", 35), rig("C2")], [("rig", "C0")]),
+        ([rig("C0"), rig("C1", 28), rig("C2", -25)], []),  # two such, one from the left
+        ([rig("C0"), rig("C1", 50, 0.1), rig("C2", -50, 0.1)], [("camera", "C1"), ("camera", "C2")]),
+        ([rig("C0"), rig("C1", mirrored=0.95), rig("C2", mirrored=0.95)], [("rig", "C1")]),
         ([rig("C0", 25)], [("rig", "C0")]),
         ([], []),
     ],
