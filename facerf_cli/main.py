@@ -136,7 +136,8 @@ def main(arguments: Sequence[str]) -> int:
         return _fail(None, "aborted", 1)
     except Exception as error:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # typer's: the line was wrong
-            return _fail(None, f"{error.format_message()} {_see_help(error)}", error.exit_code)
+            message = error.format_message().replace("Value error, ", "")  # a library's words
+            return _fail(None, f"{message} {_see_help(error)}", error.exit_code)
         return _fail(error, unexpected(error), 1)
 
 

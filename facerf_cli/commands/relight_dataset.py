@@ -74,6 +74,8 @@ def relight_dataset(
     output = dataset / RELIT
     if envmaps.startswith("procedural:"):
         names = name_maps(parse_envmaps(envmaps, settings.seed))
+    elif not Path(envmaps).exists():
+        raise UsageError(f"--envmaps {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
     else:
         names = name_maps([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
     pairs = draw_pairs(prepared, names, per_subject, settings.seed)

@@ -125,6 +125,7 @@ def test_what_cannot_be_used_is_one_line(
     assert "1000000 are the most" in says(2, line(dataset, maps="procedural:999999999"))
     assert "--memory inf: give a number" in says(2, line(dataset, "--memory", "inf"))
     assert "dataset.json: no such file" in says(1, line(tmp_path / "empty"))
+    assert "--envmaps nowhere: no such folder" in says(2, line(dataset, maps="nowhere"))
     assert main(line(dataset, pictures=1)) == 0
     capsys.readouterr()
     assert "--overwrite" in says(2, line(dataset, "--seed", "9", pictures=1))
