@@ -22,7 +22,7 @@ _SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # and two cameras each turned to the other, a
 _BETTER = 0.03  # of the mean cosine between normals, by which a mirrored rig must win
 # A face seen from the side may be laid on turned by 42 degrees, on synthetic faces. What tells that from a
 # wrong pose are normals that look away from the camera, less of them after the turn: by 0.02 of all at most
-# on sound cameras, by 0.05 to 0.3 where one is turned to a side by 40 degrees or more.
+# on sound cameras, by 0.04 to 0.3 where one is turned to a side by 40 degrees or more.
 _LOOK_AWAY = 0.03
 _APART_DEG = 45.0  # between normals after the first turn: glasses, hair
 _LEAN = 0.3  # correlation of a normal's x with the pixel's: 0.6 to 0.9 on heads
