@@ -95,7 +95,7 @@ def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     worst = int(far.argmax())
     limit_px, worst_px = _MOVED_PX * frames.scale, far[worst] * frames.scale
     words = (
-        f"the head moves: {moved.sum()} of {motion.trusted.sum()} frames that tell are off by more than "
+        f"the head moves: of {motion.trusted.sum()} frames that tell {moved.sum()} or more are off by over "
         f"{limit_px:.1f} pixels ({frames.light_ids[worst]} by {worst_px:.1f}); --align undoes it"
     )
     figures = {"frames": int(moved.sum()), "worst_px": round(float(worst_px), 2)}

@@ -131,7 +131,8 @@ def check_rigs(subject: str, rigs: Sequence[Rig]) -> Iterator[Finding]:
     rest = [rig for rig in rigs if rig not in swapped]
     off = [rig for rig in rest if rig.is_off]
     if 2 * len(off) > len(rest) and _is_of_all(rest):
-        yield _off(subject, off[0], "rig", "the lights are", "their directions or world_to_camera")
+        what = "their directions or world_to_camera, or names that are one off"
+        yield _off(subject, off[0], "rig", "the lights are", what)
         return
     for rig in off:
         if rig.is_mirrored or rig.looking_away > _LOOK_AWAY:
