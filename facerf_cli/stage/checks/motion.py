@@ -96,7 +96,7 @@ def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     limit_px, worst_px = _MOVED_PX * frames.scale, far[worst] * frames.scale
     words = (
         f"the head moves: of {motion.trusted.sum()} frames that tell {moved.sum()} or more are off by over "
-        f"{limit_px:.1f} pixels ({frames.light_ids[worst]} by {worst_px:.1f}); --align undoes it"
+        f"{limit_px:.1f} pixels ({frames.light_ids[worst]} by {worst_px:.1f}); --align shifts them back"
     )
     figures = {"frames": int(moved.sum()), "worst_px": round(float(worst_px), 2)}
     yield Finding("warning", "motion", frames.subject, words, frames.camera, figures=figures)
