@@ -268,9 +268,7 @@ def write_balls(shots: Iterable[Shot], output: Path, exposure_ev: float | None, 
         envmap = read_map(shot.envmap)
         both = [ball(envmap, BALL_PX, kind, shot.rotate_deg) for kind in ("mirror", "diffuse")]
         pixels = torch.cat(both, 1).numpy()
-        # A light that was estimated depends on the face model.
-        stamp = face_model(shot.envmap.options.photo).stamp if isinstance(shot.envmap, PhotoLight) else {}
-        metadata = Provenance(shot.envmap.name, **stamp).attributes()
+        metadata = _marks_of(shot.envmap)
         write_exr(path, pixels, metadata=metadata)
         write_display(
             path.with_suffix(".png"),
@@ -278,3 +276,15 @@ def write_balls(shots: Iterable[Shot], output: Path, exposure_ev: float | None, 
             "auto" if exposure_ev is None else exposure_ev,
             metadata=metadata,
         )
+
+
+def _marks_of(envmap: Path | DrawnMap | PhotoLight) -> dict[str, str | int]:
+    """Metadata of what shows a light; one that was estimated depends on the face model."""
+    if isinstance(envmap, PhotoLight):
+        return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
+    made = Provenance(envmap.name).attributes()
+    if isinstance(envmap, DrawnMap):
+        return made
+    from facerf_cli.stage.map_files import face_model_of_map
+
+    return made | face_model_of_map(envmap)

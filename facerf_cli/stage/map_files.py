@@ -31,6 +31,13 @@ def read_map_file(path: Path | str) -> Tensor:
     return envmap
 
 
+def face_model_of_map(path: Path) -> dict[str, str]:
+    """The marks of the face model that a light was estimated with, if its file has them."""
+    is_light = path.suffix.lower() == ".json"
+    marks = read_light_file(path)[1] if is_light else read_image(path, limit_px=ENVMAP_LIMIT_PX).metadata
+    return {name: str(mark) for name, mark in marks.items() if name.startswith("facerf:face_model")}
+
+
 @lru_cache(maxsize=2)  # a rig's takes a while, and relight asks more than once
 def _drawn(path: Path) -> Tensor:
     return read_light_file(path)[0].latlong()

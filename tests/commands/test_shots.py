@@ -203,6 +203,17 @@ def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
     assert sorted(path.name for path in (tmp_path / "out/balls").iterdir()) == ["one.exr", "one.png"]
 
 
+def test_the_ball_of_an_estimated_light_names_its_face_model(tmp_path: Path) -> None:
+    marks = {"facerf:face_model": "mine", "facerf:face_model_licence": "MIT"}
+    write_exr(tmp_path / "a.exr", np.ones((16, 32, 3), np.float32), metadata=marks)
+    light = LightRecord(rig_directions()[:3], torch.ones(3, 3), "three", None, marks)
+    write_light(tmp_path / "b.json", light)
+    shots = collect_shots([str(tmp_path / name) for name in ("a.exr", "b.json")], None, [], tmp_path / "out")
+    write_balls(shots, tmp_path / "out", 0.0, overwrite=False)
+    for name in ("a.exr", "b.exr"):
+        assert read_image(tmp_path / "out/balls" / name).metadata.items() >= marks.items()
+
+
 def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
     files = collect_shots([str(tmp_path)], "0:360:2", [], tmp_path / "out")
