@@ -151,3 +151,9 @@ def unexpected(error: Exception) -> str:
 def one_line(text: str) -> str:
     """The text with its line breaks and runs of spaces made single spaces."""
     return " ".join(text.split())
+
+
+def counted(number: int, thing: str) -> str:
+    """`1 light`, `2 lights`; `3 people` of a person."""
+    plural = {"person": "people"}.get(thing, thing + "s")
+    return f"{number} {thing if number == 1 else plural}"

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from facerf_cli.records import STDERR, one_line
+from facerf_cli.records import STDERR, counted, one_line
 
 _ALIKE = 3  # findings of one check in a camera that are shown; the rest are counted
 _STYLES = {"error": "red", "warning": "yellow"}
@@ -55,7 +55,7 @@ def summary(rows: Sequence[Row]) -> str:
     kinds = [follows(row) for row in rows]
     counts = ((kinds.count(kind), kind) for kind in ("subject stopped", "frame left out", "warning"))
     words = ", ".join(f"{count} x {kind}" for count, kind in counts if count)
-    return f"Findings about {subjects} subject{'s' if subjects > 1 else ''}: {words}"
+    return f"Findings about {counted(subjects, 'subject')}: {words}"
 
 
 def _shortened(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:

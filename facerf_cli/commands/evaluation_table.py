@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from facerf_cli.records import counted
+
 if TYPE_CHECKING:
     from facerf_cli.evaluation.summary import Cell, Group, Summary
 
@@ -20,7 +22,7 @@ def print_tables(summary: "Summary") -> None:
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     layout = summary.layout
-    pictures, persons = _count(summary.pictures, "picture"), _count(summary.persons, "person")
+    pictures, persons = counted(summary.pictures, "picture"), counted(summary.persons, "person")
     console.print(Text(f"{layout.title}: {pictures} of {persons}", style="bold"))
     first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
     console.print(_table(summary, first, summary.groups, plain=not terminal))
@@ -31,11 +33,6 @@ def print_tables(summary: "Summary") -> None:
         console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
     for note in layout.notes:
         console.print(Text(note))
-
-
-def _count(number: int, thing: str) -> str:
-    plural = {"person": "people"}.get(thing, thing + "s")
-    return f"{number} {thing if number == 1 else plural}"
 
 
 def _table(summary: "Summary", metric: str, groups: "Sequence[Group]", plain: bool) -> Table:

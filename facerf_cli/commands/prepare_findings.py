@@ -15,7 +15,7 @@ from facerf_cli.commands.inputs import Item
 from facerf_cli.commands.options import Settings
 from facerf_cli.commands.workers import spread
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.records import LOGGER_NAME, STDERR, json_line
+from facerf_cli.records import LOGGER_NAME, STDERR, counted, json_line
 
 if TYPE_CHECKING:
     from facerf_cli.stage.checks.findings import Finding
@@ -89,7 +89,7 @@ def check_all(
     _write_rows(output / FINDINGS_FILE, rows)
     show_findings(rows, strict)
     if not rows:
-        log.info("checked: %d subjects, nothing found", len(items))
+        log.info("checked: %s, nothing found", counted(len(items), "subject"))
     print(output / FINDINGS_FILE)
     return 1 if stopping(findings, strict) else 0
 

@@ -3,6 +3,7 @@
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import OpenImageIO as oiio
 
@@ -32,6 +33,7 @@ class Header:
     is_floating: bool
     bits: int  # of a value
     space: ColourSpace  # what the file says; of one that says nothing what is usual: linear, or sRGB
+    metadata: dict[str, Any]
 
 
 def read_header(path: Path) -> Header | None:
@@ -46,7 +48,15 @@ def read_header(path: Path) -> Header | None:
     if spec.get_int_attribute("Orientation", 1) >= 5:  # turned by a quarter
         width, height = height, width
     floating, bits = is_floating(spec), 8 * spec.format.size()
-    return Header(width, height, floating, bits, space_of_file(path, spec))
+    return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+
+
+def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
+    """The plain attributes of a picture that is turned upright."""
+    plain = (str, int, float, tuple)
+    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
+    attributes.pop("Orientation", None)  # applied
+    return attributes
 
 
 def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:

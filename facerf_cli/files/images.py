@@ -22,7 +22,7 @@ from facerf_cli.colour import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.damage import require_whole_png, utf8_path
-from facerf_cli.files.headers import is_floating, space_of_file
+from facerf_cli.files.headers import is_floating, metadata_of, space_of_file
 from facerf_cli.files.xmp import embed_xmp
 from facerf_cli.records import LOGGER_NAME, one_line
 
@@ -72,7 +72,7 @@ def read_image(
     if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
     pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
-    return Picture(pixels, alpha, space.name, _metadata(spec))
+    return Picture(pixels, alpha, space.name, metadata_of(spec))
 
 
 def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
@@ -158,13 +158,6 @@ def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
         raise InputError(f"{path}: {count} of {total} pixels are NaN or infinite; mend them first")
     log.warning("%s: %d pixels are NaN or infinite; their values are set to 0", path, count)
     return np.where(bad, np.float32(0), values)
-
-
-def _metadata(spec: oiio.ImageSpec) -> dict[str, Any]:
-    plain = (str, int, float, tuple)
-    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
-    attributes.pop("Orientation", None)  # applied
-    return attributes
 
 
 def write_exr(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.headers import read_header
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.files.light_files import read_light
 from facerf_cli.light.envmap import check_envmap
@@ -33,8 +34,11 @@ def read_map_file(path: Path | str) -> Tensor:
 
 def face_model_of_map(path: Path) -> dict[str, str]:
     """The marks of the face model that a light was estimated with, if its file has them."""
-    is_light = path.suffix.lower() == ".json"
-    marks = read_light_file(path)[1] if is_light else read_image(path, limit_px=ENVMAP_LIMIT_PX).metadata
+    if path.suffix.lower() == ".json":
+        marks = read_light_file(path)[1]
+    else:
+        header = read_header(path)
+        marks = header.metadata if header else {}
     return {name: str(mark) for name, mark in marks.items() if name.startswith("facerf:face_model")}
 
 

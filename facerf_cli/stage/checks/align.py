@@ -22,7 +22,6 @@ from facerf_cli.stage.data.capture import Capture
 
 _FINE_PX, _COARSER = 192, 2  # the longer side of the fine frames; fine pixels to a coarse one
 _PATH_FRONT, _OWN_FRONT = -0.2, 0.2  # cosines to the camera's axis: lamps further behind light rims alone
-_LEAST_PEAK = 0.5  # of a perfect match with the lamps around; shadows agree there
 _SHRINK = {_COARSER: 0.1, 1: 0.03}  # by pixels: what the lamps of a region share, see `own_motion`
 _PATH_ROUNDS, _OWN_ROUNDS = 3, (_COARSER, _COARSER, _COARSER, 1, 1)
 _OWN_PX = 0.6  # of a fine pixel: on still synthetic faces up to 0.55 is found
@@ -60,7 +59,7 @@ def head_motion(frames: CameraFrames) -> np.ndarray:
     for size in _OWN_ROUNDS:
         grey = _coarser(_moved_back(frames, path + own), size).grey
         predicted = np.tensordot(weights.astype(np.float32), grey, 1)
-        found = motion_between(grey, predicted, lit_pixels(grey), asked, _LEAST_PEAK)
+        found = motion_between(grey, predicted, lit_pixels(grey), asked)
         more = own_motion(weights, found.moved_px, found.trusted, _SHRINK[size])
         own += size * np.where(asked[:, None], more, 0)
         own[asked] -= np.median(own[asked], axis=0)  # the others' motion is nobody's

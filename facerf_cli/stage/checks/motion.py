@@ -41,19 +41,17 @@ def measure_motion(frames: CameraFrames, stereo: Stereo, least_front: float = _I
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
     front = frames.directions[:, 2] > least_front
-    return motion_between(frames.grey, predicted, stereo.lit, front, _LEAST_PEAK)
+    return motion_between(frames.grey, predicted, stereo.lit, front)
 
 
-def motion_between(
-    seen: np.ndarray, predicted: np.ndarray, where: np.ndarray, asked: np.ndarray, least_peak: float
-) -> Motion:
+def motion_between(seen: np.ndarray, predicted: np.ndarray, where: np.ndarray, asked: np.ndarray) -> Motion:
     """Frames [L, h, w] against predictions, over `where` [h, w]; those that are not `asked` [L] have 0."""
     moved, peaks, gain = np.zeros((len(asked), 2)), np.zeros(len(asked)), np.zeros(len(asked))
     for row in np.flatnonzero(asked):
         pair = (orientation(picture) * where for picture in (seen[row], predicted[row]))
         moved[row], peaks[row], gain[row] = register(*pair)
     moved[(gain < _LEAST_GAIN) & (np.hypot(*moved.T) > _MOVED_PX)] = 0
-    trusted = asked & (peaks > least_peak)
+    trusted = asked & (peaks > _LEAST_PEAK)
     return Motion(np.where(trusted[:, None], moved, 0), trusted)
 
 

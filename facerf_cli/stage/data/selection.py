@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from facerf_cli.errors import InputError
+from facerf_cli.records import counted
 from facerf_cli.stage.checks.findings import Finding
 from facerf_cli.stage.data.capture import Capture
 
@@ -31,9 +32,9 @@ class Selection:
         """What is left out without being marked, for a line; empty where nothing is."""
         parts = []
         if lights := {light: why for light, why in self.left_out.items() if MARKED not in why}:
-            parts.append(f"{_count(lights, 'light')} left out ({_some(lights)})")
+            parts.append(f"{counted(len(lights), 'light')} left out ({_some(lights)})")
         if self.dropped:
-            parts.append(f"{_count(self.dropped, 'camera')} left out ({_some(self.dropped)})")
+            parts.append(f"{counted(len(self.dropped), 'camera')} left out ({_some(self.dropped)})")
         return ", ".join(parts)
 
 
@@ -94,10 +95,6 @@ def is_mended(capture: Capture, subject: str, missing: Iterable[str]) -> bool:
     """Whether any of the frames, as in `Selection.missing`, has come since."""
     frames = (name.split("/") for name in missing)
     return any(capture.frame_path(subject, camera, light).is_file() for camera, light in frames)
-
-
-def _count(things: Mapping[str, str], word: str) -> str:
-    return f"1 {word}" if len(things) == 1 else f"{len(things)} {word}s"
 
 
 def _some(reasons: Mapping[str, str]) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from facerf_cli.records import counted
 from facerf_cli.stage.data.patterns import FIELDS
 from facerf_cli.stage.draft.evidence import Evidence
 from facerf_cli.stage.draft.frames import alike
@@ -31,7 +32,7 @@ def notes_on(evidence: Evidence, content: Mapping[str, Any]) -> list[str]:
 def _found(evidence: Evidence) -> Iterator[str]:
     frames = evidence.frames
     counts = {field: len(frames.ids(field)) for field in FIELDS}
-    words = ", ".join(_count(count, field) for field, count in counts.items())
+    words = ", ".join(counted(count, field) for field, count in counts.items())
     promised = counts["subject"] * counts["camera"] * counts["light"]
     missing = promised - len(frames.paths)
     there = f"{missing} of {promised} frames are not there" if missing else f"all {promised} frames are there"
@@ -44,7 +45,7 @@ def _gaps(content: Mapping[str, Any]) -> Iterator[str]:
         entries = value if isinstance(value, list) else ()
         for name in entries[0] if entries else ():
             if empty := [entry["id"] for entry in entries if entry[name] is None]:
-                yield f"{name} of {len(empty)} of {_count(len(entries), key[:-1])} ({_WANTED[name]})"
+                yield f"{name} of {len(empty)} of {counted(len(entries), key[:-1])} ({_WANTED[name]})"
     if content["colour_space"] is None:
         yield (
             "colour_space: the headers do not settle it; 'linear' where values are in proportion to light "
@@ -61,14 +62,14 @@ def _assumed(evidence: Evidence) -> Iterator[str]:
             yield f"cameras: pictures{f' of {camera}' * bool(camera)} have several sizes: {sizes}"
     if unread := sum(sight.unread for sight in evidence.sights.values()):
         seen = unread + sum(sight.sizes.total() for sight in evidence.sights.values())
-        yield f"cameras: {unread} of {_count(seen, 'picture')} looked at cannot be read"
+        yield f"cameras: {unread} of {counted(seen, 'picture')} looked at cannot be read"
     yield "cameras: K is a guess, with a focal length of 4 times the longer side; calibrate them"
     if len(evidence.sights) == 1:
         yield "cameras: the one camera is the world: x to the picture's right, y up, z toward the camera"
     if nameless := sum(sight.nameless for sight in evidence.sights.values()):
         read = sum(sight.sizes.total() for sight in evidence.sights.values())
         yield (
-            f"colour_space: {nameless} of {_count(read, 'header')} have primaries that no space known here "
+            f"colour_space: {nameless} of {counted(read, 'header')} have primaries that no space known here "
             "has, so no name is right; write these pictures anew as linear Rec.709"
         )
     if evidence.colour_space:
@@ -109,25 +110,21 @@ def _assumed_of_lights(evidence: Evidence) -> Iterator[str]:
 def _left_out(evidence: Evidence) -> Iterator[str]:
     scan, frames = evidence.scan, evidence.frames
     if frames.strays:
-        yield f"{_count(len(frames.strays), 'picture')} that do not fit the pattern ({_some(frames.strays)})"
+        yield f"{counted(len(frames.strays), 'picture')} that do not fit the pattern ({_some(frames.strays)})"
     if frames.unnameable:
         names = sorted(set(frames.unnameable))
         yield f"pictures whose ids are not of letters, digits, - and _ alone; rename them ({_some(names)})"
     if frames.full:
-        all_on = _count(frames.full.total(), "picture")
+        all_on = counted(frames.full.total(), "picture")
         yield f"{all_on} with all lamps on ({_some(frames.full)}), which the checks look at"
     if evidence.rig.unused:
         yield f"a list of lights: {evidence.rig.unused}"
     if len(scan.lists) > 1:
         yield f"further lists of lights ({_some(scan.lists[1:])})"
     if scan.shut:
-        yield f"{_count(len(scan.shut), 'folder')} that cannot be read ({_some(scan.shut)})"
+        yield f"{counted(len(scan.shut), 'folder')} that cannot be read ({_some(scan.shut)})"
     if scan.cut_short:
         yield f"what comes after the first {scan.entries} files; some lights and cameras may be missing here"
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'s' * (number != 1)}"
 
 
 def _some(names: Sequence[str] | Mapping[str, int]) -> str:
