@@ -21,14 +21,13 @@ from typing import Any
 import synthetic
 import torch
 
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.olat import compare_olats
 from facerf_cli.evaluation.people import Person
-from facerf_cli.intervals import mean_interval
-from facerf_cli.metrics import si_mse_clipped
+from facerf_cli.evaluation.protocols.olat import compare_olats
+from facerf_cli.metrics import mean_interval, si_mse_clipped
 from facerf_cli.pipeline import Models, load_models
-from facerf_cli.stage.data.dataset import Dataset, read_dataset
-from facerf_cli.stage.data.recipes import read_pairs
 
 RUNS = {"without normal maps": ["--without-normals"], "mean face": ["--mean-face"], "full": []}
 _MEAN_FACE = "builtin-mean"  # the face model that `facerf train --mean-face` leaves in the bank
@@ -120,8 +119,8 @@ def measure(checkpoint: Path, bank: Path, mean_face: bool, given: argparse.Names
     face_model = bank / f"{_MEAN_FACE}.npz" if mean_face else "builtin"
     models = load_models(checkpoint, face_model, torch.device("cpu"))
     heads = synthetic.held_out_bank(bank, fitted_with, synthetic.HELD_OUT)
-    pictures = list(synthetic.measure(models.network, *heads, given.draws, 6))
-    chart = synthetic.summary(pictures)["rows"]
+    images = list(synthetic.measure(models.network, *heads, given.draws, 6))
+    chart = synthetic.summary(images)["rows"]
     found = {"chart": chart, "rows": chart, "people": 0}
     if given.dataset:
         found |= on_people(models, read_dataset(given.dataset), given.every)

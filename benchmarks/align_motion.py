@@ -21,12 +21,12 @@ import numpy as np
 from capture_copy import Copy
 from scipy import ndimage
 
-from facerf_cli.stage.checks.align import with_alignment
-from facerf_cli.stage.checks.findings import frames_left_out
-from facerf_cli.stage.checks.subject import check_subject
-from facerf_cli.stage.data.capture import Capture
-from facerf_cli.stage.data.layouts import read_capture
-from facerf_cli.stage.data.yale_b import read_shifts
+from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.checks.findings import frames_left_out
+from facerf_cli.capture.checks.motion import with_alignment
+from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.yale_b import read_shifts
 
 _OWN_PX = 0.3  # what each frame has of its own beside the path
 _SMOOTH = 20  # frames over which the path bends
@@ -64,10 +64,10 @@ def planted(source: Path, subject: str, furthest_px: float, seed: int) -> None:
     for kind, least, most in (("all", -2, 2), *_KINDS):
         rows = (copy.directions[:, 2] >= least) & (copy.directions[:, 2] < most)
         before, after = rms(moved_px[rows], moved_px.mean(0)), rms(left_px[rows], left_px.mean(0))
-        off = [difference(pictures[rows], still[rows]) for pictures in (moved, back)]
+        off = [difference(images[rows], still[rows]) for images in (moved, back)]
         print(f"  {kind}, {rows.sum()} frames: {before:.2f} px -> {after:.2f} px RMS; ", end="")
         print(f"frames differ by {off[0]:.1%} -> {off[1]:.1%}")
-    sums = [difference(pictures.mean(0), still.mean(0)) for pictures in (moved, back)]
+    sums = [difference(images.mean(0), still.mean(0)) for images in (moved, back)]
     print(f"  their mean differs by {sums[0]:.1%} -> {sums[1]:.1%}")
 
 
@@ -75,14 +75,14 @@ def rms(shifts_px: np.ndarray, mean_px: np.ndarray) -> float:
     return float(np.sqrt(((shifts_px - mean_px) ** 2).sum(1).mean()))
 
 
-def common(pictures: np.ndarray, by_px: np.ndarray) -> np.ndarray:
+def common(images: np.ndarray, by_px: np.ndarray) -> np.ndarray:
     """Pictures [L, H, W] moved together, to where the aligned ones are."""
-    return np.stack([ndimage.shift(picture, by_px, order=3, mode="nearest") for picture in pictures])
+    return np.stack([ndimage.shift(image, by_px, order=3, mode="nearest") for image in images])
 
 
-def difference(pictures: np.ndarray, truth: np.ndarray) -> float:
+def difference(images: np.ndarray, truth: np.ndarray) -> float:
     """The mean absolute difference over the mean."""
-    return float(np.abs(pictures - truth).mean() / truth.mean())
+    return float(np.abs(images - truth).mean() / truth.mean())
 
 
 def frames_of(capture: Capture, subject: str, camera: str) -> Iterator[np.ndarray]:

@@ -21,17 +21,15 @@ import torch
 from torch import Tensor
 
 from facerf_cli.baselines import prt, specular_sh
+from facerf_cli.baselines.base import DETAIL, Kind
 from facerf_cli.baselines.explain import explain
-from facerf_cli.baselines.kinds import Kind
-from facerf_cli.baselines.photo_texels import DETAIL
-from facerf_cli.evaluation.views import View
+from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
+from facerf_cli.dataset.weights import load_pairs
+from facerf_cli.evaluation.methods import View
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.intervals import mean_interval
-from facerf_cli.metrics import si_mse
+from facerf_cli.metrics import mean_interval, si_mse
 from facerf_cli.pipeline import FaceTexture, Models, load_models, turn_to
-from facerf_cli.stage.data.dataset import SPLITS, Dataset, read_dataset
-from facerf_cli.stage.data.pair_weights import load_pairs
 
 KINDS: tuple[Kind, ...] = ("field", "diffuse-sh", "specular-sh", "prt")
 
@@ -86,7 +84,7 @@ def measure(
         "and pose": (target, relit(target.directions, other[None], turn)[0], target.under(other)),
     }
     errors = {
-        name: float(si_mse(seen.view.picture(texture), truth, seen.view.mask))
+        name: float(si_mse(seen.view.image(texture), truth, seen.view.mask))
         for name, (seen, texture, truth) in textures.items()
     }
     return errors | {"CPU s": seconds}

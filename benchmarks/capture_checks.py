@@ -2,7 +2,7 @@
 
     python benchmarks/capture_checks.py ../shared/data/extended_yale_b
 
-Truth is the list of broken pictures in `facerf_cli/stage/data/yale_b.py`, which the checks never see.
+Truth is the list of broken pictures in `facerf_cli/capture/yale_b.py`, which the checks never see.
 Thresholds were reasoned on subjects 05, 15 and 22 and on synthetic faces, and the others are counted apart;
 but they are no blind test. Seen once as a whole, they had 9 of 10 broken pictures found and 15 false alarms,
 all of lamps overhead that hair hides: since then an unlit lamp is judged by the places that it reaches best,
@@ -16,12 +16,12 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
-from facerf_cli.evaluation.yale_b_cases import SETTINGS_SUBJECTS
-from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.checks.subject import check_subject
-from facerf_cli.stage.data.capture import Capture
-from facerf_cli.stage.data.layouts import read_capture
-from facerf_cli.stage.data.yale_b import UNMARKED_DAMAGE
+from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.yale_b import UNMARKED_DAMAGE
+from facerf_cli.evaluation.protocols.yale_b_cases import SETTINGS_SUBJECTS
 
 
 def main() -> None:
@@ -42,10 +42,10 @@ def main() -> None:
 
 def counted(capture: Capture, found: dict[str, list[Finding]]) -> str:
     """How many of the broken pictures are found, and what is found besides, of subjects' findings."""
-    truth, said, pictures = set(), set(), 0
+    truth, said, images = set(), set(), 0
     for subject, findings in found.items():
-        there = set(pictures_of(capture, subject))
-        pictures += len(there)
+        there = set(images_of(capture, subject))
+        images += len(there)
         truth |= {(subject, flash.name) for flash in UNMARKED_DAMAGE.get(subject, ())} & there
         said |= {(subject, finding.light) for finding in findings if finding.leaves_out} & there
     missed = ", ".join("/".join(place) for place in sorted(truth - said)) or "none"
@@ -53,7 +53,7 @@ def counted(capture: Capture, found: dict[str, list[Finding]]) -> str:
     stopped = [subject for subject, findings in found.items() if any(map(stops, findings))]
     return (
         f"{len(truth & said)} of {len(truth)} broken pictures found (missed: {missed}); "
-        f"{len(said - truth)} false alarms of {pictures} pictures ({false}); {len(stopped)} subjects stopped"
+        f"{len(said - truth)} false alarms of {images} pictures ({false}); {len(stopped)} subjects stopped"
     )
 
 
@@ -61,7 +61,7 @@ def stops(finding: Finding) -> bool:
     return finding.severity == "error" and not finding.leaves_out
 
 
-def pictures_of(capture: Capture, subject: str) -> Iterable[tuple[str, str]]:
+def images_of(capture: Capture, subject: str) -> Iterable[tuple[str, str]]:
     camera = next(iter(capture.cameras))
     for light in capture.light_ids:
         if capture.frame_path(subject, camera, light).is_file():

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.stage_json import STAGE_FILE
 from facerf_cli.files.images import read_image
-from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.checks.subject import check_subject
-from facerf_cli.stage.data.layouts import read_capture
-from facerf_cli.stage.data.stage_file import STAGE_FILE
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lamps whose frames are touched
 

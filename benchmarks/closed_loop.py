@@ -8,7 +8,7 @@ and a dim one in front. `texture` relights the face in the chart and estimates f
 does what a user would: `facerf relight`, its 8-bit PNG into `facerf estimate-light`, which finds and fits the
 face anew; where the detector takes something else for the face the case is said and left out.
 
-- angle: between the brightest directions (`light/brightest.py`), in degrees.
+- angle: between the brightest directions (`light/rig_latlong.py`), in degrees.
 - weights: |estimate - truth| / |truth| over the 150 lights' rgb weights. How bright a light is cannot be told
   from how bright the skin is, so also after the one factor that fits best (scaled). SH: the same of the
   coefficients up to order 2, which is about what a matt face can tell.
@@ -29,21 +29,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.commands.inputs import Item
-from facerf_cli.commands.options import Settings
-from facerf_cli.commands.photo import PhotoOptions, fit_faces, load_models_once, read_photo
-from facerf_cli.commands.photo_light import LIGHT_FEATURES
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.light_options import LIGHT_FEATURES
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.photo_options import PhotoOptions, fit_faces, load_models_once, read_photo
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import read_image
 from facerf_cli.files.light_files import read_light
-from facerf_cli.light.brightest import brightest_direction
 from facerf_cli.light.envmap import rotated_weights
-from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.rig_latlong import brightest_direction
 from facerf_cli.light.sh import rig_coefficients
-from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.main import main as facerf
 from facerf_cli.metrics import light_error_deg
-from facerf_cli.objectives.feature_networks import load_light_features
 from facerf_cli.pipeline import (
     FaceTexture,
     explain_photo,
@@ -52,6 +50,7 @@ from facerf_cli.pipeline import (
     refine_photo_light,
     weigh_batches,
 )
+from facerf_cli.training.pretrained import load_light_features
 
 PHOTOS = [Path("examples/astronaut.jpg"), Path("../shared/data/photos")]
 TURNS_DEG = (0, 120)  # evenly spaced from 0, as --rotate FROM:TO:N has them
@@ -77,7 +76,7 @@ def main() -> None:
     rows = []
     for photo in (path for entry in given.photos for path in _photos(entry)):
         for way in given.way:
-            estimates = in_texture if way == "texture" else through_picture
+            estimates = in_texture if way == "texture" else through_image
             for light, found in estimates(photo, lights, given):
                 rows.append({"way": way, "photo": photo.stem, "light": light.name, **compared(found, light)})
                 print(
@@ -156,7 +155,7 @@ def in_texture(photo: Path, lights: list[Known], given: argparse.Namespace) -> I
         yield light, weights
 
 
-def through_picture(
+def through_image(
     photo: Path, lights: list[Known], given: argparse.Namespace
 ) -> Iterator[tuple[Known, Tensor]]:
     """Through an 8-bit PNG of the whole photo and the two commands."""

@@ -20,15 +20,23 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.transform import resize
 
+from facerf_cli.capture.colour_chart import outlined
+from facerf_cli.capture.find_colour_chart import (
+    PATCH_SIDE,
+    area_corners,
+    delta_e_2000,
+    find_chart,
+    fit_colours,
+    neutral_matrix,
+    published_colours,
+    sample,
+    squares_px,
+)
+from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.report import contact_sheet
-from facerf_cli.stage.chart.colours import delta_e_2000, fit_colours, neutral_matrix, published_colours
-from facerf_cli.stage.chart.find import find_chart
-from facerf_cli.stage.chart.overlay import outlined
-from facerf_cli.stage.chart.patches import PATCH_SIDE, area_corners, sample, squares_px
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # the renderer is the tests'
-from tests.stage.chart.chart_picture import background, chart_picture
+from tests.capture.chart_image import background, chart_image
 
 SHAPE = (360, 480)
 _DISTANCE = 2.5  # of the camera, in widths of the chart
@@ -43,7 +51,7 @@ def main() -> None:
         "--photos", type=Path, nargs="+", help="photographs in the place of rendered pictures"
     )
     options = parser.parse_args()
-    tiles = [told(path) for path in options.photos] if options.photos else counted(options.pictures)
+    tiles = [told(path) for path in options.photos] if options.photos else counted(options.images)
     if options.sheet:
         sized = [resize(tile, (*SHAPE, 3), anti_aliasing=True) for tile in tiles[:_SHOWN]]
         write_display(options.sheet, contact_sheet(np.stack(sized)))
@@ -51,30 +59,30 @@ def main() -> None:
 
 def told(path: Path) -> np.ndarray:
     """A photograph [H, W, 3], outlined, after a line of what is found in it."""
-    picture = read_image(path).pixels
-    found = find_chart(picture)
+    image = read_image(path).pixels
+    found = find_chart(image)
     if found is None:
         print(f"{path.name}: not found")
-        return picture
-    fit = fit_colours(sample(picture, found).colours)
+        return image
+    fit = fit_colours(sample(image, found).colours)
     before, after = fit.delta_e_before.mean(), fit.delta_e_after.mean()
     print(f"{path.name}: found; mean delta E 2000 {before:.1f} before, {after:.1f} after the fit")
-    return outlined(picture, found)
+    return outlined(image, found)
 
 
-def counted(pictures: int) -> list[np.ndarray]:
+def counted(images: int) -> list[np.ndarray]:
     """Rendered pictures [H, W, 3], outlined, after lines of what is found in all."""
     rows, tiles, seconds = [], [], 0.0
-    for seed in range(pictures):
-        picture, corners_px, camera = draw_photograph(seed)
+    for seed in range(images):
+        image, corners_px, camera = draw_photograph(seed)
         begun_s = time.perf_counter()
-        found = find_chart(picture)
+        found = find_chart(image)
         seconds += time.perf_counter() - begun_s
-        rows.append(figures(picture, corners_px, camera, found))
-        tiles += [picture if found is None else outlined(picture, found)]
-    print(summary(np.array(rows)), f"{seconds / pictures:.2f} s a picture", sep="\n")
-    false = sum(find_chart(surroundings(seed)) is not None for seed in range(pictures))
-    print(f"without a chart: {false} of {pictures} pictures taken for one")
+        rows.append(figures(image, corners_px, camera, found))
+        tiles += [image if found is None else outlined(image, found)]
+    print(summary(np.array(rows)), f"{seconds / images:.2f} s a picture", sep="\n")
+    false = sum(find_chart(surroundings(seed)) is not None for seed in range(images))
+    print(f"without a chart: {false} of {images} pictures taken for one")
     return tiles
 
 
@@ -85,8 +93,8 @@ def draw_photograph(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     camera = np.eye(3) + np.where(np.eye(3), 0.25, 0.15) * draw.uniform(-1, 1, (3, 3))
     light = np.exp(draw.uniform(-0.25, 0.25, 2))
     noise, clutter = draw.uniform(0.002, 0.02), draw.uniform(0, 1)
-    picture = chart_picture(corners_px, SHAPE, camera, light, noise, clutter, seed)
-    blurred = ndimage.gaussian_filter(picture, (*[draw.uniform(0, 1.2)] * 2, 0))
+    image = chart_image(corners_px, SHAPE, camera, light, noise, clutter, seed)
+    blurred = ndimage.gaussian_filter(image, (*[draw.uniform(0, 1.2)] * 2, 0))
     y, x = (np.linspace(-1, 1, side) for side in SHAPE)
     return blurred * (1 - 0.15 * (y[:, None, None] ** 2 + x[:, None] ** 2)), corners_px, camera
 
@@ -104,7 +112,7 @@ def draw_corners(draw: np.random.Generator) -> np.ndarray:
 
 
 def figures(
-    picture: np.ndarray, corners_px: np.ndarray, camera: np.ndarray, found: np.ndarray | None
+    image: np.ndarray, corners_px: np.ndarray, camera: np.ndarray, found: np.ndarray | None
 ) -> tuple[float, ...]:
     """A patch's smaller side in pixels, whether found, corners' error in patches, delta E before, after."""
     patches = squares_px(corners_px, PATCH_SIDE)
@@ -113,7 +121,7 @@ def figures(
         return side_px, 0, np.nan, np.nan, np.nan
     off = np.linalg.norm(found - corners_px, axis=-1).max() / side_px
     seen = published_colours() @ camera.T
-    matrix = fit_colours(sample(picture, found).colours).matrix
+    matrix = fit_colours(sample(image, found).colours).matrix
     errors = [
         delta_e_2000(colours / neutral_matrix(colours, published_colours())[1], published_colours()).mean()
         for colours in (seen, seen @ matrix.T)

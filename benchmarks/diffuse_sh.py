@@ -21,26 +21,24 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
 from facerf_cli.baselines.field import Field, explain_by_field
-from facerf_cli.baselines.reflectance import Explained
-from facerf_cli.evaluation.views import View
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import Pair, image_path, read_pairs
+from facerf_cli.evaluation.methods import View
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.intervals import mean_interval
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.metrics import si_mse_clipped
-from facerf_cli.network.diffuse import DiffuseNetwork
-from facerf_cli.network.losses import clipped_si_mse
-from facerf_cli.objectives.diffuse import draw_sums, explained, summed
-from facerf_cli.objectives.objective import seeded
+from facerf_cli.metrics import mean_interval, si_mse_clipped
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.pipeline import FaceTexture, Models, estimate_photo_light, load_models, turn_to, weigh
-from facerf_cli.stage.bank import Bank, geometry_of
-from facerf_cli.stage.data.dataset import Dataset, read_dataset
-from facerf_cli.stage.data.recipes import Pair, picture_path, read_pairs
-from facerf_cli.stage.lights import draw_light
-from facerf_cli.stage.samples import Sample
+from facerf_cli.synth.heads_bank import Bank, geometry_of
+from facerf_cli.synth.texture_samples import Sample, draw_light
+from facerf_cli.training.diffuse_sh_objective import draw_sums, explained, summed
+from facerf_cli.training.losses import clipped_si_mse
+from facerf_cli.training.objective import seeded
 
 _COARSE_RIG = 50  # lights over which the field explains a source
 _HELD_OUT, _LIGHTS, _SUMS = 12, 8, 3  # of the stage's validation
@@ -79,7 +77,7 @@ def _print(errors: Errors) -> None:
         found = mean_interval(values)
         assert found
         interval = f"{found.mean:.5f} [{found.low:.5f}, {found.high:.5f}], sd {found.sd:.5f}"
-        print(f"{figure:20} {method:10} {interval}, {found.pictures} pictures of {found.groups}")
+        print(f"{figure:20} {method:10} {interval}, {found.images} pictures of {found.groups}")
 
 
 def on_heads(models: Models, network: DiffuseNetwork, folder: Path, draws: int) -> Errors:
@@ -136,8 +134,8 @@ def _on_pair(
     source, target = (
         _view(models, dataset, pair.subject, c) for c in (pair.source_camera, pair.target_camera)
     )
-    picture = read_image(picture_path(dataset, *pair.key)).pixels
-    face, stack = source.texture_of(picture), dataset.stack_path(pair.subject, pair.target_camera)
+    image = read_image(image_path(dataset, *pair.key)).pixels
+    face, stack = source.texture_of(image), dataset.stack_path(pair.subject, pair.target_camera)
     directions = torch.from_numpy(read_olat_header(stack).directions).float()
     weights = torch.stack([draw_light(directions, seeded(7, pair.index, k)) for k in range(2)])
     truths = weigh(read_olats(stack).float(), weights).permute(0, 2, 3, 1).numpy()
@@ -146,7 +144,7 @@ def _on_pair(
     for method in methods:
         found = _explained(method, models, network, face)
         own = found.reflectance.relit(found.light.directions, found.light.weights[None])[0]
-        yield "source", method, _error(source, own, picture)
+        yield "source", method, _error(source, own, image)
         for texture, truth in zip(found.reflectance.relit(directions, weights, turn), truths, strict=True):
             yield f"relit, {pose} pose", method, _error(target, texture, truth)
 
@@ -164,7 +162,7 @@ def _view(models: Models, dataset: Dataset, subject: str, camera: str) -> View:
 
 def _error(view: View, texture: Tensor, truth: np.ndarray) -> float:
     mean = (truth.mean(-1) * view.mask).sum() / view.mask.sum()
-    return si_mse_clipped(view.picture(texture), truth * (_MEAN / mean), view.mask)
+    return si_mse_clipped(view.image(texture), truth * (_MEAN / mean), view.mask)
 
 
 if __name__ == "__main__":

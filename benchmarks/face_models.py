@@ -22,8 +22,8 @@ import numpy as np
 import scipy.io
 from scipy import sparse
 
-from facerf_cli.face.importers.basel_2009 import read_basel_2009
-from facerf_cli.face.importers.basel_2017 import _LANDMARKS, read_basel_2017
+from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
+from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
 from facerf_cli.face.importers.carry import landmarks_of
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit

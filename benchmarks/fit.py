@@ -18,7 +18,8 @@ import numpy as np
 import skimage.data
 import torch
 
-from facerf_cli.evaluation.yale_b_cases import SETTINGS_SUBJECTS, Sitter, face_mask
+from facerf_cli.capture.yale_b import read_shifts, read_yale_b
+from facerf_cli.evaluation.protocols.yale_b_cases import SETTINGS_SUBJECTS, Sitter, face_mask
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, FitSettings, fit_batch, fit_landmarks, trust_inside
 from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
@@ -28,7 +29,6 @@ from facerf_cli.files.images import read_image
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.stage.data.yale_b import read_shifts, read_yale_b
 
 SUBJECTS = ("yaleB05", "yaleB15", "yaleB22")
 Truth = tuple[np.ndarray, np.ndarray]  # normals [H, W, 3], where they are known [H, W]
@@ -141,10 +141,10 @@ def faces_per_second(model: MorphableModel, batch: int = 64) -> float:
 
 
 def score(
-    model: MorphableModel, pictures: list[Photo], yale: list[tuple[Photo, list[Truth]]], settings: FitSettings
+    model: MorphableModel, images: list[Photo], yale: list[tuple[Photo, list[Truth]]], settings: FitSettings
 ) -> str:
     """One line: landmark errors in percent of the inter-ocular distance, angles in degrees."""
-    errors = [100 * fit(model, photo, settings).error_iod for photo in pictures]
+    errors = [100 * fit(model, photo, settings).error_iod for photo in images]
     yale_errors, fitted, neutral = [], [], []
     for photo, truths in yale:
         found = fit(model, photo, settings)
@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--all", action="store_true", help="all subjects of Yale B")
     options = parser.parse_args()
     model = load_face_model(options.face_model)
-    pictures = photos(options.shared)
+    images = photos(options.shared)
     shifts = read_shifts(options.shared / "bench/yale_b/shifts.csv")
     database = read_yale_b(options.shared / "data/extended_yale_b", shifts)
     chosen = SETTINGS_SUBJECTS if options.sweep else SUBJECTS
@@ -184,14 +184,14 @@ def main() -> None:
     yale = []
     for subject in subjects:
         sitter = Sitter(database, subject)
-        frontal = np.round(255 * sitter.picture("frontal")).astype(np.uint8)
+        frontal = np.round(255 * sitter.image("frontal")).astype(np.uint8)
         photo = look_at(subject, np.repeat(frontal[..., None], 3, -1))
         yale.append((photo, yale_truths(sitter)))
-    print(model.name, "| photos:", *(photo.name for photo in pictures), "| yale:", *subjects)
+    print(model.name, "| photos:", *(photo.name for photo in images), "| yale:", *subjects)
     if options.sweep:
         for settings in settings_to_try():
-            print(settings, score(model, pictures, yale, settings), flush=True)
-    print(score(model, pictures, yale, FitSettings()))
+            print(settings, score(model, images, yale, settings), flush=True)
+    print(score(model, images, yale, FitSettings()))
     print(f"{faces_per_second(model):.0f} faces a second at B=64 on {torch.get_num_threads()} thread(s)")
 
 

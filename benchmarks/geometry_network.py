@@ -21,9 +21,9 @@ import skimage.data
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FitSettings, better_start, fit_batch, problem_of
-from facerf_cli.face.fit_start import FitStart, started
+from facerf_cli.face.fit import FitSettings, FitStart, better_start, fit_batch, problem_of, started
 from facerf_cli.face.gauss_newton import (
     FitState,
     Problem,
@@ -42,12 +42,11 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, LAYOUT_VERSION, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.geometry import GeometryNetwork
-from facerf_cli.network.saved import load_networks
-from facerf_cli.objectives.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.stage.data.dataset import read_dataset
-from facerf_cli.stage.rendered_faces import RenderedFaces
+from facerf_cli.synth.image_samples import RenderedFaces
+from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 
 CROP_PX = 256
 MOST_STEPS = 40
@@ -154,11 +153,11 @@ def captured(folder: Path, cameras: list[str], subjects: int) -> tuple[Tensor, T
 
 
 def photos(shared: Path) -> tuple[Tensor, Tensor]:
-    pictures = [("astronaut", (skimage.data.astronaut() / 255.0) ** 2.2)]
+    images = [("astronaut", (skimage.data.astronaut() / 255.0) ** 2.2)]
     for path in sorted((shared / "data/photos").glob("*.jpg")):
-        pictures.append((path.stem, read_image(path).pixels))
+        images.append((path.stem, read_image(path).pixels))
     crops, landmarks = [], []
-    for name, pixels in pictures:
+    for name, pixels in images:
         linear = np.asarray(pixels, np.float32)
         (face,) = choose_face(detect_landmarks(to_display(linear)), "largest", name)
         crop = from_landmarks(face.landmarks_px, CROP_PX)
@@ -207,8 +206,8 @@ def main() -> None:
           f"{milliseconds(network):.1f} ms of processor time a crop on "
           f"{torch.get_num_threads()} thread(s); "
           f"a step of one face's fit {milliseconds_of_a_step():.1f} ms")  # fmt: skip
-    if given.pictures:
-        report_held_out(network, given.pictures, given.draws)
+    if given.images:
+        report_held_out(network, given.images, given.draws)
     if given.dataset:
         report(
             "dataset, lit all round",

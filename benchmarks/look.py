@@ -89,8 +89,8 @@ def _row(photo: Path, folder: Path, envmap: Path, cell_px: int) -> list[np.ndarr
     (own,) = (path for path in folder.iterdir() if path.name.rsplit("-", 1)[0] == photo.stem)
     relit = [read_image(own / f"{photo.stem}_{shot}.png").pixels for shot in shots]
     beyond = ~frame.valid(*original.shape[:2])
-    shown = [_displayed(frame.apply(picture)) for picture in (original, *relit)]
-    return [np.where(beyond[..., None], np.uint8(255), picture) for picture in shown]
+    shown = [_displayed(frame.apply(image)) for image in (original, *relit)]
+    return [np.where(beyond[..., None], np.uint8(255), image) for image in shown]
 
 
 def _head(photo: np.ndarray, path: Path, cell_px: int) -> Crop:
@@ -111,12 +111,12 @@ def _labels(photo: Path, checkpoint: str, envmap: Path) -> list[str]:
     return [f"{photo.stem}  {checkpoint}".strip(), *LAMPS, envmap.stem]
 
 
-def _labelled(pictures: list[np.ndarray], labels: list[str], cell_px: int) -> np.ndarray:
+def _labelled(images: list[np.ndarray], labels: list[str], cell_px: int) -> np.ndarray:
     """A row of the sheet with words above its pictures."""
-    row = Image.new("RGB", (cell_px * len(pictures), cell_px + _LABEL_PX), "white")
+    row = Image.new("RGB", (cell_px * len(images), cell_px + _LABEL_PX), "white")
     draw = ImageDraw.Draw(row)
-    for column, (picture, label) in enumerate(zip(pictures, labels, strict=True)):
-        row.paste(Image.fromarray(picture), (column * cell_px, _LABEL_PX))
+    for column, (image, label) in enumerate(zip(images, labels, strict=True)):
+        row.paste(Image.fromarray(image), (column * cell_px, _LABEL_PX))
         draw.text((column * cell_px + 4, 5), label, fill="black")
     return np.asarray(row)
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from capture_copy import Copy
 from capture_faults import FAULTS, Fault
 
-from facerf_cli.stage.checks.findings import Finding
-from facerf_cli.stage.data.layouts import read_capture
+from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.layouts import read_capture
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.relight import multiply
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import StackHeader, read_olats, write_olat_stack
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.stage.data.relighting import multiply
-from facerf_cli.stage.sky.skies import draw_sky
+from facerf_cli.synth.sky.skies import draw_sky
 
 _ROUNDS = 5
 
@@ -37,9 +37,9 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     olats = some_stack(given.lights, given.side)
-    weights = some_weights(given.lights, given.pictures)
+    weights = some_weights(given.lights, given.images)
     print(
-        f"{given.pictures} pictures of {given.side} x {given.side} pixels from {given.lights} lights, "
+        f"{given.images} pictures of {given.side} x {given.side} pixels from {given.lights} lights, "
         f"{torch.get_num_threads()} threads"
     )
     measure_product(olats, weights)
@@ -48,12 +48,12 @@ def main() -> None:
 
 def measure_product(olats: Tensor, weights: Tensor) -> None:
     """Print times of the three ways, and how far ours is from float32."""
-    pictures = torch.empty(len(weights), *olats.shape[1:], dtype=torch.float16)
+    images = torch.empty(len(weights), *olats.shape[1:], dtype=torch.float16)
     stack = olats.permute(1, 0, 2, 3).reshape(3, len(olats), -1).float()  # [3, L, P]
     by_channel = weights.permute(2, 0, 1).contiguous()  # [3, M, L]
     few = max(1, len(weights) // 25)
     ways: dict[str, Callable[[], object]] = {
-        "ours": lambda: multiply(olats, weights, pictures),
+        "ours": lambda: multiply(olats, weights, images),
         "bare torch.matmul": lambda: torch.matmul(by_channel, stack),
         "loop over lights": lambda: naive(olats, weights[:few]),
     }
@@ -70,17 +70,17 @@ def measure_product(olats: Tensor, weights: Tensor) -> None:
             f"  {name:18s} {seconds:8.3f} s  {rate:7.1f} GFLOP/s  {share:5.2f} of bare torch.matmul's speed"
         )
     truth = torch.matmul(by_channel[:, :few], stack).transpose(0, 1).reshape(few, *olats.shape[1:])
-    difference = relative(pictures[:few].float(), truth)
+    difference = relative(images[:few].float(), truth)
     print(f"  largest relative difference to float32: {difference:.1e} (half a step of halfs is 4.9e-4)")
 
 
 def naive(olats: Tensor, weights: Tensor) -> Tensor:
     """Picture by picture, light by light."""
-    pictures = torch.zeros(len(weights), *olats.shape[1:])
-    for picture, weight in zip(pictures, weights, strict=True):
+    images = torch.zeros(len(weights), *olats.shape[1:])
+    for image, weight in zip(images, weights, strict=True):
         for olat, rgb in zip(olats, weight, strict=True):
-            picture += rgb[:, None, None] * olat.float()
-    return pictures
+            image += rgb[:, None, None] * olat.float()
+    return images
 
 
 def measure_disk(olats: Tensor, weights: Tensor) -> None:
@@ -90,15 +90,15 @@ def measure_disk(olats: Tensor, weights: Tensor) -> None:
     directions = rig_directions(len(olats)).numpy()
     blank = normals[..., 0]
     header = StackHeader("image", directions, np.eye(3), normals, blank, normals, LAYOUT_VERSION, {})
-    pictures = torch.empty(8, *olats.shape[1:], dtype=torch.float16)
-    multiply(olats, weights[:8], pictures)
+    images = torch.empty(8, *olats.shape[1:], dtype=torch.float16)
+    multiply(olats, weights[:8], images)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "stack.exr")
         write_olat_stack(path, header, [olats])
         read_s = min(timed(lambda: read_olats(path)) for _ in range(2))
         megabytes, packed = 2 * olats.numel() / 1e6, path.stat().st_size / 1e6
         print(f"  stack read in {read_s:.2f} s: {megabytes / read_s:.0f} MB/s ({packed:.0f} MB on disk)")
-        pixels = [picture.permute(1, 2, 0).float().numpy() for picture in pictures]
+        pixels = [image.permute(1, 2, 0).float().numpy() for image in images]
         write_s = timed(lambda: [write_exr(Path(folder, f"{i}.exr"), x) for i, x in enumerate(pixels)]) / 8
         size = Path(folder, "0.exr").stat().st_size / 1e3
         print(f"  a picture written in {1000 * write_s:.1f} ms ({size:.0f} kB)")
@@ -117,11 +117,11 @@ def some_stack(lights: int, side: int) -> Tensor:
     return stack.copy_(cosine[:, None] * grain)
 
 
-def some_weights(lights: int, pictures: int) -> Tensor:
+def some_weights(lights: int, images: int) -> Tensor:
     """Weights [M, L, 3] of procedural skies."""
     turns = tuple(360 * k / 10 for k in range(10))
-    maps = [torch.from_numpy(draw_sky(index, 0, 128)[0]) for index in range(-(-pictures // 10))]
-    return torch.cat([rotated_weights(sky, rig_directions(lights), turns) for sky in maps])[:pictures]
+    maps = [torch.from_numpy(draw_sky(index, 0, 128)[0]) for index in range(-(-images // 10))]
+    return torch.cat([rotated_weights(sky, rig_directions(lights), turns) for sky in maps])[:images]
 
 
 def relative(values: Tensor, truth: Tensor) -> float:

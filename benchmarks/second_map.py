@@ -14,8 +14,9 @@ from typing import TypeVar
 
 import torch
 
-from facerf_cli.face.composite import Surround, composite, photo_camera, view_face
+from facerf_cli.composite import Surround, composite
 from facerf_cli.face.landmarks import find_faces
+from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.images import read_image
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import rig_directions

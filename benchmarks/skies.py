@@ -14,7 +14,7 @@ import numpy as np
 
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.light.sphere import latlong_solid_angles
-from facerf_cli.stage.sky.skies import KINDS, MIX, draw_sky
+from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky
 
 EDGES = np.array([-9, -1, -0.5, -0.25, 0, 0.25, 0.5, 1, 1.5, 2, 3, 9])  # log10 of radiance to the median's
 CHROMA_EDGES = np.array([-9, -1, -0.5, -0.2, 0.2, 0.5, 1, 9])  # log2 of red to blue
@@ -81,8 +81,8 @@ def main() -> None:
     parser.add_argument("--kind", action="append", choices=list(KINDS))
     options = parser.parse_args()
     paths = sorted(path for path in options.hdri.iterdir() if path.suffix in (".hdr", ".exr"))
-    pictures = (read_image(path, limit_px=ENVMAP_LIMIT_PX).pixels for path in paths)
-    real = [numbers(halved_to(pixels, options.width)) for pixels in pictures]
+    images = (read_image(path, limit_px=ENVMAP_LIMIT_PX).pixels for path in paths)
+    real = [numbers(halved_to(pixels, options.width)) for pixels in images]
     kinds = tuple(options.kind or MIX)
     drawn = [numbers(draw_sky(i, options.seed, options.width, kinds)[0]) for i in range(options.maps)]
     print("real:", ", ".join(path.stem for path in paths))

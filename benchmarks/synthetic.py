@@ -29,16 +29,15 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from facerf_cli.face.regions import region_mask
-from facerf_cli.intervals import Interval, mean_interval
-from facerf_cli.metrics import TONES, ita_deg, tone_drift_deg, tone_of
-from facerf_cli.network.losses import clipped_si_mse, si_mse
-from facerf_cli.objectives.objective import seeded
+from facerf_cli.face.topology import region_mask
+from facerf_cli.metrics import TONES, Interval, ita_deg, mean_interval, tone_drift_deg, tone_of
 from facerf_cli.pipeline import load_models
-from facerf_cli.stage.appearance import skin as appearance
-from facerf_cli.stage.appearance.people import People, draw_people
-from facerf_cli.stage.bank import Bank, geometry_of
-from facerf_cli.stage.samples import Sample
+from facerf_cli.synth.appearance import skin as appearance
+from facerf_cli.synth.appearance.people import People, draw_people
+from facerf_cli.synth.heads_bank import Bank, geometry_of
+from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.training.losses import clipped_si_mse, si_mse
+from facerf_cli.training.objective import seeded
 
 HELD_OUT = 12  # as `facerf train` holds out
 ANGLES_DEG = (0, 30, 60, 90, 180)  # between the light and the camera
@@ -47,7 +46,7 @@ _SEED = 2021
 
 
 @dataclass(frozen=True)
-class Picture:
+class LinearImage:
     """One relit texture of a held-out head, and what is known of it."""
 
     head: int
@@ -64,8 +63,8 @@ def main() -> None:
     given = _arguments()
     bank, heads = held_out_bank(given.bank, given.fit_with, given.held_out)
     network = load_models(given.checkpoint, "builtin", torch.device("cpu")).network
-    pictures = list(measure(network, bank, heads, given.draws, given.lights))
-    found = summary(pictures) | {"checkpoint": str(given.checkpoint or "shipped")}
+    images = list(measure(network, bank, heads, given.draws, given.lights))
+    found = summary(images) | {"checkpoint": str(given.checkpoint or "shipped")}
     print(table(found))
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n")
@@ -100,7 +99,7 @@ def held_out_bank(folder: Path, fit_with: str, count: int) -> tuple[Bank, Tensor
 
 
 @torch.no_grad()
-def measure(network: Any, bank: Bank, heads: Tensor, draws: int, lights: int) -> Iterator[Picture]:
+def measure(network: Any, bank: Bank, heads: Tensor, draws: int, lights: int) -> Iterator[LinearImage]:
     """Every head `draws` times; a sample depends on its head and number alone."""
     for head in heads.tolist():
         for number in range(draws):
@@ -108,7 +107,7 @@ def measure(network: Any, bank: Bank, heads: Tensor, draws: int, lights: int) ->
                 sample = bank.draw(torch.tensor([head]), lights, seeded(_SEED, head, number))
             encoded = network.encode(sample.source, sample.normals_source, sample.visible)
             predicted = network.decode(encoded, sample.normals_target, sample.lights)
-            yield from _pictures(head, sample, predicted, people[-1])
+            yield from _images(head, sample, predicted, people[-1])
 
 
 @contextmanager
@@ -124,7 +123,7 @@ def _recorded() -> Iterator[list[People]]:
         yield seen
 
 
-def _pictures(head: int, sample: Sample, predicted: Tensor, person: People) -> Iterator[Picture]:
+def _images(head: int, sample: Sample, predicted: Tensor, person: People) -> Iterator[LinearImage]:
     cosine = torch.einsum("blc,bcij->blij", sample.lights, sample.normals_target).clamp_min(0)
     lambert = sample.source[:, None] * cosine[:, :, None]
     measured = (
@@ -142,40 +141,40 @@ def _pictures(head: int, sample: Sample, predicted: Tensor, person: People) -> I
             drift_deg = drift_of(predicted[0, light], sample.target[0, light], sample.weight[0, 0], albedo)
         angle_deg = float(torch.rad2deg(direction[2].clamp(-1, 1).acos()))
         whole, clipped, naive = errors[light]
-        yield Picture(head, same, angle_deg, tone, whole, clipped, naive, drift_deg)
+        yield LinearImage(head, same, angle_deg, tone, whole, clipped, naive, drift_deg)
 
 
 def drift_of(predicted: Tensor, truth: Tensor, weight: Tensor, albedo: np.ndarray) -> float | None:
     """`metrics.tone_drift_deg` of a relit skin: textures [3, T, T], weight [T, T], the skin's albedo [3]."""
     side = truth.shape[-1]
     skin = region_mask("skin", side) * region_mask("face", side) * weight
-    ours, true = (picture.permute(1, 2, 0).numpy() for picture in (predicted, truth))
+    ours, true = (image.permute(1, 2, 0).numpy() for image in (predicted, truth))
     return tone_drift_deg(ours, true, skin.numpy(), albedo)
 
 
-def summary(pictures: list[Picture]) -> dict[str, Any]:
+def summary(images: list[LinearImage]) -> dict[str, Any]:
     """Figures by row, each with its interval over heads."""
     rows = {
-        "same pose": [p for p in pictures if p.same_pose],
-        "different pose": [p for p in pictures if not p.same_pose],
+        "same pose": [p for p in images if p.same_pose],
+        "different pose": [p for p in images if not p.same_pose],
     }
     for low, high in pairwise(ANGLES_DEG):
-        rows[f"{low} to {high} deg"] = [p for p in pictures if low <= p.angle_deg < high]
-    tones = {tone: [p for p in pictures if p.tone == tone] for tone in TONES}
-    tones["random colours"] = [p for p in pictures if p.tone is None]
+        rows[f"{low} to {high} deg"] = [p for p in images if low <= p.angle_deg < high]
+    tones = {tone: [p for p in images if p.tone == tone] for tone in TONES}
+    tones["random colours"] = [p for p in images if p.tone is None]
     return {
         "rows": {name: _errors(chosen) for name, chosen in rows.items()},
         "tones": {name: _errors(chosen) | _drifts(chosen) for name, chosen in tones.items()},
     }
 
 
-def _errors(pictures: list[Picture]) -> dict[str, Any]:
+def _errors(images: list[LinearImage]) -> dict[str, Any]:
     measures = ("si_mse", "clipped", "lambert")
-    return {name: _plain(mean_interval((p.head, getattr(p, name)) for p in pictures)) for name in measures}
+    return {name: _plain(mean_interval((p.head, getattr(p, name)) for p in images)) for name in measures}
 
 
-def _drifts(pictures: list[Picture]) -> dict[str, Any]:
-    drifts = [(p.head, p.drift_deg) for p in pictures if p.drift_deg is not None]
+def _drifts(images: list[LinearImage]) -> dict[str, Any]:
+    drifts = [(p.head, p.drift_deg) for p in images if p.drift_deg is not None]
     size = mean_interval((head, abs(drift)) for head, drift in drifts)
     return {"drift_deg": _plain(mean_interval(drifts)), "drift_size_deg": _plain(size)}
 

@@ -23,17 +23,17 @@ import numpy as np
 import torch
 from synthetic import held_out_bank
 
+from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.network.features import LightNetwork, VggFeatures
+from facerf_cli.network.feature_networks import LightNetwork, VggFeatures
 from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
-from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
-from facerf_cli.objectives.chart import ChartObjective
-from facerf_cli.objectives.joint import JointObjective
-from facerf_cli.objectives.objective import Objective, Validation, seeded
-from facerf_cli.runs.settings import PRESETS, TrainSettings
-from facerf_cli.stage.data.dataset import read_dataset
-from facerf_cli.training import train
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
+from facerf_cli.training.joint_objective import JointObjective
+from facerf_cli.training.loop import train
+from facerf_cli.training.objective import Objective, Validation, seeded
+from facerf_cli.training.settings import PRESETS, TrainSettings
+from facerf_cli.training.texture_objective import ChartObjective
 
 _HEADS = 40  # of the bank, besides the mean face: a step does not depend on how many there are
 _TINY_WIDTHS = (8, 12, 16)  # as `facerf train --preset tiny` has them

@@ -27,13 +27,13 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
-from facerf_cli.stage import bake_renderer, path_tracer
-from facerf_cli.stage.appearance.materials import Appearance, draw_appearance
-from facerf_cli.stage.bake_renderer import RenderSettings
-from facerf_cli.stage.head.heads import build_head
-from facerf_cli.stage.head.mesh import HeadMesh
-from facerf_cli.stage.path_tracer import PathSettings
-from facerf_cli.stage.stage_camera import StageCamera
+from facerf_cli.synth import bake_renderer, path_tracer
+from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
+from facerf_cli.synth.bake_renderer import RenderSettings
+from facerf_cli.synth.head.heads import build_head
+from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.path_tracer import PathSettings
+from facerf_cli.synth.views import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and what a picture's side takes in
 CHART = 128  # texels along the chart's side
@@ -83,8 +83,8 @@ def main() -> None:
         if bounces == 0:
             truth = theirs
         results[bounces] = compare(model, alpha, cameras, ours, theirs, truth)
-        if arguments.pictures is not None:
-            write_pictures(arguments.pictures, bounces, ours, theirs)
+        if arguments.images is not None:
+            write_images(arguments.images, bounces, ours, theirs)
     print(
         f"{model.name}, {arguments.size} px, {arguments.samples} paths a pixel, {results[0].texels} texels\n"
     )
@@ -96,11 +96,11 @@ def main() -> None:
         print(f"{name} {direct:6.1%} {direct_lit:6.1%}     {total:6.1%} {total_lit:6.1%}", end="")
         print(f"{results[1].means[light]:16.4f}")
     print()
-    per_picture = {name: float(np.mean(values)) for name, values in times.items()}
-    print(f"bake of {len(angles)} lights {per_picture['bake']:.2f} s, ", end="")
-    print(f"their irradiance {per_picture['irradiance']:.2f} s")
-    print(f"a picture: bake {1000 * per_picture['photograph']:.0f} ms, ", end="")
-    print(f"mitsuba {1000 * per_picture['mitsuba']:.0f} ms ({arguments.samples} paths a pixel)")
+    per_image = {name: float(np.mean(values)) for name, values in times.items()}
+    print(f"bake of {len(angles)} lights {per_image['bake']:.2f} s, ", end="")
+    print(f"their irradiance {per_image['irradiance']:.2f} s")
+    print(f"a picture: bake {1000 * per_image['photograph']:.0f} ms, ", end="")
+    print(f"mitsuba {1000 * per_image['mitsuba']:.0f} ms ({arguments.samples} paths a pixel)")
 
 
 def stage_camera(side_px: int, yaw_deg: float) -> StageCamera:
@@ -171,8 +171,8 @@ def compare(
         at = vertices @ camera.head_to_camera.T + camera.translation_m
         for light in range(len(our)):
             (a, seen), (b, _), (c, _) = (
-                unwrap(pictures[light], at, grid_triangles(), camera.camera, CHART)
-                for pictures in (our, their, lamp)
+                unwrap(images[light], at, grid_triangles(), camera.camera, CHART)
+                for images in (our, their, lamp)
             )
             lit = c.mean(0) > LIT * their.max()
             edge = binary_dilation(lit, iterations=EDGE_TEXELS) & binary_dilation(
@@ -195,7 +195,7 @@ def _errors(ours: Tensor, theirs: Tensor, lit: Tensor) -> tuple[float, float, fl
     return float(squares.mean().sqrt()) / mean, float(squares[:, lit].mean().sqrt()) / mean, mean
 
 
-def write_pictures(folder: Path, bounces: int, ours: list[Tensor], theirs: list[Tensor]) -> None:
+def write_images(folder: Path, bounces: int, ours: list[Tensor], theirs: list[Tensor]) -> None:
     """Ours above theirs above four times the difference, one file a camera."""
     folder.mkdir(parents=True, exist_ok=True)
     for camera, (our, their) in enumerate(zip(ours, theirs, strict=True)):

@@ -23,13 +23,13 @@ import numpy as np
 import torch
 from yale_table import Row, results, table
 
+from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import FacerfError
-from facerf_cli.evaluation.cases import Comparison
+from facerf_cli.evaluation.case import Comparison
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.yale_b import compare_sitter
+from facerf_cli.evaluation.protocols.yale_b import compare_sitter
 from facerf_cli.metrics import si_mse, ssim
 from facerf_cli.pipeline import load_models
-from facerf_cli.stage.data.yale_b import YaleB, read_shifts, read_yale_b
 
 SHARED = Path("../shared")
 
@@ -124,15 +124,15 @@ def score_subject(task: Task, subject: str) -> list[list[Row]]:
 
 def _row(comparison: Comparison, method: str) -> Row:
     facts, (subject, source, light) = comparison.case.facts, comparison.case.name.split("/")
-    pictures = comparison.predictions[method], comparison.truth, comparison.mask
+    images = comparison.predictions[method], comparison.truth, comparison.mask
     return {
         "subject": subject,
         "angle_deg": facts.get("angle_deg"),
         "task": "B" if facts["column"] == "environment" else "A",
         "source": source,
         "light": light,
-        "si_mse": si_mse(*pictures),
-        "ssim": ssim(*pictures),
+        "si_mse": si_mse(*images),
+        "ssim": ssim(*images),
     }
 
 

@@ -6,9 +6,9 @@ from functools import partial
 from itertools import pairwise
 from typing import Any
 
-from facerf_cli.evaluation.yale_b_cases import ANGLES_DEG
-from facerf_cli.evaluation.yale_b_published import FIGURES, PEERS
-from facerf_cli.intervals import average, mean_interval
+from facerf_cli.evaluation.protocols.yale_b import FIGURES, PEERS
+from facerf_cli.evaluation.protocols.yale_b_cases import ANGLES_DEG
+from facerf_cli.metrics import average, mean_interval
 
 Row = dict[str, Any]  # a picture: subject, task, source, light, angle_deg, si_mse, ssim
 

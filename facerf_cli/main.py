@@ -17,22 +17,21 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli import __version__
-from facerf_cli.commands import evaluate, face_model
-from facerf_cli.commands.convert_light import convert_light
-from facerf_cli.commands.doctor import doctor
-from facerf_cli.commands.envmap import envmap
-from facerf_cli.commands.estimate_light import estimate_light
-from facerf_cli.commands.fit_geometry import fit_geometry
-from facerf_cli.commands.machines import with_machines
-from facerf_cli.commands.options import DeviceName, Settings
-from facerf_cli.commands.predict_olat import predict_olat
-from facerf_cli.commands.prepare_dataset import prepare_dataset
-from facerf_cli.commands.relight import relight
-from facerf_cli.commands.relight_dataset import relight_dataset
-from facerf_cli.commands.synth_stage import synth_stage
-from facerf_cli.commands.train import train
+from facerf_cli.cli import evaluate, face_model
+from facerf_cli.cli.convert_light import convert_light
+from facerf_cli.cli.doctor import doctor
+from facerf_cli.cli.envmap import envmap
+from facerf_cli.cli.estimate_light import estimate_light
+from facerf_cli.cli.fit_geometry import fit_geometry
+from facerf_cli.cli.options import DeviceName, Settings, with_machines
+from facerf_cli.cli.predict_olat import predict_olat
+from facerf_cli.cli.prepare_dataset import prepare_dataset
+from facerf_cli.cli.relight import relight
+from facerf_cli.cli.relight_dataset import relight_dataset
+from facerf_cli.cli.synth_stage import synth_stage
+from facerf_cli.cli.train import train
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.records import LOGGER_NAME, configure_logging, unexpected
+from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
 
 VERBS: tuple[Callable[..., Any], ...] = (
     relight,

@@ -1,14 +1,84 @@
-"""What a prediction is measured by: each metric with its definition, its source and its colour space.
+"""Means with 95 % intervals, for pictures that come in groups: of a subject, of a head.
+
+Pictures of one person are alike, so it is persons that are drawn again, with all of their pictures (a cluster
+bootstrap, percentile intervals: Efron and Tibshirani, *An introduction to the bootstrap*, 1993).
+
+What a prediction is measured by: each metric with its definition, its source and its colour space.
 
 Pictures are [H, W, 3] or [H, W], mask [H, W] in 0..1 is where they count, and how much: a mean is over the
 mask's weight (and over channels alike). The values are those that the caller gives, scene-linear Rec.709 or
 display-encoded; 1 is white. Where a definition needs no scale of its own, none is sought.
 """
 
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from facerf_cli.colour import lab_d65, luminance
+
+Key = TypeVar("Key", bound=Hashable)
+
+_RESAMPLES = 10_000
+_DRAWN_AT_ONCE = 1 << 22
+_SEED = 0
+_LOW, _HIGH = 2.5, 97.5  # percent
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean over pictures, its 95 % interval over groups, and the pictures' own median and spread."""
+
+    mean: float
+    median: float
+    low: float
+    high: float
+    sd: float  # over pictures
+    images: int
+    groups: int
+
+    def as_dict(self) -> dict[str, float]:
+        """For JSON."""
+        return dict(self.__dict__)
+
+
+def mean_interval(values: Iterable[tuple[Hashable, float]]) -> Interval | None:
+    """The mean over (group, value) pairs and its interval; None where there are none.
+
+    With a single group nothing is known of others: the interval is NaN.
+    """
+    by_group: dict[Hashable, list[float]] = {}
+    for group, value in values:
+        by_group.setdefault(group, []).append(value)
+    if not by_group:
+        return None
+    everything = np.concatenate([np.asarray(group, float) for group in by_group.values()])
+    low, high = _percentiles(list(by_group.values()))
+    mean, median, sd = (float(f(everything)) for f in (np.mean, np.median, np.std))
+    return Interval(mean, median, low, high, sd, len(everything), len(by_group))
+
+
+def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """The interval of the mean over pictures, groups drawn with replacement."""
+    if len(groups) < 2:
+        return float("nan"), float("nan")
+    totals = np.array([sum(group) for group in groups])
+    counts = np.array([len(group) for group in groups])
+    random, means = np.random.default_rng(_SEED), np.empty(_RESAMPLES)
+    for first in range(0, _RESAMPLES, at_once := max(1, _DRAWN_AT_ONCE // len(groups))):
+        part = means[first : first + at_once]
+        drawn = random.integers(len(groups), size=(len(part), len(groups)))
+        part[:] = totals[drawn].sum(1) / counts[drawn].sum(1)
+    low, high = np.percentile(means, [_LOW, _HIGH])
+    return float(low), float(high)
+
+
+def average(rows: Sequence[Mapping[Key, float]]) -> dict[Key, float]:
+    """Values by key, averaged over several mappings of the same keys: pictures over seeds."""
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+
 
 PSNR_HIGHEST_DB = 100.0  # of equal pictures, whose PSNR is infinite
 _SSIM_SIGMA_PX = 1.5
@@ -147,7 +217,7 @@ def tone_drift_deg(
     inside = skin > 0.5
     if not inside.any():
         return None
-    ours, true = (np.median(picture[inside].astype(np.float64), 0) for picture in (prediction, truth))
+    ours, true = (np.median(image[inside].astype(np.float64), 0) for image in (prediction, truth))
     if np.ptp(true) < 1e-6 or not luminance(true) > 0:
         return None
     exposure = luminance(np.asarray(albedo, np.float64)) / luminance(true)
@@ -163,7 +233,7 @@ def _inside(
     inside = mask > 0
     if not inside.any():
         raise ValueError("the mask is empty")
-    p, t = (picture[inside].astype(np.float64).reshape(inside.sum(), -1) for picture in (prediction, truth))
+    p, t = (image[inside].astype(np.float64).reshape(inside.sum(), -1) for image in (prediction, truth))
     return p, t, np.broadcast_to(mask[inside].astype(np.float64)[:, None], t.shape)
 
 

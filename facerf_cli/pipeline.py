@@ -17,22 +17,16 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
-from facerf_cli.face.fit_start import FitStart
-from facerf_cli.face.interior import interior_texture
+from facerf_cli.face.fit import FaceFit, FitStart, fit_landmarks, trust_inside
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
-from facerf_cli.face.regions import region_mask
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv
-from facerf_cli.light.estimate import LightEvidence, estimate_light
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv, interior_texture, region_mask
+from facerf_cli.light.estimate import LightEvidence, RefinedLight, estimate_light, refine_light
 from facerf_cli.light.quotient import Quotient
-from facerf_cli.light.refine import RefinedLight, refine_light
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.diffuse import DiffuseNetwork
-from facerf_cli.network.features import Layered
-from facerf_cli.network.inputs import colour_cast, exposure_of
-from facerf_cli.network.reflectance import ReflectanceNetwork
-from facerf_cli.network.saved import load_networks
+from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.feature_networks import Layered
+from facerf_cli.network.reflectance import ReflectanceNetwork, colour_cast, exposure_of
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
@@ -108,8 +102,8 @@ def see_head(models: Models, cropped: np.ndarray) -> FitStart | None:
     """Where the Geometry Network sees the head in a crop [S, S, 3]; None where there is no such network."""
     if models.geometry is None:
         return None
-    picture = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
-    return FitStart(*(tensor.cpu() for tensor in models.geometry(picture)))
+    image = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
+    return FitStart(*(tensor.cpu() for tensor in models.geometry(image)))
 
 
 def fit_face(
@@ -138,8 +132,8 @@ def unwrap_face(
     """Unwrap the crop [S, S, 3] of a photo [H, W, ...] into the chart (paper, 'Network Architecture')."""
     vertices = fit.vertices_camera(model)
     inside = fit.crop.valid(*photo_shape[:2])  # beyond the photo the crop only repeats its border
-    picture = torch.from_numpy(np.dstack([cropped, inside.astype(np.float32)])).permute(2, 0, 1)
-    unwrapped, visible = unwrap(picture, vertices, grid_triangles(), fit.camera, texture_side)
+    image = torch.from_numpy(np.dstack([cropped, inside.astype(np.float32)])).permute(2, 0, 1)
+    unwrapped, visible = unwrap(image, vertices, grid_triangles(), fit.camera, texture_side)
     texture, visible = unwrapped[:3], visible * (unwrapped[3] > 0.99)
     if visible.max() < 0.5:
         raise InputError("the fitted face lies outside the picture; give its landmarks with --landmarks")
@@ -292,5 +286,5 @@ def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
 
 def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
     """Pictures [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black beyond it."""
-    pictures = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
-    return pictures.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)
+    images = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
+    return images.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)

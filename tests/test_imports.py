@@ -9,14 +9,15 @@ PACKAGE = Path(__file__).parents[1] / "facerf_cli"
 LEVELS = (
     ("__main__", "manpages"),
     ("main",),
-    ("commands",),
-    ("training",),
-    ("objectives", "runs", "evaluation"),
-    ("pipeline", "stage", "baselines", "report"),
-    ("network", "face", "metrics"),
-    ("raster", "light"),
-    ("files",),
-    ("records", "colour", "errors", "intervals"),
+    ("cli",),
+    ("evaluation", "training"),
+    ("dataset",),
+    ("synth", "capture"),
+    ("pipeline",),
+    ("baselines", "composite"),
+    ("network", "face"),
+    ("raster", "light", "files", "metrics"),
+    ("workers", "ray_workers", "colour", "logs", "errors"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 STRANGERS = (("network", "face"), ("raster", "light"))  # what one needs of the other is handed in

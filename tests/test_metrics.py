@@ -23,15 +23,15 @@ from facerf_cli.metrics import (
     tone_drift_deg,
     tone_of,
 )
-from facerf_cli.network.losses import si_mse as training_si_mse
+from facerf_cli.training.losses import si_mse as training_si_mse
 from tests.conftest import SHARED
 from tests.oracles import metrics as slow
 
-Pictures = tuple[np.ndarray, np.ndarray, np.ndarray]
+Images = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @pytest.fixture
-def pictures() -> Pictures:
+def images() -> Images:
     """Prediction, truth [14, 19, 3] and a soft mask; both pictures go beyond 0 and 1."""
     random = np.random.default_rng(1)
     truth = random.gamma(1.5, 0.3, (14, 19, 3)).astype(np.float32)
@@ -70,50 +70,50 @@ def test_figures_are_those_of_the_reference_scorer(
     }
     for name, value in found.items():
         assert value == pytest.approx(expected[name], rel=1e-9, abs=1e-12), name
-    colours = [np.repeat(picture[..., None], 3, -1) for picture in (prediction, truth)]
+    colours = [np.repeat(image[..., None], 3, -1) for image in (prediction, truth)]
     assert si_mse(*colours, yale.MASK) == pytest.approx(found["si_mse"])
     assert ssim(*colours, yale.MASK) == pytest.approx(found["ssim"])
 
 
-def test_figures_are_those_of_the_slow_twins(pictures: Pictures) -> None:
-    assert best_scale(*pictures) == pytest.approx(slow.best_scale(*pictures), rel=1e-6)
-    assert si_mse(*pictures) == pytest.approx(slow.si_mse(*pictures), rel=1e-9)
-    assert mse(*pictures) == pytest.approx(slow.mse(*pictures), rel=1e-9)
-    assert ssim(*pictures) == pytest.approx(slow.ssim(*pictures), rel=1e-6)
-    assert dssim(*pictures) == pytest.approx((1 - ssim(*pictures)) / 2)
-    assert psnr(*pictures) == pytest.approx(-10 * np.log10(mse(*pictures)))
+def test_figures_are_those_of_the_slow_twins(images: Images) -> None:
+    assert best_scale(*images) == pytest.approx(slow.best_scale(*images), rel=1e-6)
+    assert si_mse(*images) == pytest.approx(slow.si_mse(*images), rel=1e-9)
+    assert mse(*images) == pytest.approx(slow.mse(*images), rel=1e-9)
+    assert ssim(*images) == pytest.approx(slow.ssim(*images), rel=1e-6)
+    assert dssim(*images) == pytest.approx((1 - ssim(*images)) / 2)
+    assert psnr(*images) == pytest.approx(-10 * np.log10(mse(*images)))
 
 
-def test_si_mse_is_that_of_training(pictures: Pictures) -> None:
-    planes = [torch.from_numpy(picture).double().permute(2, 0, 1)[None, None] for picture in pictures[:2]]
-    expected = training_si_mse(*planes, torch.from_numpy(pictures[2])[None, None])
-    assert si_mse(*pictures) == pytest.approx(expected.item(), rel=1e-9)
+def test_si_mse_is_that_of_training(images: Images) -> None:
+    planes = [torch.from_numpy(image).double().permute(2, 0, 1)[None, None] for image in images[:2]]
+    expected = training_si_mse(*planes, torch.from_numpy(images[2])[None, None])
+    assert si_mse(*images) == pytest.approx(expected.item(), rel=1e-9)
 
 
-def test_a_scale_of_the_prediction_means_nothing_to_si_mse_and_ssim(pictures: Pictures) -> None:
-    prediction, truth, mask = pictures
+def test_a_scale_of_the_prediction_means_nothing_to_si_mse_and_ssim(images: Images) -> None:
+    prediction, truth, mask = images
     for metric in (si_mse, si_mse_clipped, si_rel, ssim, dssim):
         assert metric(7 * prediction, truth, mask) == pytest.approx(metric(prediction, truth, mask), rel=1e-5)
     assert mse(7 * prediction, truth, mask) > 1.5 * mse(prediction, truth, mask)
 
 
-def test_a_scale_is_never_negative(pictures: Pictures) -> None:
-    _, truth, mask = pictures
+def test_a_scale_is_never_negative(images: Images) -> None:
+    _, truth, mask = images
     for prediction in (-truth, 0 * truth):
         assert best_scale(prediction, truth, mask) == 0
         assert si_rel(prediction, truth, mask) == pytest.approx(1)
         assert np.isfinite(ssim(prediction, truth, mask))
 
 
-def test_what_lies_outside_the_mask_means_nothing(pictures: Pictures) -> None:
-    prediction, truth, mask = pictures
+def test_what_lies_outside_the_mask_means_nothing(images: Images) -> None:
+    prediction, truth, mask = images
     wild = np.where(mask[..., None] > 0, prediction, np.float32(50))
     for metric in (best_scale, si_mse, si_mse_clipped, mse, psnr, ssim):
         assert metric(wild, truth, mask) == metric(prediction, truth, mask)
 
 
-def test_equal_pictures(pictures: Pictures) -> None:
-    _, truth, mask = pictures
+def test_equal_images(images: Images) -> None:
+    _, truth, mask = images
     assert si_mse(truth, truth, mask) == pytest.approx(0, abs=1e-15)
     assert ssim(truth, truth, mask) == pytest.approx(1) and dssim(truth, truth, mask) == pytest.approx(0)
     assert psnr(truth, truth, mask) == pytest.approx(PSNR_HIGHEST_DB)
@@ -128,8 +128,8 @@ def test_a_glint_of_the_truth_weighs_less_once_clipped() -> None:
     assert si_mse_clipped(truth, truth, mask) > 0  # the prediction is not clipped
 
 
-def test_an_empty_mask_and_other_sizes_are_refused(pictures: Pictures) -> None:
-    prediction, truth, mask = pictures
+def test_an_empty_mask_and_other_sizes_are_refused(images: Images) -> None:
+    prediction, truth, mask = images
     with pytest.raises(ValueError, match="empty"):
         si_mse(prediction, truth, 0 * mask)
     with pytest.raises(ValueError, match=r"\(14, 18, 3\)"):

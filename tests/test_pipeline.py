@@ -5,7 +5,7 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import find_faces
-from facerf_cli.face.regions import region_mask
+from facerf_cli.face.topology import region_mask
 from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import estimate_light
 from facerf_cli.light.sphere import rig_directions

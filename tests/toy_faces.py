@@ -7,10 +7,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
-from facerf_cli.objectives.chart import ChartObjective, ChartSettings
-from facerf_cli.stage.samples import Sample
+from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
 
 SIDE, RIG = 16, 8
 NETWORK = ReflectanceSettings(

@@ -1,8 +1,8 @@
 """A face that is diffuse, under light of order 2: what the paper's comparison with Tewari et al. assumes.
 
-Albedo and light are regressed by one network (`network/diffuse.py`, after MoFA, ICCV 2017), and the light is
-then solved for with that albedo; a face is lit by their product alone, so it has no highlights and casts no
-shadows on itself.
+Albedo and light are regressed by one network (`network/diffuse_sh.py`, after MoFA, ICCV 2017), and the light
+is then solved for with that albedo; a face is lit by their product alone, so it has no highlights and casts
+no shadows on itself.
 """
 
 import math
@@ -14,15 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.base import Explained
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, irradiance, rig_coefficients
-from facerf_cli.network.diffuse import COEFFICIENTS, ORDER, DiffuseNetwork, shading
-from facerf_cli.network.inputs import resize
-from facerf_cli.network.saved import load_networks
+from facerf_cli.light.sphere import RigLight
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.diffuse_sh import COEFFICIENTS, ORDER, DiffuseNetwork, shading
+from facerf_cli.network.reflectance import resize
 from facerf_cli.pipeline import FaceTexture, Models
 
 _SEEN = 0.9  # of a texel, for the light's sake

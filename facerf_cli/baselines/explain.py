@@ -1,10 +1,10 @@
 """A photo explained by the reflectance model of one's choice."""
 
+from facerf_cli.baselines import Kind
+from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.field import explain_by_field
-from facerf_cli.baselines.kinds import Kind
 from facerf_cli.baselines.prt import explain_by_prt
-from facerf_cli.baselines.reflectance import Explained
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.pipeline import FaceTexture, Models

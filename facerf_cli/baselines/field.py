@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.base import Explained
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import (

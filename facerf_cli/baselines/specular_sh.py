@@ -16,15 +16,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.baselines.albedo import SIDE, skin_prior
-from facerf_cli.baselines.light_prior import light_prior
-from facerf_cli.baselines.photo_texels import DETAIL, coarse, shrunk, with_detail
-from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.base import (
+    DETAIL,
+    SIDE,
+    Explained,
+    coarse,
+    light_prior,
+    shrunk,
+    skin_prior,
+    with_detail,
+)
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.topology import GRID, grid_triangles
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, rig_coefficients, sh_basis
+from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import FaceTexture, Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
 

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines.albedo import LogGaussian
-from facerf_cli.baselines.light_prior import LightPrior
+from facerf_cli.baselines.base import LightPrior, LogGaussian
 
 _FLOOR = 0.1  # of the mean radiance, below which errors do not grow: they are relative to the radiance
 _FIRM_STEPS = 3  # before outliers are told by the fit
@@ -142,16 +141,16 @@ def _minimise(problem: _Problem, steps: int) -> Tensor:
     """The state of least cost, from the mean face in the mean light of the right strength."""
     size = 1 + len(problem.light.modes) + len(problem.albedo[1]) + len(problem.gloss[1])
     state = torch.zeros(size, dtype=torch.float64)
-    picture, _ = _synthesise(problem, state, with_slopes=False)
-    state[0] = -picture.mean().clamp_min(1e-6).log()
+    image, _ = _synthesise(problem, state, with_slopes=False)
+    state[0] = -image.mean().clamp_min(1e-6).log()
     damping = 1e-3
     prior = torch.ones(size, dtype=torch.float64)
     prior[0] = 0  # any exposure is as likely
     for step in range(steps):
-        picture, slopes = _synthesise(problem, state)
-        error = picture - problem.radiance
+        image, slopes = _synthesise(problem, state)
+        error = image - problem.radiance
         # Against the greater of the two, or black hair would count for more than the face.
-        reach = torch.maximum(picture, problem.radiance) + _FLOOR
+        reach = torch.maximum(image, problem.radiance) + _FLOOR
         weight = problem.evidence / reach.square()
         if step >= _FIRM_STEPS:
             weight = weight * _robust(error / reach)
@@ -181,15 +180,15 @@ def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> t
     if problem.mirror is not None:
         gloss = (problem.gloss[0] + torch.einsum("p,pn->n", gloss_at, problem.gloss[1])).exp()
         shining = gloss * (problem.mirror @ light).T
-    picture = lit + shining
+    image = lit + shining
     if not with_slopes:
-        return picture, picture
+        return image, image
     lights = strength.exp() * problem.light.modes  # [R, K, 3]
     by_light = torch.einsum("cnk,rkc->rcn", problem.transfer, lights) * diffuse
     if problem.mirror is not None:
         by_light = by_light + torch.einsum("nk,rkc->rcn", problem.mirror, lights) * gloss
     by_gloss = problem.gloss[1][:, None] * shining
-    return picture, torch.cat([picture[None], by_light, problem.albedo[1] * lit, by_gloss])
+    return image, torch.cat([image[None], by_light, problem.albedo[1] * lit, by_gloss])
 
 
 def _robust(relative: Tensor) -> Tensor:

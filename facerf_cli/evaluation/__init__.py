@@ -1,1 +1,0 @@
-"""What is measured, and on what: the paper's comparisons as protocols (paper, 'Quantitative Evaluations')."""

@@ -12,7 +12,7 @@ from typing import Any
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Row
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.records import json_line
+from facerf_cli.logs import json_line
 
 FORMAT = "facerf-evaluation-2"
 
@@ -41,12 +41,12 @@ class ItemFigures:
     key: str
     rows: tuple[Row, ...]
     strips: tuple[KeptStrip, ...]
-    pictures: tuple[str, ...]
+    images: tuple[str, ...]
 
     @property
     def files(self) -> tuple[str, ...]:
         """All that was kept beside the figures."""
-        return (*(strip.file for strip in self.strips), *self.pictures)
+        return (*(strip.file for strip in self.strips), *self.images)
 
 
 def write_figures(path: Path, figures: ItemFigures) -> None:

@@ -1,4 +1,7 @@
-"""People of a prepared dataset as the protocols see them: crops, fits, source pictures, and what is known."""
+"""People of a prepared dataset as the protocols see them: crops, fits, source pictures, and what is known.
+
+A user's photo as the protocols see it: its crop, fitted and unwrapped as every verb does.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -7,18 +10,19 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from facerf_cli.evaluation.views import View
+from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.pairs import Pair, image_path
+from facerf_cli.dataset.relight import render_source
+from facerf_cli.dataset.weights import load_pairs, pair_weights, weights_path
+from facerf_cli.evaluation.methods import View
+from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, fit_from_arrays, fit_landmarks
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.files.images import read_image
+from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.metrics import tone_of
-from facerf_cli.pipeline import FaceTexture
-from facerf_cli.stage.appearance.pigments import skin_albedo
-from facerf_cli.stage.data.dataset import Dataset
-from facerf_cli.stage.data.pair_weights import load_pairs, pair_weights, weights_path
-from facerf_cli.stage.data.recipes import Pair, picture_path
-from facerf_cli.stage.data.relighting import render_source
+from facerf_cli.pipeline import FaceTexture, fit_face
+from facerf_cli.synth.appearance.pigments import skin_albedo
 
 T = TypeVar("T")
 
@@ -66,12 +70,12 @@ class Person:
 
     def source(self, pair: Pair) -> tuple[np.ndarray, FaceTexture]:
         """The source picture [S, S, 3] of a pair, written or made from its recipe, and its texture."""
-        path = picture_path(self.dataset, *pair.key)
+        path = image_path(self.dataset, *pair.key)
         if path.is_file():
-            picture = read_image(path).pixels
+            image = read_image(path).pixels
         else:
-            picture = render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
-        return picture, self.shot(pair.source_camera).view.texture_of(picture)
+            image = render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
+        return image, self.shot(pair.source_camera).view.texture_of(image)
 
     def light(self, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """The true light of a pair's source: camera-space directions [L, 3] and rgb weights [L, 3]."""
@@ -117,3 +121,39 @@ def evenly(groups: Mapping[str, Sequence[T]], most: int) -> dict[str, list[T]]:
     for place, name in rounds[:most]:
         chosen[name].append(groups[name][place])
     return {name: members for name, members in chosen.items() if members}
+
+
+@dataclass(frozen=True, eq=False)
+class Portrait:
+    """One face of a photo: its crop, a picture [S, S, 3] linear; view, texture."""
+
+    image: np.ndarray
+    photo: LinearImage
+    keep_eyes: bool
+    view: View
+    face: FaceTexture
+
+    @staticmethod
+    def of(
+        model: MorphableModel,
+        fit: FaceFit,
+        image: np.ndarray,
+        photo: LinearImage,
+        keep_eyes: bool,
+    ) -> "Portrait":
+        """A crop of a photo seen with a fit; nothing is compared beyond the photo and its alpha."""
+        view = View.of(model, fit, _shown(fit.crop, photo), keep_eyes)
+        return Portrait(image, photo, keep_eyes, view, view.texture_of(image))
+
+    def fitted_with(self, model: MorphableModel) -> "Portrait":
+        """The same crop with another face model on the same landmarks."""
+        old = self.view.fit
+        landmarks_px = old.crop.to_photo(old.landmarks_px.numpy())
+        fit = fit_face(model, old.crop, landmarks_px, self.photo.pixels.shape)
+        return Portrait.of(model, fit, self.image, self.photo, self.keep_eyes)
+
+
+def _shown(crop: Crop, photo: LinearImage) -> np.ndarray:
+    """How much of the photo each pixel of its crop shows [S, S], in 0..1."""
+    inside = crop.valid(*photo.pixels.shape[:2]).astype(np.float32)
+    return inside if photo.alpha is None else inside * crop.apply(photo.alpha[..., None])[..., 0]

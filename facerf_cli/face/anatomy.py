@@ -10,15 +10,16 @@ rounded to half a millimetre; none of its vertices are in here.
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator, RectBivariateSpline
 
-from facerf_cli.face.regions import CHART_MM, inside_mm
 from facerf_cli.face.topology import (
     BOTTOM_M,
+    CHART_MM,
     GRID,
     HALF_ANGLE_DEG,
     LANDMARK_UV,
     LANDMARKS_M,
     TOP_M,
     grid_uv,
+    inside_mm,
     landmark_weights,
 )
 

@@ -1,4 +1,11 @@
-"""The face model fitted to 68 landmarks with strong statistical priors (paper, 'Landmark loss').
+"""The pose of heads of known shape from their landmarks in a picture, without derivatives.
+
+Where a fit starts: from the landmarks alone, or from a head that a Geometry Network saw.
+
+That head is one of the built-in model. Any face model is seeded from it by least squares (DESIGN): its points
+that the fit may use are laid on those of the head, by pose and shape together.
+
+The face model fitted to 68 landmarks with strong statistical priors (paper, 'Landmark loss').
 
 The camera is fixed; pose (rotation, translation), identity alpha and expression beta vary. Landmarks
 alone say little about identity and nothing about most of the surface, so the priors are strong.
@@ -7,7 +14,7 @@ alone say little about identity and nothing about most of the surface, so the pr
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +24,6 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks
-from facerf_cli.face.fit_start import FitStart, started
 from facerf_cli.face.gauss_newton import (
     CONTOUR_RAYS,
     INNER_COUNT,
@@ -31,9 +37,137 @@ from facerf_cli.face.gauss_newton import (
     total_cost,
     weak_perspective,
 )
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
-from facerf_cli.raster.camera import Camera
+from facerf_cli.raster.camera import Camera, pixel_rays, skew_matrix, so3_exp
+
+_POSE_ROUNDS = 6
+
+
+def pose_from_landmarks(
+    points: Tensor, px: Tensor, camera: Camera, rotation: Tensor, translation_m: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Rotations [B, 3, 3] and translations [B, 3] that lay points [B, N, 3] (head frame) on pixels [B, N, 2].
+
+    One scaled orthographic fit at the depths of the pose that is given (DeMenthon and Davis, *Model-based
+    object pose in 25 lines of code*, 1995), then a few rounds of orthogonal iteration (Lu, Hager and
+    Mjolsness, *Fast and globally convergent pose estimation from video images*, 2000). float64.
+    """
+    depth_m = -(points @ rotation.mT + translation_m[:, None])[..., 2:]
+    rays = pixel_rays(px, camera)
+    rotation = _orthographic(points, rays[..., :2] * depth_m)
+    line = rays[..., :, None] * rays[..., None, :] / (rays * rays).sum(-1)[..., None, None]  # [B, N, 3, 3]
+    off_line = line - torch.eye(3, dtype=rays.dtype)
+    middle = torch.linalg.inv(-off_line.mean(1))
+
+    def best_translation(rotation: Tensor) -> Tensor:
+        turned = (points @ rotation.mT)[..., None]
+        return (middle @ (off_line @ turned).mean(1))[..., 0]
+
+    for _ in range(_POSE_ROUNDS):
+        seen = points @ rotation.mT + best_translation(rotation)[:, None]
+        rotation = _closest_rotation((line @ seen[..., None])[..., 0], points)
+    return rotation, best_translation(rotation)
+
+
+def _orthographic(points: Tensor, image: Tensor) -> Tensor:
+    """Rotations [B, 3, 3] of a scaled orthographic fit of points [B, N, 3] to positions [B, N, 2], y up."""
+    centred, flat = points - points.mean(1, keepdim=True), image - image.mean(1, keepdim=True)
+    u, _, vh = torch.linalg.svd(torch.linalg.lstsq(centred, flat).solution.mT, full_matrices=False)
+    rows = u @ vh
+    return torch.cat([rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])], 1)
+
+
+def _closest_rotation(wanted: Tensor, points: Tensor) -> Tensor:
+    """Rotations [B, 3, 3] from points to others [B, N, 3], both about their middles (Kabsch, 1976)."""
+    moment = (wanted - wanted.mean(1, keepdim=True)).mT @ (points - points.mean(1, keepdim=True))
+    u, _, vh = torch.linalg.svd(moment)
+    signs = torch.ones(len(points), 3, dtype=points.dtype)
+    signs[:, 2] = torch.det(u @ vh).sign()
+    return u @ (signs[..., None] * vh)
+
+
+_START_ROUNDS = 2
+_NOISE_M = 0.0003  # a point's distance that weighs as much as one deviation of a coordinate
+
+
+@dataclass(frozen=True)
+class FitStart:
+    """Heads of B faces to start from, in the space of the fit's camera; coefficients of the built-in model.
+
+    There may be fewer coefficients than the model has: the others are zero.
+    """
+
+    rotation: Tensor  # [B, 3, 3] head_to_camera
+    translation_m: Tensor  # [B, 3]
+    alpha: Tensor  # [B, Ki]
+    beta: Tensor  # [B, Ke]
+
+
+def started(problem: Problem, start: FitStart) -> tuple[FitState, FitState]:
+    """A fit's states at the start: as it is, and of its shape with the pose that the inner landmarks give."""
+    state, basis = seeded_state(problem.basis, start), problem.basis
+    offset = state.coordinates @ basis.modes[:INNER_COUNT].flatten(0, 1).mT
+    points = basis.mean[:INNER_COUNT] + offset.reshape(len(offset), INNER_COUNT, 3)
+    inner_px = problem.target_px[:, -INNER_COUNT:]
+    pose = pose_from_landmarks(points, inner_px, problem.camera, state.rotation, state.translation_m)
+    return state, FitState(*pose, state.coordinates)
+
+
+def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
+    """The state of a fit, of whatever model, that comes closest to the start."""
+    wanted = _points_camera(start).nan_to_num()
+    rotation, translation = start.rotation.double().nan_to_num(), start.translation_m.double().nan_to_num()
+    by_parameters = torch.cat(
+        [-skew_matrix(basis.mean), torch.eye(3).expand(len(basis.mean), 3, 3), basis.modes], -1
+    )
+    flat = (by_parameters * _weights()[:, None, None]).flatten(0, 1)
+    prior = torch.ones(flat.shape[1], dtype=flat.dtype)
+    prior[:6] = 0
+    factor = torch.linalg.cholesky(flat.mT @ flat + prior.diag())
+    coordinates = torch.zeros(len(wanted), flat.shape[1] - 6, dtype=flat.dtype)
+    for _ in range(_START_ROUNDS):
+        points = basis.mean + (coordinates @ basis.modes.flatten(0, 1).mT).reshape(len(wanted), -1, 3)
+        off = (wanted - translation[:, None]) @ rotation - points  # head frame
+        right = (off * _weights()[:, None]).flatten(1) @ flat
+        right[:, 6:] -= coordinates
+        step = torch.cholesky_solve(right.mT, factor).mT
+        translation = translation + (rotation @ step[:, 3:6, None])[..., 0]
+        rotation = rotation @ so3_exp(step[:, :3])
+        coordinates = coordinates + step[:, 6:]
+    return FitState(rotation, translation, coordinates)
+
+
+@cache
+def _weights() -> Tensor:
+    """Of the basis's points [N], 1 / m: the contour's many count as much together as the inner ones."""
+    corners, _ = fit_points()
+    weights = torch.full(
+        (len(corners),), (INNER_COUNT / (len(corners) - INNER_COUNT)) ** 0.5, dtype=torch.float64
+    )
+    weights[:INNER_COUNT] = 1
+    return weights / _NOISE_M
+
+
+def _points_camera(start: FitStart) -> Tensor:
+    """The start's points [B, N, 3] where a fit's basis has them, camera space, float64."""
+    mean, identity, expression = _builtin_points()
+    alpha, beta = start.alpha.double(), start.beta.double()
+    offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
+    offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
+    return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
+
+
+@cache
+def _builtin_points() -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of the built-in model at a fit's points."""
+    model, (corners, weights) = load_face_model(), fit_points()
+    mean, identity, expression = (
+        (basis[..., corners, :].double() * weights[..., None].double()).sum(-2)
+        for basis in (model.mean, model.identity, model.expression)
+    )
+    return mean, identity, expression
+
 
 Quality = Literal["good", "fair", "poor"]
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # a mean landmark error up to this is a good, a fair fit

@@ -2,6 +2,8 @@
 
 Contour landmarks slide: each is held to the closest point of the mesh's silhouette near the jaw, found
 anew at every step (paper, 'Landmark loss').
+
+The face's outline along the jaw, on which contour landmarks slide (paper, 'Landmark loss').
 """
 
 from collections.abc import Callable
@@ -13,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, locate
+from facerf_cli.face.topology import CONTOUR, GRID, LANDMARK_UV, LANDMARKS_M, locate
 from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
 
 INNER_COUNT = 68 - len(CONTOUR)
@@ -94,10 +96,10 @@ class Problem:
 def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tuple[FitState, Tensor]:
     """The mean's pose from a scaled orthographic fit to the inner landmarks, and its pixels per metre [B]."""
     model = basis.mean[:INNER_COUNT]
-    picture = target_px[:, len(CONTOUR) :] * torch.tensor([1.0, -1.0], dtype=torch.float64)  # y up
+    image = target_px[:, len(CONTOUR) :] * torch.tensor([1.0, -1.0], dtype=torch.float64)  # y up
     centred = model - model.mean(0)
-    middle = picture.mean(1)
-    affine = torch.linalg.lstsq(centred.expand(len(picture), -1, -1), picture - middle[:, None]).solution.mT
+    middle = image.mean(1)
+    affine = torch.linalg.lstsq(centred.expand(len(image), -1, -1), image - middle[:, None]).solution.mT
     u, stretch, vh = torch.linalg.svd(affine, full_matrices=False)  # affine [B, 2, 3]
     scale = stretch.mean(-1)
     rows = u @ vh
@@ -105,7 +107,7 @@ def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tupl
     depth_m = camera.focal_px / scale
     offset = (middle - torch.tensor([camera.cx_px, -camera.cy_px], dtype=torch.float64)) / scale[:, None]
     translation = torch.cat([offset, -depth_m[:, None]], 1) - rotation @ model.mean(0)
-    coordinates = torch.zeros(len(picture), basis.modes.shape[-1], dtype=torch.float64)
+    coordinates = torch.zeros(len(image), basis.modes.shape[-1], dtype=torch.float64)
     return FitState(rotation, translation, coordinates), scale
 
 
@@ -258,3 +260,46 @@ def damped_step(normal: Tensor, gradient: Tensor, coordinates: Tensor, damping: 
     diagonal = normal.diagonal(dim1=1, dim2=2)
     diagonal += prior + damping[:, None] * (diagonal + prior)
     return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky(normal))[..., 0]
+
+
+_NOSE = (28, 33)  # the rays to the jaw begin midway between these landmarks
+_RAYS_PER_LANDMARK, _POINTS_PER_RAY = 8, 10
+
+
+@cache
+def contour_rays() -> Tensor:
+    """Vertices of the grid [R, P] along rays across the jaw's band, outermost last, right ear to left ear."""
+    ends = _between_landmarks(LANDMARK_UV)
+    centre = np.array([0.5, LANDMARK_UV[list(_NOSE), 1].mean()])
+    share = np.linspace(*_BAND, _POINTS_PER_RAY)[:, None]
+    column_row = np.round((centre + share * (ends - centre)[:, None]) * (GRID - 1)).astype(np.int64)
+    column_row = column_row.clip(0, GRID - 1)
+    return torch.from_numpy(column_row[..., 1] * GRID + column_row[..., 0])
+
+
+@cache
+def _outward() -> Tensor:
+    """Unit directions [R, 3] in the head frame in which each ray leaves the face seen from before it."""
+    away = (_between_landmarks(LANDMARKS_M) - LANDMARKS_M[list(_NOSE)].mean(0)) * [1, 1, 0]
+    return torch.from_numpy(away / np.linalg.norm(away, axis=-1, keepdims=True)).float()
+
+
+def _between_landmarks(values: np.ndarray) -> np.ndarray:
+    """Contour landmarks' values [68, C] at the rays' outer ends [R, C], linear between landmarks."""
+    along = np.arange((len(CONTOUR) - 1) * _RAYS_PER_LANDMARK + 1) / _RAYS_PER_LANDMARK
+    contour = values[list(CONTOUR)]
+    return np.stack([np.interp(along, CONTOUR, column) for column in contour.T], -1)
+
+
+@torch.no_grad()
+def silhouette_ids(vertices_px: Tensor, head_to_camera: Tensor) -> Tensor:
+    """The vertices [B, R] of the outline: of each ray the one that reaches furthest out in the picture.
+
+    vertices_px [B, V, 2] are the mesh's pixels, head_to_camera [B, 3, 3] the poses. A constant: no gradient.
+    """
+    rays = contour_rays().to(vertices_px.device)
+    outward = _outward().to(head_to_camera) @ head_to_camera.mT  # [B, R, 3]
+    px = vertices_px[:, rays]  # [B, R, P, 2]
+    reach = px[..., 0] * outward[..., None, 0] - px[..., 1] * outward[..., None, 1]
+    furthest = reach.argmax(-1, keepdim=True)
+    return rays.expand(len(px), -1, -1).gather(2, furthest)[..., 0]

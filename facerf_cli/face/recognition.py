@@ -15,7 +15,7 @@ RECOGNITION_LICENCE = (
 _NETWORK_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
 
-def face_descriptor(picture_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
     """The descriptor [128] of a face in an sRGB picture [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
 
     King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a chip of
@@ -23,14 +23,14 @@ def face_descriptor(picture_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.nd
     """
     import dlib
 
-    if landmarks_px.shape != (68, 2) or picture_srgb.ndim != 3 or picture_srgb.shape[2] != 3:
-        raise ValueError(f"picture {picture_srgb.shape}, landmarks {landmarks_px.shape}")
-    picture = np.round(np.clip(picture_srgb, 0, 1) * 255).astype(np.uint8)
+    if landmarks_px.shape != (68, 2) or image_srgb.ndim != 3 or image_srgb.shape[2] != 3:
+        raise ValueError(f"picture {image_srgb.shape}, landmarks {landmarks_px.shape}")
+    image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
     points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
     (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
     box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
     shape = dlib.full_object_detection(box, points)
-    return np.array(_network().compute_face_descriptor(np.ascontiguousarray(picture), shape))
+    return np.array(_network().compute_face_descriptor(np.ascontiguousarray(image), shape))
 
 
 def descriptor_distance(first: np.ndarray, second: np.ndarray) -> float:

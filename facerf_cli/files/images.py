@@ -1,30 +1,188 @@
-"""Pictures on disk: any encoding in, scene-linear float32 Rec.709 inside; EXR and display pictures out."""
+"""What a decoder reports badly, found before it starts: names that are no UTF-8, PNG files cut short.
+
+What a picture's header says, without its pixels: its size, kind of numbers and colour space.
+
+Provenance as an XMP packet in PNG and JPEG files, where viewers look for IPTC's digital source type.
+
+Pictures on disk: any encoding in, scene-linear float32 Rec.709 inside; EXR and display pictures out.
+"""
 
 import logging
 import re
+import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.colour import (
+    ADOBE_RGB,
+    DISPLAY_P3,
     LINEAR,
     REC709_CHROMATICITIES,
+    REC2020,
+    SRGB,
+    ColourSpace,
     auto_exposure_ev,
+    find_space,
     in_blocks,
+    linear_space,
     linear_to_srgb,
     named_space,
     to_linear_rec709,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.damage import require_whole_png, utf8_path
-from facerf_cli.files.headers import is_floating, metadata_of, space_of_file
-from facerf_cli.files.xmp import embed_xmp
-from facerf_cli.records import LOGGER_NAME, one_line
+from facerf_cli.logs import LOGGER_NAME, one_line
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def utf8_path(path: Path) -> str:
+    """The path as OpenImageIO takes it: an InputError where it is not UTF-8, as names on disk may be."""
+    try:
+        path.as_posix().encode()
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
+        ) from None
+    return str(path)
+
+
+def require_whole_png(path: Path) -> None:
+    """Walk a PNG file's chunks to its last and check their sums; a file of another kind passes."""
+    with path.open("rb") as stream:
+        if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
+            return
+        kind = b""
+        while kind != b"IEND":
+            head = stream.read(8)
+            length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
+            body, checksum = stream.read(length), stream.read(4)
+            if len(body) != length or len(checksum) != 4:
+                raise InputError(f"{path}: damaged or cut short: the PNG file ends too early")
+            if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
+                raise InputError(f"{path}: damaged: a checksum of the PNG file is wrong")
+
+
+_ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class Header:
+    """A picture's size upright, and what its values are."""
+
+    width_px: int
+    height_px: int
+    is_floating: bool
+    bits: int  # of a value
+    space: ColourSpace  # what the file says; of one that says nothing what is usual: linear, or sRGB
+    metadata: dict[str, Any]
+
+
+def read_header(path: Path) -> Header | None:
+    """The header of a picture's first part; None where it is no picture that can be read."""
+    stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
+    if stream is None:
+        oiio.geterror()  # or it prints its own words at exit
+        return None
+    spec = stream.spec()
+    stream.close()
+    width, height = spec.full_width, spec.full_height
+    if spec.get_int_attribute("Orientation", 1) >= 5:  # turned by a quarter
+        width, height = height, width
+    floating, bits = is_floating(spec), 8 * spec.format.size()
+    return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+
+
+def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
+    """The plain attributes of a picture that is turned upright."""
+    plain = (str, int, float, tuple)
+    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
+    attributes.pop("Orientation", None)  # applied
+    return attributes
+
+
+def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
+    """What the file says of its colours; else floats are linear Rec.709 and integers sRGB."""
+    default = LINEAR if is_floating(spec) else SRGB
+    profile = spec.get_string_attribute("ICCProfile:profile_description")
+    name = profile or spec.get_string_attribute("oiio:ColorSpace")
+    if profile:
+        named = next((space for part, space in _ICC_SPACES.items() if part in profile.lower()), None)
+    elif name in ("", "Rec709"):  # the latter is OpenImageIO's word for every PNM file, whatever made it
+        named = default
+    else:
+        named = find_space(name)
+    if named is None:
+        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
+        named = default
+    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
+    if not chromaticities or not named.is_linear:
+        return named
+    by_primaries = linear_space(chromaticities)
+    if by_primaries is None:
+        log.warning("%s: primaries of no colours that can be, taken for those of %s", path, named.name)
+    return named if by_primaries in (None, LINEAR) else by_primaries
+
+
+def is_floating(spec: oiio.ImageSpec) -> bool:
+    """Whether values are of half, single or double precision."""
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+_NAMESPACES = {
+    "Iptc4xmpExt": "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
+    "xmp": "http://ns.adobe.com/xap/1.0/",
+    "facerf": "urn:facerf:1",
+}
+_JPEG_START = b"\xff\xd8"
+_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "Software": "xmp:CreatorTool"}
+_JPEG_START, _PNG_SIGNATURE = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
+_JPEG_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"
+
+
+def embed_xmp(path: Path, metadata: Mapping[str, str | int | float]) -> None:
+    """Insert the metadata that has a place in XMP into a finished PNG or JPEG; others stay as they are."""
+    data = path.read_bytes() if path.suffix.lower() in (".png", ".jpg", ".jpeg") else b""
+    packet = xmp_packet(metadata)
+    if data.startswith(_JPEG_START):
+        body = _JPEG_SIGNATURE + packet
+        segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
+        at = len(_JPEG_START)
+        if data[at : at + 2] == b"\xff\xe0":  # JFIF's own segment stays first
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    elif data.startswith(_PNG_SIGNATURE):
+        body = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + packet
+        segment = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        at = len(_PNG_SIGNATURE) + 25  # after the header chunk, whose length is fixed
+    else:
+        return
+    path.write_bytes(data[:at] + segment + data[at:])
+
+
+def xmp_packet(metadata: Mapping[str, str | int | float]) -> bytes:
+    """The packet as XMP's standard frames it."""
+    named = {_PROPERTIES.get(name, name): value for name, value in metadata.items()}
+    properties = [
+        f"{name}={quoteattr(str(value))}"
+        for name, value in named.items()
+        if name.split(":")[0] in _NAMESPACES
+    ]
+    namespaces = [f'xmlns:{prefix}="{address}"' for prefix, address in _NAMESPACES.items()]
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" {" ".join([*namespaces, *properties])}/></rdf:RDF></x:xmpmeta>'
+        '<?xpacket end="w"?>'
+    ).encode()
+
 
 PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
@@ -34,11 +192,10 @@ JPEG_QUALITY = 95
 _LAYER_CHANNELS = {"normal": ("XYZ", "half"), "position": ("XYZ", "float"), "uv": ("UV", "float")}
 
 Attributes = Mapping[str, str | int | float]
-log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
-class Picture:
+class LinearImage:
     """A picture in scene-linear Rec.709, upright, its colour not multiplied by its alpha."""
 
     pixels: np.ndarray  # [H, W, 3] float32
@@ -52,7 +209,7 @@ def read_image(
     colourspace: str | None = None,
     limit_px: int = PHOTO_LIMIT_PX,
     non_finite: Literal["error", "zero"] = "error",
-) -> Picture:
+) -> LinearImage:
     """Read a picture of any supported format; `colourspace` overrides what the file says of itself.
 
     The size is checked before anything is decoded. NaN and infinite values are an error, or, with "zero",
@@ -72,7 +229,7 @@ def read_image(
     if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
     pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
-    return Picture(pixels, alpha, space.name, metadata_of(spec))
+    return LinearImage(pixels, alpha, space.name, metadata_of(spec))
 
 
 def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:

@@ -24,7 +24,7 @@ from facerf_cli.files.inert_arrays import (
     require,
     text_of,
 )
-from facerf_cli.records import one_line
+from facerf_cli.logs import one_line
 
 _MAX_BYTES = 512 << 20  # of a file
 _MAX_OPCODES = 200_000  # FLAME has a few thousand

@@ -22,9 +22,8 @@ from torch import Tensor
 from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.damage import utf8_path
-from facerf_cli.files.images import HALF_MAX, Attributes
-from facerf_cli.records import one_line
+from facerf_cli.files.images import HALF_MAX, Attributes, utf8_path
+from facerf_cli.logs import one_line
 
 FORMAT = "facerf-olat-1"
 COMPRESSION = "zip"  # of the lossless ones the smallest, and the quickest but for none at all
@@ -62,14 +61,14 @@ class OlatStack:
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
     """Write OLATs as they come, in batches [l, 3, H, W] in the order of the header's directions."""
     specs = _specs(header)
-    pictures = (picture for batch in olats for picture in batch.permute(0, 2, 3, 1).cpu().numpy())
+    images = (image for batch in olats for image in batch.permute(0, 2, 3, 1).cpu().numpy())
     with atomic_path(path) as temporary:
         stream = oiio.ImageOutput.create(str(temporary))
         assert stream is not None, f"{path}: a stack is an .exr"
         good = stream.open(str(temporary), tuple(specs))
-        for number, (picture, spec) in enumerate(zip(pictures, specs[:-1], strict=True)):
+        for number, (image, spec) in enumerate(zip(images, specs[:-1], strict=True)):
             good = good and (number == 0 or stream.open(str(temporary), spec, "AppendSubimage"))
-            good = good and stream.write_image(_as_half(path, picture))
+            good = good and stream.write_image(_as_half(path, image))
         good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
         source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
         good = good and stream.write_image(_as_half(path, source))
@@ -160,10 +159,10 @@ def _part(
     return spec
 
 
-def _as_half(path: Path, picture: np.ndarray) -> np.ndarray:
-    if not np.isfinite(picture).all():
+def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
+    if not np.isfinite(image).all():
         raise ValueError(f"{path}: some values are NaN or infinite")
-    return np.ascontiguousarray(picture.clip(-HALF_MAX, HALF_MAX), np.float16)
+    return np.ascontiguousarray(image.clip(-HALF_MAX, HALF_MAX), np.float16)
 
 
 def _read_header(path: Path, stream: oiio.ImageInput, content: dict[str, Any]) -> StackHeader:

@@ -1,6 +1,14 @@
-"""The light of a photo by least squares over a field's single lights (paper, 'Light Estimation')."""
+"""The light of a photo by least squares over a field's single lights (paper, 'Light Estimation').
+
+A photo's light refined by features of its texture (paper, 'Light Estimation').
+
+From the least-squares light on, argmin over the weights of |V_f(explained texture) - V_f(photo's texture)|^2
+by Adadelta (Zeiler, *ADADELTA: an adaptive learning rate method*, 2012), as the paper does it. What features
+are compared is handed in.
+"""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,18 +84,18 @@ class LightEvidence:
         return estimate_smooth_light(self.directions, olats, photo, self.clipped[:, self.mask])
 
 
-def estimate_light(olats: Tensor, picture: Tensor) -> Tensor:
+def estimate_light(olats: Tensor, image: Tensor) -> Tensor:
     """Non-negative weights [L, C] with which lights' pictures [L, C, N] sum to a picture [C, N].
 
     Eq. (leastsq) of the paper, a channel at a time, with what is clipped, covered or misfitted weighing less
     (iteratively reweighted least squares). Everything is scene-linear.
     """
-    channels = [_weights(a, b) for a, b in zip(olats.unbind(1), picture, strict=True)]
+    channels = [_weights(a, b) for a, b in zip(olats.unbind(1), image, strict=True)]
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def _weights(olats: Tensor, picture: Tensor) -> np.ndarray:
-    lights, target = olats.double().T.numpy(), picture.double().numpy()  # [N, L], [N]
+def _weights(olats: Tensor, image: Tensor) -> np.ndarray:
+    lights, target = olats.double().T.numpy(), image.double().numpy()  # [N, L], [N]
     if not len(target):  # nothing is seen well enough
         return np.zeros(lights.shape[1])
     ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
@@ -102,19 +110,19 @@ def _weights(olats: Tensor, picture: Tensor) -> np.ndarray:
     return np.asarray(weights)
 
 
-def plain_estimate(olats: Tensor, picture: Tensor) -> Tensor:
+def plain_estimate(olats: Tensor, image: Tensor) -> Tensor:
     """Eq. (leastsq) as it stands: signed weights [L, C], every element of the picture [C, N] alike.
 
     Of the many solutions where lights cannot be told apart, the shortest.
     """
     channels = [
         np.linalg.lstsq(lights.double().T.numpy(), target.double().numpy())[0]
-        for lights, target in zip(olats.unbind(1), picture, strict=True)
+        for lights, target in zip(olats.unbind(1), image, strict=True)
     ]
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, clipped: Tensor) -> Tensor:
+def estimate_smooth_light(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
     """Eq. (leastsq) for a light that is to be looked at: non-negative, smooth where the face leaves it open.
 
     Of lights at directions [L, 3], whose pictures [L, 3, N] are to sum to a picture [3, N]. A face fixes few
@@ -125,7 +133,7 @@ def estimate_smooth_light(directions: Tensor, olats: Tensor, picture: Tensor, cl
     """
     channels = [
         _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
-        for lights, target, white in zip(olats.unbind(1), picture, clipped, strict=True)
+        for lights, target, white in zip(olats.unbind(1), image, clipped, strict=True)
     ]
     from_near = _from_near(directions.double().numpy())
     grey, colour = _grey_light(channels, from_near)
@@ -210,3 +218,81 @@ def _from_near(directions: np.ndarray) -> np.ndarray:
     near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
     np.fill_diagonal(near, 0)
     return np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)
+
+
+Features = Callable[[Tensor], Sequence[Tensor]]  # of textures [B, 3, T, T], linear, black beyond the mask
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """Adadelta's own rate is 1; it ends once `patience` steps gained less than the share `settled`."""
+
+    steps: int = 150
+    learning_rate: float = 1.0
+    patience: int = 20
+    settled: float = 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedLight:
+    """Weights [L, 3], the loss of the start and theirs, and after how many steps it ended."""
+
+    weights: Tensor
+    loss_before: float
+    loss_after: float
+    steps: int
+
+
+def refine_light(
+    evidence: LightEvidence,
+    start: Tensor,
+    features: Features,
+    non_negative: bool = True,
+    settings: RefineSettings = RefineSettings(),
+) -> RefinedLight:
+    """The light of least feature loss on the way from `start` [L, 3]; never worse than the start.
+
+    Non-negativity is kept by projection. Beyond white nothing is asked of clipped texels.
+    """
+    loss_of = _FeatureLoss(evidence, features)
+    unit = float(start.square().mean().sqrt()) or 1.0  # so that a step is of the same size for every photo
+    scaled = (start / unit).requires_grad_()
+    optimizer = torch.optim.Adadelta([scaled], lr=settings.learning_rate)
+    best, first, least, losses = start, 0.0, float("inf"), []
+    for _ in range(settings.steps + 1):
+        loss = loss_of(scaled * unit)
+        losses.append(float(loss.detach()))
+        first = losses[0]
+        if losses[-1] < least:
+            best, least = scaled.detach() * unit, losses[-1]
+        if not first > 0 or _has_settled(losses, settings):
+            break
+        optimizer.zero_grad()
+        (loss / first).backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        if non_negative:
+            scaled.data.clamp_(min=0)
+    return RefinedLight(best.clone() if least < first else start, first, min(first, least), len(losses) - 1)
+
+
+class _FeatureLoss:
+    """Mean squared difference of features, summed over layers, of the masked textures of one face."""
+
+    def __init__(self, evidence: LightEvidence, features: Features) -> None:
+        self._evidence, self._features = evidence, features
+        self._clipped = evidence.clipped
+        with torch.no_grad():
+            self._wanted = [layer.clone() for layer in features((evidence.photo * evidence.mask)[None])]
+
+    def __call__(self, weights: Tensor) -> Tensor:
+        photo, explained = self._evidence.photo, self._evidence.relit(weights)
+        explained = torch.where(self._clipped, explained.minimum(photo), explained)
+        found = self._features((explained * self._evidence.mask)[None])
+        terms = [(a - b).square().mean() for a, b in zip(found, self._wanted, strict=True)]
+        return torch.stack(terms).sum()
+
+
+def _has_settled(losses: list[float], settings: RefineSettings) -> bool:
+    if len(losses) <= settings.patience:
+        return False
+    return min(losses) > (1 - settings.settled) * min(losses[: -settings.patience])

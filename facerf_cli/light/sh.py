@@ -4,16 +4,24 @@
 c_lm = integral of L(d) Y_lm(d) over the sphere: radiance times steradian. A light of a rig of weight w
 (`light/envmap.py`: it gives a white surface that faces it radiance 1) is a point of radiance times solid
 angle pi w, so a rig and the map that it was weighed from have about the same coefficients.
+
+Spherical harmonics of a lat-long map, and the map of coefficients; the convention is `sh.CONVENTION`.
+
+A light that can shine, nowhere negative, with given spherical-harmonic coefficients.
+
+Coefficients cut off at an order ring below 0, and a face that is lit so goes black where it should be dim. Of
+all non-negative lights that have the coefficients, the one of least power (least integral of its square) is a
+harmonic series clipped at 0; its series is found from the coefficients by Newton's method on the convex dual.
 """
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sphere import latlong_directions, rig_directions
+from facerf_cli.light.sphere import RigLight, golden_spiral, latlong_directions, rig_directions
 
 CONVENTION = (
     "real, orthonormal over the sphere, no Condon-Shortley phase, index l*l+l+m; camera axes "
@@ -125,3 +133,109 @@ def rotated(coefficients: Tensor, turn: Tensor) -> Tensor:
     came_from = directions @ turn.double().cpu()  # row by row: the inverse of the rotation
     turned = sh_basis(came_from, order) @ coefficients.double().cpu()
     return torch.linalg.lstsq(sh_basis(directions, order), turned, driver="gelsd").solution.to(coefficients)
+
+
+# Takes camera axes to those whose polar axis is the map's, +y, so that rows and columns part: (z, x, y).
+_MAP_POLAR = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+_VALUES_AT_ONCE = 1 << 24
+
+
+def latlong_coefficients(envmap: Tensor, order: int) -> Tensor:
+    """Coefficients [(order + 1)^2, 3] float32 of a map [H, W, 3], taken as constant over each pixel.
+
+    The integral is exact across a row and by Gauss-Legendre quadrature down it, at any map size; it is taken
+    about the map's own pole and turned to the convention's.
+    """
+    height, width = envmap.shape[:2]
+    across = _across(width, order)  # [W, 2 order + 1]
+    some_rows = torch.split(envmap.cpu(), max(1, _VALUES_AT_ONCE // (3 * width)))
+    by_row = torch.cat([torch.einsum("hwc,wm->hmc", part.double(), across) for part in some_rows])
+    about_pole = torch.einsum("hk,hkc->kc", _down(height, order), by_row[:, _column_of(order)])
+    return rotated(about_pole, _MAP_POLAR.T).float()
+
+
+def sh_to_latlong(coefficients: Tensor, height: int) -> Tensor:
+    """Radiance [height, 2 height, 3] float32 at the pixels' centres; negative where a cut series is."""
+    directions = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
+    parts = torch.split(directions, max(1, _VALUES_AT_ONCE // len(coefficients)))
+    order_of(coefficients)
+    values = torch.cat([radiance(coefficients.cpu(), part) for part in parts])
+    return values.float().reshape(height, 2 * height, 3)
+
+
+def _column_of(order: int) -> Tensor:
+    """order + m of every index l*l+l+m."""
+    return torch.tensor([order + m for degree in range(order + 1) for m in range(-degree, degree + 1)])
+
+
+def _across(width: int, order: int) -> Tensor:
+    """Integrals over a pixel's azimuths [W, 2 order + 1] of cos(m azimuth), for m < 0 of sin(|m| azimuth)."""
+    edges = math.pi * (1 - 2 * torch.arange(width + 1, dtype=torch.float64)[:, None] / width)
+    m = torch.arange(1, order + 1, dtype=torch.float64)
+    cosines = (m * edges).sin() / m
+    sines = -(m * edges).cos() / m
+    antiderivatives = torch.cat([sines.flip(1), edges, cosines], 1)
+    return antiderivatives[:-1] - antiderivatives[1:]
+
+
+def _down(height: int, order: int) -> Tensor:
+    """Integrals over a row's elevations [H, K] of each harmonic's factor of elevation."""
+    points = 8 + math.ceil(order * math.pi / height)
+    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
+    step = math.pi / height
+    middle = math.pi / 2 - (torch.arange(height, dtype=torch.float64) + 0.5) * step
+    elevation = middle[:, None] + step / 2 * nodes
+    ring = elevation.cos()
+    at_azimuth_0 = sh_basis(torch.stack([ring, torch.zeros_like(ring), elevation.sin()], -1), order)
+    index = [
+        degree * degree + degree + abs(m) for degree in range(order + 1) for m in range(-degree, degree + 1)
+    ]
+    factors = torch.einsum("hqk,hq->hk", at_azimuth_0, weights * ring * step / 2)
+    return factors[:, index]
+
+
+_RIDGE = 1e-3  # bounds the series where no non-negative light has the coefficients
+_STEPS = 60
+_SETTLED = 1e-8
+_FEWEST_DIRECTIONS, _DIRECTIONS_A_COEFFICIENT = 2048, 10
+
+
+def positive_latlong(coefficients: Tensor, height: int) -> Tensor:
+    """The map [height, 2 height, 3] float32, not negative, whose coefficients are these [K, 3].
+
+    To two or three hundredths where they are those of some light, mostly to a thousandth; else about the
+    nearest that can be had.
+    """
+    return sh_to_latlong(clipped_series(coefficients), height).clamp(min=0)
+
+
+def clipped_series(coefficients: Tensor) -> Tensor:
+    """The series [K, 3] which, clipped at 0, has these coefficients [K, 3]."""
+    order = order_of(coefficients)
+    count = max(_FEWEST_DIRECTIONS, _DIRECTIONS_A_COEFFICIENT * len(coefficients))
+    basis = sh_basis(torch.from_numpy(golden_spiral(count)), order).numpy()
+    wanted = coefficients.double().cpu().numpy()
+    scale = max(float(np.abs(wanted).max()), 1e-30)
+    return torch.from_numpy(np.stack([_solve(basis, c / scale) for c in wanted.T], 1) * scale).float()
+
+
+def _solve(basis: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Least of half the integral of max(0, basis @ series)^2, less wanted @ series, and a small ridge."""
+    area = 4 * np.pi / len(basis)
+    series, lowest = wanted.copy(), np.inf
+    step = np.zeros_like(series)
+    for _ in range(_STEPS):
+        light = (basis @ series).clip(min=0)
+        value = 0.5 * area * light @ light + 0.5 * _RIDGE * series @ series - wanted @ series
+        if value > lowest:  # too far: half way back
+            step = step / 2
+            series = series + step
+            continue
+        lowest = value
+        gradient = area * basis.T @ light + _RIDGE * series - wanted
+        if float(np.abs(gradient).max()) < _SETTLED:
+            break
+        lit = basis[light > 0]
+        step = np.linalg.solve(area * lit.T @ lit + _RIDGE * np.eye(len(series)), gradient)
+        series = series - step
+    return series

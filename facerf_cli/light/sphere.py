@@ -1,4 +1,6 @@
-"""Directions of light: rigs, azimuth and elevation, and the lat-long map; defined here and nowhere else.
+"""A light as the single lights that add up to it: what is estimated, weighed and handed on.
+
+Directions of light: rigs, azimuth and elevation, and the lat-long map; defined here and nowhere else.
 
 A light direction is the unit vector from the face toward the light, in camera space (x to the picture's
 right, y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the
@@ -7,11 +9,27 @@ camera), u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class RigLight:
+    """Unit camera-space directions [L, 3] toward the lights, and their rgb weights [L, 3].
+
+    The units are those of `light/envmap.py`.
+
+    Weights are not negative where a light is to be physical; the light of a spherical-harmonic model may need
+    negative ones.
+    """
+
+    directions: Tensor
+    weights: Tensor
+
 
 RIG_LIGHTS = 150  # the paper's light stage
 _RELAX_STEPS = 200

@@ -89,8 +89,8 @@ def render_texture(
     """
     fragments = rasterize(vertices_camera, triangles, camera)
     coverage = fragments.covered.to(texture.dtype)
-    picture = sample_texture(texture, interpolate(uv, triangles, fragments))
-    return picture * coverage[..., None], coverage
+    image = sample_texture(texture, interpolate(uv, triangles, fragments))
+    return image * coverage[..., None], coverage
 
 
 def unwrap(

@@ -2,9 +2,8 @@
 
 import torch
 
-from facerf_cli.baselines.albedo import SIDE
-from facerf_cli.baselines.photo_texels import coarse, shrunk, with_detail
-from facerf_cli.face.regions import region_mask
+from facerf_cli.baselines.base import SIDE, coarse, shrunk, with_detail
+from facerf_cli.face.topology import region_mask
 from facerf_cli.pipeline import FaceTexture
 
 T = 128

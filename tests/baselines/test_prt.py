@@ -10,9 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines import baked_transfer as baked
-from facerf_cli.baselines.baked_transfer import TransferSettings, bake_transfer
-from facerf_cli.baselines.prt import Prt
+from facerf_cli.baselines import prt as baked
+from facerf_cli.baselines.prt import Prt, TransferSettings, bake_transfer
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sh import cosine_lobe, sh_basis
@@ -79,8 +78,8 @@ def test_lights_that_turn_with_the_head_change_nothing(transfer: Tensor) -> None
 
 
 def test_a_lamp_from_the_right_lights_the_right(transfer: Tensor) -> None:
-    picture = lit(white(transfer), 60, 0)
-    assert float(picture[:, 40:].mean()) > 2 * float(picture[:, :24].mean())
+    image = lit(white(transfer), 60, 0)
+    assert float(image[:, 40:].mean()) > 2 * float(image[:, :24].mean())
 
 
 def test_a_second_run_does_not_bake(

@@ -9,9 +9,8 @@ from torch import Tensor
 
 from facerf_cli.baselines import specular_sh
 from facerf_cli.baselines.specular_sh import SpecularSh, Surface, diffuse_transfer, mirror_transfer
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import irradiance, rig_coefficients
-from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 
 T = 33
 

@@ -5,8 +5,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.baselines import synthesis
-from facerf_cli.baselines.albedo import LogGaussian
-from facerf_cli.baselines.light_prior import LightPrior
+from facerf_cli.baselines.base import LightPrior, LogGaussian
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 
 T, K = 12, 9
@@ -26,7 +25,7 @@ def transfers() -> tuple[Tensor, Tensor]:
     return both[0].expand(3, -1, -1), both[1]
 
 
-def picture(scene: tuple[Tensor, Tensor], albedo: Tensor, gloss: Tensor, light: Tensor) -> Tensor:
+def image(scene: tuple[Tensor, Tensor], albedo: Tensor, gloss: Tensor, light: Tensor) -> Tensor:
     """The forward model, written out: [3, N]."""
     transfer, mirror = scene
     diffuse = albedo.exp().flatten(1) * torch.einsum("cnk,kc->cn", transfer, light)
@@ -37,12 +36,12 @@ def drawn() -> tuple[tuple[LogGaussian, LogGaussian, LightPrior], tuple[Tensor, 
     albedo, gloss, light = priors()
     given = transfers()
     coefficients = 5 * (light.mean + torch.einsum("r,rkc->kc", torch.randn(6), light.modes))
-    radiance = picture(given, albedo.at(torch.randn(4), T), gloss.at(torch.randn(2), T), coefficients)
+    radiance = image(given, albedo.at(torch.randn(4), T), gloss.at(torch.randn(2), T), coefficients)
     return (albedo, gloss, light), given, radiance
 
 
 def error_of(found: synthesis.Solution, parts: tuple, given: tuple[Tensor, Tensor], truth: Tensor) -> float:
-    remade = picture(given, parts[0].at(found.albedo, T), parts[1].at(found.gloss, T), found.light)
+    remade = image(given, parts[0].at(found.albedo, T), parts[1].at(found.gloss, T), found.light)
     return float((remade - truth).norm() / truth.norm())
 
 
@@ -91,13 +90,13 @@ def test_the_light_of_a_known_face() -> None:
     parts, given, _ = drawn()
     albedo, gloss = parts[0].at(torch.randn(4), T), parts[1].at(torch.randn(2), T)
     light = 2 * (parts[2].mean + torch.einsum("r,rkc->kc", torch.randn(6), parts[2].modes))
-    radiance = picture(given, albedo, gloss, light)
+    radiance = image(given, albedo, gloss, light)
     found = light_given(Scene(radiance, torch.ones(T * T), *given), albedo, gloss, parts[2])
     assert float((found - light).norm() / light.norm()) < 0.02
 
 
 @pytest.mark.parametrize("shines", [True, False])
-def test_slopes_are_those_of_the_picture(shines: bool) -> None:
+def test_slopes_are_those_of_the_image(shines: bool) -> None:
     parts, (transfer, mirror), radiance = drawn()
     scene = Scene(radiance, torch.ones(T * T), transfer, mirror if shines else None)
     seen = scene.trust > 0

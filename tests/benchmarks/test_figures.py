@@ -15,22 +15,20 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import torch
 from loss_curve import curve, draw_chart, read_log
 from model_card import ablations, speed, synthetic, table1, yale
-from synthetic import Picture, drift_of, summary
+from synthetic import LinearImage, drift_of, summary
 from synthetic import table as held_out_table
 from yale_table import COLUMNS, results, table
 
 from facerf_cli.evaluation.measure import Row
-from facerf_cli.evaluation.paper import TABLE_1
-from facerf_cli.evaluation.summary import Layout, summarise
-from facerf_cli.intervals import average, mean_interval
-from facerf_cli.metrics import tone_of
+from facerf_cli.evaluation.summary import TABLE_1, Layout, summarise
+from facerf_cli.metrics import average, mean_interval, tone_of
 
 
 def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
     random = np.random.default_rng(0)
     groups = random.normal(size=40)
     interval = mean_interval((g, groups[g] + 0.01 * random.normal()) for g in range(40) for _ in range(50))
-    assert interval is not None and (interval.pictures, interval.groups) == (2000, 40)
+    assert interval is not None and (interval.images, interval.groups) == (2000, 40)
     half = 1.96 * groups.std() / math.sqrt(40)
     np.testing.assert_allclose(interval.high - interval.low, 2 * half, rtol=0.1)
     assert interval.low < interval.mean < interval.high
@@ -42,7 +40,7 @@ def test_one_group_tells_nothing_of_others() -> None:
     assert mean_interval([]) is None
 
 
-def test_seeds_are_averaged_picture_by_picture() -> None:
+def test_seeds_are_averaged_image_by_image() -> None:
     assert average([{"a": 1.0, "b": 2.0}, {"a": 3.0, "b": 2.0}]) == {"a": 2.0, "b": 2.0}
 
 
@@ -87,7 +85,7 @@ def test_every_seed_must_clear_the_bar_itself() -> None:
     np.testing.assert_allclose(frontal["si_mse"]["spread"], 0.0098)
 
 
-def test_columns_hold_their_pictures_only() -> None:
+def test_columns_hold_their_images_only() -> None:
     counts = {c.name: sum(c.holds(r) for r in rows(0.0, 0.0)) for c in COLUMNS}
     assert counts == {"frontal": 15, "soft": 3, "environment": 6} | {c.name: 3 for c in COLUMNS[3:]}
 
@@ -121,15 +119,15 @@ def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
 
 
 def test_rows_of_held_out_heads() -> None:
-    pictures = [
-        Picture(head, same, angle, tone, error, error, 2 * error, drift)
+    images = [
+        LinearImage(head, same, angle, tone, error, error, 2 * error, drift)
         for head in (1, 2)
         for same, angle, tone, error, drift in (
             (True, 10.0, "tan", 0.001, -2.0),
             (False, 75.0, None, 0.003, None),
         )
     ]
-    found = summary(pictures)
+    found = summary(images)
     assert found["rows"]["same pose"]["si_mse"]["mean"] == pytest.approx(0.001)
     assert found["rows"]["60 to 90 deg"]["lambert"]["mean"] == pytest.approx(0.006)
     assert found["tones"]["tan"]["drift_deg"]["mean"] == -2 and found["tones"]["dark"]["si_mse"] is None
@@ -149,8 +147,8 @@ def test_the_log_is_read_to_where_it_was_cut_short(tmp_path: Path) -> None:
 
 def test_the_cards_tables_are_rectangular() -> None:
     whole = results(["a", "b"], [rows(0.002, 0.8), rows(0.003, 0.8)], whole=True)
-    picture = Picture(1, True, 10.0, "tan", 0.001, 0.001, 0.002, -2.0)
-    heads = summary([picture, replace(picture, same_pose=False, tone=None, drift_deg=None)])
+    image = LinearImage(1, True, 10.0, "tan", 0.001, 0.001, 0.002, -2.0)
+    heads = summary([image, replace(image, same_pose=False, tone=None, drift_deg=None)])
     figures = {"si_mse": 0.003, "si_mse_clipped": 0.002}
     cases = [
         Row(f"{pose} {method}", "p", method, {"pose": pose}, figures)

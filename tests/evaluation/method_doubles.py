@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines.reflectance import Explained
+from facerf_cli.baselines.base import Explained
 from facerf_cli.evaluation.people import Person
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.light.rig_light import RigLight
+from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import FaceTexture
 
 LIGHTS = torch.eye(3)

@@ -10,7 +10,7 @@ import pytest
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import measure as module
-from facerf_cli.evaluation.cases import Case, Comparison
+from facerf_cli.evaluation.case import Case, Comparison
 from facerf_cli.evaluation.measure import METRICS, Measures, Row, measure, shown
 from facerf_cli.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 
@@ -34,10 +34,10 @@ def descriptors(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     """The pictures that the face recogniser was shown; its answer is their mean colour."""
     seen: list[np.ndarray] = []
 
-    def describe(picture: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+    def describe(image: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
         assert np.array_equal(landmarks_px, LANDMARKS)
-        seen.append(picture)
-        return picture.mean((0, 1))
+        seen.append(image)
+        return image.mean((0, 1))
 
     monkeypatch.setattr(module, "face_descriptor", describe)
     return seen
@@ -65,7 +65,7 @@ def test_a_row_a_method_in_their_order(comparison: Comparison) -> None:
         assert (value < far[name]) is METRICS[name].lower_is_better, name
 
 
-def test_display_space_is_of_the_encoded_pictures(comparison: Comparison) -> None:
+def test_display_space_is_of_the_encoded_images(comparison: Comparison) -> None:
     (near, _) = measure(comparison, Measures(space="display"))
     p, t = linear_to_srgb(comparison.predictions["near"]), linear_to_srgb(comparison.truth)
     assert near.values["si_mse"] == pytest.approx(si_mse(p, t, comparison.mask))
@@ -78,9 +78,9 @@ def test_faces_are_shown_masked_and_at_the_truths_exposure(
     rows = measure(replace(comparison, landmarks_px=LANDMARKS), Measures(space="linear"))
     true, near, _ = descriptors  # the truth's once
     gain = 2 ** auto_exposure_ev(comparison.truth, comparison.mask)
-    for picture, linear in ((true, comparison.truth), (near, comparison.predictions["near"])):
+    for image, linear in ((true, comparison.truth), (near, comparison.predictions["near"])):
         expected = linear_to_srgb((linear * gain).clip(0, 1)) * comparison.mask[..., None]
-        np.testing.assert_allclose(picture, expected, atol=1e-6)
+        np.testing.assert_allclose(image, expected, atol=1e-6)
     distance = np.linalg.norm(true.mean((0, 1)) - near.mean((0, 1)))
     assert rows[0].values["face_distance"] == pytest.approx(distance)
     assert "face_distance" not in measure(comparison, Measures())[0].values

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.others import Others, read_array
+from facerf_cli.evaluation.case import Others, read_array
 from facerf_cli.files.images import write_display, write_exr
 
 SHAPE = (6, 9, 3)
@@ -53,7 +53,7 @@ def test_a_wrong_size_and_two_files_of_a_case(folder: Path) -> None:
         (np.zeros((0, 3, 3)), "a picture is"),
     ],
 )
-def test_arrays_that_are_no_pictures(tmp_path: Path, content: np.ndarray, words: str) -> None:
+def test_arrays_that_are_no_images(tmp_path: Path, content: np.ndarray, words: str) -> None:
     np.save(tmp_path / "x.npy", content)
     with pytest.raises(InputError, match=words):
         read_array(tmp_path / "x.npy")

@@ -13,9 +13,18 @@ from PIL import Image
 
 from facerf_cli.evaluation.case_files import KeptStrip
 from facerf_cli.evaluation.measure import Row, measure
-from facerf_cli.evaluation.page import About, page
-from facerf_cli.evaluation.page_cases import BEST, TYPICAL, WORST, Chosen, choose
-from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST, strip_of
+from facerf_cli.evaluation.report_html import (
+    BEST,
+    ERROR_COLOURS,
+    ERROR_HIGHEST,
+    TYPICAL,
+    WORST,
+    About,
+    Chosen,
+    choose,
+    page,
+    strip_of,
+)
 from facerf_cli.evaluation.summary import Summary, summarise
 from tests.evaluation.toy_protocol import LAYOUT, NOISE, comparison, evaluate
 
@@ -89,12 +98,12 @@ def test_one_file_that_needs_nothing_else(report: Path) -> None:
     tags = [tag for tag, _ in reader.tags]
     assert not {"script", "link", "iframe", "object"} & set(tags)
     assert not re.search(r"(?:src|href)=\"(?!data:image/jpeg;base64,|#)", text) and "url(" not in text
-    images = [attributes for tag, attributes in reader.tags if tag == "img"]
-    assert len(images) == 12
-    for image in images:
-        picture = Image.open(io.BytesIO(base64.b64decode(image["src"].split(",")[1])))
-        assert (picture.width, picture.height) == (int(image["width"]), int(image["height"]))
-        assert "above the truth" in image["alt"] and "good, bad <i>" in image["alt"]
+    found = [attributes for tag, attributes in reader.tags if tag == "img"]
+    assert len(found) == 12
+    for tag in found:
+        image = Image.open(io.BytesIO(base64.b64decode(tag["src"].split(",")[1])))
+        assert (image.width, image.height) == (int(tag["width"]), int(tag["height"]))
+        assert "above the truth" in tag["alt"] and "good, bad <i>" in tag["alt"]
     ids = {attributes["id"] for _, attributes in reader.tags if "id" in attributes}
     assert {attributes["href"][1:] for tag, attributes in reader.tags if tag == "a"} == ids
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation import perceptual
-from facerf_cli.evaluation.perceptual import perceptual_metric
-from facerf_cli.network.perceptual import Lpips
+from facerf_cli.evaluation import measure as perceptual
+from facerf_cli.evaluation.measure import perceptual_metric
+from facerf_cli.network.feature_networks import Lpips
 
 
 @pytest.fixture(autouse=True)
@@ -55,10 +55,10 @@ def test_a_metric_from_files(
 ) -> None:
     known(monkeypatch, heads)
     metric = perceptual_metric(save(tmp_path / "heads.pth", heads), vgg)
-    picture = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
-    assert metric(picture, picture) == 0 < metric(1 - picture, picture)
+    image = np.random.default_rng(0).random((24, 32, 3)).astype(np.float32)
+    assert metric(image, image) == 0 < metric(1 - image, image)
     with pytest.raises(InputError, match="16 px"):
-        metric(picture[:15], picture[:15])
+        metric(image[:15], image[:15])
 
 
 def test_heads_of_the_installed_package_are_found_without_importing_it(

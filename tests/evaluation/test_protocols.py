@@ -10,22 +10,21 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.angles import angle_class, angle_of, turn_class
-from facerf_cli.evaluation.cases import Case
-from facerf_cli.evaluation.geometry import FULL, MEAN, Form, compare_geometries
-from facerf_cli.evaluation.olat import LAMBERT, compare_olats
+from facerf_cli.evaluation.case import Case
+from facerf_cli.evaluation.methods import View, angle_class, angle_of, turn_class
 from facerf_cli.evaluation.people import Person, evenly
-from facerf_cli.evaluation.reconstruction import brightest, reconstruct
-from facerf_cli.evaluation.transfer import Side, couples_of, transfer
-from facerf_cli.evaluation.views import View
+from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, Form, compare_geometries
+from facerf_cli.evaluation.protocols.olat import LAMBERT, compare_olats
+from facerf_cli.evaluation.protocols.reconstruction import brightest, reconstruct
+from facerf_cli.evaluation.protocols.transfer import Side, couples_of, transfer
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.metrics import si_mse, si_mse_channels
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.stage.data.dataset import Dataset, read_dataset
-from facerf_cli.stage.data.recipes import Pair
+from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, PersonOfAlbedo
-from tests.stage.data.dataset_fixture import write_small_dataset
 
 
 @pytest.fixture(scope="module")
@@ -80,12 +79,12 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, d
 
 
 def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) -> None:
-    picture, face = person.source(pair(0, "C0", "C0", 0))
+    image, face = person.source(pair(0, "C0", "C0", 0))
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
     view = person.shot("C0").view
-    found = reconstruct(Case("a", "0000"), view, picture, face, [Double("unlit", gain=0.5)], truth)
-    error = si_mse(found.predictions["unlit"], picture, found.mask)
-    assert error < 0.01 * np.square(picture[found.mask > 0.5]).mean()
+    found = reconstruct(Case("a", "0000"), view, image, face, [Double("unlit", gain=0.5)], truth)
+    error = si_mse(found.predictions["unlit"], image, found.mask)
+    assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
     assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
     np.testing.assert_allclose(found.landmarks_px, person.shot("C0").view.fit.landmarks_px)
@@ -95,15 +94,15 @@ def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
     method = Double("unlit")
     sides = []
     for camera in ("C0", "C1"):
-        picture, face = person.source(pair(0, camera, camera, 0))
-        sides.append(Side(Case(f"by {camera}", "0000"), person.shot(camera).view, picture, face))
+        image, face = person.source(pair(0, camera, camera, 0))
+        sides.append(Side(Case(f"by {camera}", "0000"), person.shot(camera).view, image, face))
     first, second = transfer((sides[0], sides[1]), [method])
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
     assert torch.equal(light_of_a[0], a.light.weights)
     fits = [side.view.fit for side in sides]
     torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
-    assert first.truth is sides[0].picture and first.source is sides[1].picture
+    assert first.truth is sides[0].image and first.source is sides[1].image
     assert second.case.facts["turn"] == "30 to 60 deg"
     for found in (
         first,
@@ -124,19 +123,19 @@ def test_the_mean_face_is_compared_where_both_see_the_face(person: Person) -> No
     people = {FULL: replace(person, refit=True, _shots={})}
     people[MEAN] = replace(people[FULL], model=model.pose_only(), _shots={})
     asked = pair(0, "C1", "C1", 0)
-    picture, _ = person.source(asked)
+    image, _ = person.source(asked)
     forms = {
-        name: Form(p.shot("C1").view, p.shot("C1").view.texture_of(picture), [Double("unlit")])
+        name: Form(p.shot("C1").view, p.shot("C1").view.texture_of(image), [Double("unlit")])
         for name, p in people.items()
     }
     assert not forms[MEAN].view.fit.alpha.any() and forms[FULL].view.fit.alpha.any()
-    found = compare_geometries(Case("a", "0000"), picture, forms)
+    found = compare_geometries(Case("a", "0000"), image, forms)
     assert list(found.predictions) == [FULL, MEAN]
     assert (found.mask <= forms[MEAN].view.mask).all() and (found.mask <= forms[FULL].view.mask).all()
     two: dict[str, Any] = {
         name: replace(form, methods=[Double("x"), Double("y")]) for name, form in forms.items()
     }
-    names = list(compare_geometries(Case("a", "0000"), picture, two).predictions)
+    names = list(compare_geometries(Case("a", "0000"), image, two).predictions)
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
@@ -154,7 +153,7 @@ def test_a_face_of_which_nothing_is_seen_is_named(person: Person) -> None:
         View.of(person.model, shot.view.fit, 0 * shot.header.seen)
 
 
-def test_couples_are_of_two_cameras_and_two_maps_and_each_picture_is_in_one() -> None:
+def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> None:
     sources = [("C0", "a"), ("C0", "b"), ("C1", "a"), ("C1", "a"), ("C1", "c"), ("C0", "a")]
     pairs = [pair(index, camera, camera, 0, envmap) for index, (camera, envmap) in enumerate(sources)]
     couples = [(a.index, b.index) for a, b in couples_of(pairs)]
@@ -185,8 +184,8 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     assert (
         main(["relight-dataset", str(dataset.folder), "--envmaps", "procedural:2", "--per-subject", "2"]) == 0
     )
-    from facerf_cli.stage.data.pair_weights import weights_path
-    from facerf_cli.stage.data.recipes import picture_path, read_pairs
+    from facerf_cli.dataset.pairs import image_path, read_pairs
+    from facerf_cli.dataset.weights import weights_path
 
     person, (first, second) = Person(load_face_model(), dataset, "0000"), read_pairs(dataset)
     directions, weights = person.light(second)
@@ -195,7 +194,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     np.testing.assert_array_equal(person.light(second)[1], weights)
     assert not weights_path(dataset).exists()
     written, _ = person.source(first)
-    picture_path(dataset, *first.key).unlink()
+    image_path(dataset, *first.key).unlink()
     np.testing.assert_array_equal(person.source(first)[0], written)
 
 

@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 
 from facerf_cli.evaluation.measure import METRICS, Row
-from facerf_cli.evaluation.paper import TABLE_1, TABLE_2_RECONSTRUCTION, TABLE_2_TRANSFER, TABLE_3, TABLE_4
-from facerf_cli.evaluation.summary import Layout, natural, published_beside, summarise
+from facerf_cli.evaluation.summary import (
+    TABLE_1,
+    TABLE_2_RECONSTRUCTION,
+    TABLE_2_TRANSFER,
+    TABLE_3,
+    TABLE_4,
+    Layout,
+    natural,
+    published_beside,
+    summarise,
+)
 
 LAYOUT = Layout("toy", "Toy", ("si_mse", "psnr"), ("pose",), TABLE_1)
 ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}
@@ -31,7 +40,7 @@ def rows(**more: float) -> list[Row]:
 
 def test_means_and_pairs_by_hand() -> None:
     summary = summarise(LAYOUT, rows())
-    assert (summary.pictures, summary.persons, summary.methods) == (4, 2, ("ours", "theirs"))
+    assert (summary.images, summary.persons, summary.methods) == (4, 2, ("ours", "theirs"))
     ours, theirs = (summary.groups[0].cells["si_mse"][name] for name in summary.methods)
     assert ours.interval.mean == pytest.approx(0.25) and ours.interval.sd == pytest.approx(
         np.std(ERRORS["ours"])
@@ -58,11 +67,11 @@ def test_values_that_are_none_are_counted_not_hidden() -> None:
     found = rows()
     found[0].values["si_mse"] = math.nan
     cells = summarise(LAYOUT, found).groups[0].cells["si_mse"]
-    assert cells["ours"].left_out == 1 and cells["ours"].interval.pictures == 3
-    assert cells["theirs"].paired.difference.pictures == 3  # only where both are
+    assert cells["ours"].left_out == 1 and cells["ours"].interval.images == 3
+    assert cells["theirs"].paired.difference.images == 3  # only where both are
 
 
-def test_a_picture_measured_twice_is_our_bug() -> None:
+def test_a_image_measured_twice_is_our_bug() -> None:
     with pytest.raises(ValueError, match="twice"):
         summarise(LAYOUT, [*rows(), rows()[0]])
 

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.commands.evaluation_options import EvaluateOptions
-from facerf_cli.commands.evaluation_run import run_protocol
-from facerf_cli.commands.inputs import Item
-from facerf_cli.commands.options import Settings
-from facerf_cli.commands.photo import PhotoOptions
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.evaluation_run import run_protocol
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.cases import Case, Comparison
-from facerf_cli.evaluation.paper import TABLE_1
-from facerf_cli.evaluation.summary import Layout
+from facerf_cli.evaluation.case import Case, Comparison
+from facerf_cli.evaluation.summary import TABLE_1, Layout
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(

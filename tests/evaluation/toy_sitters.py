@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
 from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import Camera, project
-from facerf_cli.stage.data.yale_b import HEIGHT_PX, WIDTH_PX
 
 
 @dataclass(frozen=True, eq=False)

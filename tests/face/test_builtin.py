@@ -9,11 +9,9 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM
-from facerf_cli.face.builtin import IDENTITIES, build
-from facerf_cli.face.expressions import EXPRESSION_STD
+from facerf_cli.face.builtin import EXPRESSION_STD, IDENTITIES, build
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.face.regions import region_mask
-from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, grid_uv
+from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, grid_uv, region_mask
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
@@ -177,12 +175,12 @@ def test_a_face_detector_finds_the_mean_and_its_landmarks(model):
     shade = interpolate(vertex_normals(vertices, triangles), triangles, fragments) @ light
     linear = colour * (0.2 + 0.85 * shade.clamp(min=0))[..., None]
     linear[fragments.triangle < 0] = 0.08
-    picture = (linear.clamp(0, 1) ** (1 / 2.2) * 255).byte().numpy()
+    image = (linear.clamp(0, 1) ** (1 / 2.2) * 255).byte().numpy()
 
-    boxes = dlib.get_frontal_face_detector()(picture, 0)
+    boxes = dlib.get_frontal_face_detector()(image, 0)
     assert len(boxes) == 1
     predictor = f"{models.submodule_search_locations[0]}/models/shape_predictor_68_face_landmarks.dat"
-    shape = dlib.shape_predictor(predictor)(picture, boxes[0])
+    shape = dlib.shape_predictor(predictor)(image, boxes[0])
     found_px = torch.tensor([(shape.part(i).x + 0.5, shape.part(i).y + 0.5) for i in range(68)])
     wanted_px = project(model.landmarks(vertices[None])[0], camera)
     between_eyes_px = (wanted_px[36] - wanted_px[45]).norm()

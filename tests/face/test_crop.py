@@ -62,7 +62,7 @@ def test_ramps_stay_straight(size_px, off_px):
     assert cut == pytest.approx(expected, abs=off_px)
 
 
-def test_light_stays_inside_the_range_of_the_picture():
+def test_light_stays_inside_the_range_of_the_image():
     image = np.zeros((20, 30, 3), np.float32)
     image[10, 15] = 1e4
     cut = Crop(5, 2, 16, 128).apply(image)

@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import FitSettings, better_start, fit_batch, fit_landmarks, problem_of
-from facerf_cli.face.fit_start import FitStart, seeded_state
+from facerf_cli.face.fit import (
+    FitSettings,
+    FitStart,
+    better_start,
+    fit_batch,
+    fit_landmarks,
+    problem_of,
+    seeded_state,
+)
 from facerf_cli.face.gauss_newton import fit_points, minimise, total_cost
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.head_model import HeadModel
-from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
+from facerf_cli.face.morphable import HeadModel, MorphableModel, load_face_model, save_face_model
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,7 @@
 import torch
 
-from facerf_cli.face.interior import interior_mask, interior_texture
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.topology import LANDMARK_UV, grid_triangles, grid_uv
+from facerf_cli.face.topology import LANDMARK_UV, grid_triangles, grid_uv, interior_mask, interior_texture
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 

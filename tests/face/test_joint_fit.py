@@ -10,9 +10,8 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.crop_pose import fit_in_crop
 from facerf_cli.face.fit import IOD_M, fit_landmarks
-from facerf_cli.face.joint_fit import JointFit, PosedCamera, fit_views
+from facerf_cli.face.joint_fit import JointFit, PosedCamera, fit_in_crop, fit_views
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation, project
 

@@ -11,13 +11,13 @@ from PIL import Image
 
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.landmark_files import read_landmarks
 from facerf_cli.face.landmarks import (
     Face,
     choose_face,
     detect_landmarks,
     find_faces,
     predictor_path,
+    read_landmarks,
     to_display,
 )
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
@@ -85,7 +85,7 @@ def test_a_small_face(landmarks_px):
     assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
 
 
-def test_a_large_picture(landmarks_px):
+def test_a_large_image(landmarks_px):
     large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
     (face,) = detect_landmarks(large)
     assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
@@ -121,7 +121,7 @@ def test_several_faces_from_left_to_right(landmarks_px):
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3), (200, 300, 3)])
-def test_no_face_names_the_picture_and_a_way_out(shape):
+def test_no_face_names_the_image_and_a_way_out(shape):
     with pytest.raises(InputError, match=r"holiday\.png: no face found.*--landmarks"):
         find_faces(np.random.default_rng(0).random(shape, np.float32), "holiday.png")
 
@@ -133,7 +133,7 @@ def test_display_copies_are_exposed_by_themselves():
     assert to_display(np.zeros((4, 5, 3), np.float32)).max() == 0
 
 
-def test_only_display_pictures_are_searched():
+def test_only_display_images_are_searched():
     with pytest.raises(ValueError, match="uint8"):
         detect_landmarks(np.zeros((5, 5, 3), np.float32))
 

@@ -44,8 +44,8 @@ def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
 
 def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     class Recorder:
-        def compute_face_descriptor(self, picture: np.ndarray, shape: Any) -> list[float]:
-            self.picture, self.points = picture, [(point.x, point.y) for point in shape.parts()]
+        def compute_face_descriptor(self, image: np.ndarray, shape: Any) -> list[float]:
+            self.image, self.points = image, [(point.x, point.y) for point in shape.parts()]
             return [0.0] * 128
 
     recorder = Recorder()
@@ -53,7 +53,7 @@ def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     places = np.stack([np.arange(68), 2 * np.arange(68)], -1)
     face_descriptor(np.full((9, 7, 3), [0.2, 0.5, 1.3]), places + PIXEL_CENTRE + 0.2)
     assert recorder.points == [tuple(place) for place in places.tolist()]  # a pixel's centre is whole there
-    assert recorder.picture.dtype == np.uint8 and recorder.picture[3, 3].tolist() == [51, 128, 255]
+    assert recorder.image.dtype == np.uint8 and recorder.image[3, 3].tolist() == [51, 128, 255]
 
 
 def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> None:

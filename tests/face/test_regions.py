@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from facerf_cli.face.regions import REGIONS, region_mask
-from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.face.topology import LANDMARK_UV, REGIONS, region_mask
 
 SIDE = 96
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from facerf_cli.face.drawings import _BACKGROUND, draw_turntable
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.face.turntable import _BACKGROUND, draw_turntable
 
 CELL = 48
 
@@ -16,9 +16,9 @@ def cells() -> list[np.ndarray]:
     return cut(draw_turntable(load_face_model(), CELL))
 
 
-def cut(picture: np.ndarray) -> list[np.ndarray]:
-    assert picture.shape == (2 * CELL, 4 * CELL, 3)
-    return [picture[r : r + CELL, c : c + CELL] for r in (0, CELL) for c in range(0, 4 * CELL, CELL)]
+def cut(image: np.ndarray) -> list[np.ndarray]:
+    assert image.shape == (2 * CELL, 4 * CELL, 3)
+    return [image[r : r + CELL, c : c + CELL] for r in (0, CELL) for c in range(0, 4 * CELL, CELL)]
 
 
 def covered(cell: np.ndarray) -> np.ndarray:

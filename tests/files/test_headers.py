@@ -10,8 +10,7 @@ import pytest
 
 from facerf_cli.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.errors import InputError
-from facerf_cli.files.headers import read_header
-from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.images import read_header, read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import is_olat_stack
 
 
@@ -97,7 +96,7 @@ def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
         write_display(name, np.zeros((2, 2, 3), np.float32))
 
 
-def test_no_picture_has_no_header(tmp_path: Path) -> None:
+def test_no_image_has_no_header(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"no picture")
     assert read_header(tmp_path / "a.png") is None and read_header(tmp_path / "b.png") is None
     assert read_header(tmp_path) is None and oiio.geterror() == ""

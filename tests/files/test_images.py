@@ -10,7 +10,7 @@ import pytest
 from facerf_cli import colour
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr
-from facerf_cli.records import Provenance
+from facerf_cli.logs import Provenance
 
 VALUES = np.random.default_rng(1).random((23, 34, 4)).astype(np.float32)  # [H, W, RGBA], not square
 
@@ -44,9 +44,9 @@ def warned(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) ->
 ])  # fmt: skip
 def test_floats_are_linear(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
     rgb = VALUES[..., :3] * 40
-    picture = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
-    np.testing.assert_allclose(picture.pixels, rgb, rtol=tolerance, atol=40 * tolerance)
-    assert picture.pixels.dtype == np.float32 and picture.alpha is None
+    image = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
+    np.testing.assert_allclose(image.pixels, rgb, rtol=tolerance, atol=40 * tolerance)
+    assert image.pixels.dtype == np.float32 and image.alpha is None
 
 
 @pytest.mark.parametrize(("suffix", "kind", "tolerance"), [
@@ -55,9 +55,9 @@ def test_floats_are_linear(tmp_path: Path, suffix: str, kind: str, tolerance: fl
 ])  # fmt: skip
 def test_integers_are_srgb(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
     rgb = VALUES[..., :3]
-    picture = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
-    assert picture.colourspace_name == "sRGB"
-    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels), rgb, atol=tolerance * 1.01)
+    image = read_image(save(tmp_path / f"a.{suffix}", rgb, kind))
+    assert image.colourspace_name == "sRGB"
+    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels), rgb, atol=tolerance * 1.01)
 
 
 def test_jpeg_is_srgb(tmp_path: Path) -> None:
@@ -71,23 +71,23 @@ def test_jpeg_is_srgb(tmp_path: Path) -> None:
 )
 def test_grey_becomes_three_equal_channels(tmp_path: Path, suffix: str, kind: str) -> None:
     grey = np.full((11, 16, 1), 188 / 255, np.float32)
-    picture = read_image(save(tmp_path / f"a.{suffix}", grey, kind))
-    assert picture.pixels.shape == (11, 16, 3)
-    np.testing.assert_allclose(picture.pixels, colour.srgb_to_linear(grey).repeat(3, -1), atol=2e-4)
+    image = read_image(save(tmp_path / f"a.{suffix}", grey, kind))
+    assert image.pixels.shape == (11, 16, 3)
+    np.testing.assert_allclose(image.pixels, colour.srgb_to_linear(grey).repeat(3, -1), atol=2e-4)
 
 
 def test_grey_with_alpha(tmp_path: Path) -> None:
     path = save(tmp_path / "a.png", VALUES[..., :2], "uint16", channelnames=("Y", "A"))
-    picture = read_image(path)
-    np.testing.assert_allclose(picture.alpha, VALUES[..., 1], atol=1e-5)
-    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels[..., 2]), VALUES[..., 0], atol=1e-5)
+    image = read_image(path)
+    np.testing.assert_allclose(image.alpha, VALUES[..., 1], atol=1e-5)
+    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels[..., 2]), VALUES[..., 0], atol=1e-5)
 
 
 def test_pnm_by_its_bytes(tmp_path: Path) -> None:
     levels = np.arange(72, dtype=np.uint8).reshape(4, 6, 3)
     (tmp_path / "a.ppm").write_bytes(b"P6\n6 4\n255\n" + levels.tobytes())
-    picture = read_image(tmp_path / "a.ppm")
-    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels) * 255, levels, atol=1e-3)
+    image = read_image(tmp_path / "a.ppm")
+    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels) * 255, levels, atol=1e-3)
     (tmp_path / "a.pgm").write_bytes(b"P5\n3 2\n1023\n" + np.arange(0, 600, 100, dtype=">u2").tobytes())
     encoded = colour.linear_to_srgb(read_image(tmp_path / "a.pgm").pixels[..., 0]) * 1023
     np.testing.assert_allclose(encoded, [[0, 100, 200], [300, 400, 500]], atol=0.02)
@@ -95,9 +95,9 @@ def test_pnm_by_its_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
 def test_alpha_comes_apart_from_colour(tmp_path: Path, suffix: str) -> None:
-    picture = read_image(save(tmp_path / f"a.{suffix}", VALUES, "uint16"))
-    np.testing.assert_allclose(picture.alpha, VALUES[..., 3], atol=1e-5)
-    np.testing.assert_allclose(colour.linear_to_srgb(picture.pixels), VALUES[..., :3], atol=1e-5)
+    image = read_image(save(tmp_path / f"a.{suffix}", VALUES, "uint16"))
+    np.testing.assert_allclose(image.alpha, VALUES[..., 3], atol=1e-5)
+    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels), VALUES[..., :3], atol=1e-5)
 
 
 def test_exr_is_divided_by_its_alpha_but_keeps_light_without_cover(tmp_path: Path) -> None:
@@ -105,16 +105,16 @@ def test_exr_is_divided_by_its_alpha_but_keeps_light_without_cover(tmp_path: Pat
     alpha[:3] = 0
     premultiplied = np.where(alpha > 0, rgb * alpha, rgb)
     path = save(tmp_path / "a.exr", np.concatenate([premultiplied, alpha], -1), oiio__UnassociatedAlpha=0)
-    picture = read_image(path)
-    np.testing.assert_allclose(picture.pixels, rgb, rtol=1e-5)
-    np.testing.assert_array_equal(picture.alpha, alpha[..., 0])
+    image = read_image(path)
+    np.testing.assert_allclose(image.pixels, rgb, rtol=1e-5)
+    np.testing.assert_array_equal(image.alpha, alpha[..., 0])
 
 
 def test_a_fourth_channel_that_is_no_alpha_is_left_out(tmp_path: Path) -> None:
     path = save(tmp_path / "a.exr", VALUES, channelnames=("R", "G", "B", "Z"))
-    picture = read_image(path)
-    assert picture.alpha is None
-    np.testing.assert_array_equal(picture.pixels, VALUES[..., :3])
+    image = read_image(path)
+    assert image.alpha is None
+    np.testing.assert_array_equal(image.pixels, VALUES[..., :3])
 
 
 def test_an_exr_with_layers_only_gives_its_first(tmp_path: Path) -> None:
@@ -126,9 +126,9 @@ def test_an_exr_with_layers_only_gives_its_first(tmp_path: Path) -> None:
 def test_orientation_is_applied_as_openImageIO_does(tmp_path: Path, orientation: int) -> None:
     path = save(tmp_path / "a.tif", VALUES, Orientation=orientation)
     expected = oiio.ImageBufAlgo.reorient(oiio.ImageBuf(str(path))).get_pixels(oiio.FLOAT)
-    picture = read_image(path)
-    np.testing.assert_allclose(picture.alpha, expected[..., 3], atol=1e-6)
-    assert picture.pixels.shape == expected[..., :3].shape and "Orientation" not in picture.metadata
+    image = read_image(path)
+    np.testing.assert_allclose(image.alpha, expected[..., 3], atol=1e-6)
+    assert image.pixels.shape == expected[..., :3].shape and "Orientation" not in image.metadata
 
 
 def test_orientation_6_turns_the_first_row_to_the_right_edge(tmp_path: Path) -> None:
@@ -151,15 +151,15 @@ def test_chromaticities_of_an_exr(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour.ColourSpace) -> None:
     path = save(tmp_path / "a.exr", VALUES[..., :3], oiio__ColorSpace=name)
-    picture = read_image(path)
-    np.testing.assert_allclose(picture.pixels, colour.to_linear_rec709(VALUES[..., :3], space), atol=1e-5)
-    assert picture.colourspace_name == space.name
+    image = read_image(path)
+    np.testing.assert_allclose(image.pixels, colour.to_linear_rec709(VALUES[..., :3], space), atol=1e-5)
+    assert image.colourspace_name == space.name
 
 
 def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
     spec = oiio.ImageSpec(4, 4, 3, "uint8")
     spec.attribute("ICCProfile:profile_description", "Display P3")
-    from facerf_cli.files.headers import space_of_file
+    from facerf_cli.files.images import space_of_file
 
     assert space_of_file(tmp_path, spec) is colour.DISPLAY_P3
     spec.attribute("ICCProfile:profile_description", "Scanner 7")
@@ -225,14 +225,14 @@ def test_a_jpeg_that_lacks_its_last_byte_and_a_png_with_a_flipped_bit(
 @pytest.mark.parametrize(
     "name", ["a.exr", "a.png", "a.jpg", "a.hdr", "a.tif", "a.pgm", "a.txt", "a", "a b#%04d.png"]
 )
-def test_a_text_file_is_no_picture(tmp_path: Path, name: str, capfd: pytest.CaptureFixture) -> None:
+def test_a_text_file_is_no_image(tmp_path: Path, name: str, capfd: pytest.CaptureFixture) -> None:
     (tmp_path / name).write_text("not a picture\n" * 20)
     with pytest.raises(InputError, match="not a picture that can be read"):
         read_image(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 
 
-def test_an_unreadable_picture_says_what_to_do_without_the_library_s_codes(tmp_path: Path) -> None:
+def test_an_unreadable_image_says_what_to_do_without_the_library_s_codes(tmp_path: Path) -> None:
     (tmp_path / "a.exr").write_text("hello, I am text\n")
     with pytest.raises(InputError, match=r"save it anew as .* \(EXR Error: File is not an OpenEXR file\)$"):
         read_image(tmp_path / "a.exr")
@@ -283,12 +283,12 @@ def test_exr_round_trip_with_layers_and_provenance(tmp_path: Path) -> None:
     path = tmp_path / "new" / "a.exr"
     facts = Provenance("me.jpg", "default", "builtin", "MIT").attributes()
     assert write_exr(path, rgb, alpha, layers, facts) == 0
-    picture = read_image(path)
-    np.testing.assert_allclose(picture.pixels, rgb, rtol=2e-3, atol=3e-3)
-    np.testing.assert_allclose(picture.alpha, alpha, atol=3e-4)
-    assert picture.metadata["facerf:synthetic"] == 1 and picture.metadata["facerf:input"] == "me.jpg"
-    assert picture.metadata["IPTC:DigitalSourceType"].endswith("compositeWithTrainedAlgorithmicMedia")
-    assert picture.metadata["chromaticities"] == pytest.approx(colour.REC709_CHROMATICITIES)
+    image = read_image(path)
+    np.testing.assert_allclose(image.pixels, rgb, rtol=2e-3, atol=3e-3)
+    np.testing.assert_allclose(image.alpha, alpha, atol=3e-4)
+    assert image.metadata["facerf:synthetic"] == 1 and image.metadata["facerf:input"] == "me.jpg"
+    assert image.metadata["IPTC:DigitalSourceType"].endswith("compositeWithTrainedAlgorithmicMedia")
+    assert image.metadata["chromaticities"] == pytest.approx(colour.REC709_CHROMATICITIES)
     stored = oiio.ImageBuf(str(path))
     names = list(stored.spec().channelnames)
     xyz = {f"{layer}.{letter}" for layer in ("normal", "position") for letter in "XYZ"}
@@ -325,13 +325,13 @@ def test_display_auto_exposure_is_told_and_alpha_is_kept_straight(tmp_path: Path
     linear, alpha = VALUES[..., :3] * 0.01, VALUES[..., 3]
     chosen_ev = write_display(tmp_path / "a.png", linear, "auto", alpha, Provenance("me.jpg").attributes())
     assert chosen_ev == colour.auto_exposure_ev(linear, alpha)
-    picture = read_image(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png")
     expected = np.clip(linear * 2**chosen_ev, 0, 1)
     np.testing.assert_allclose(
-        colour.linear_to_srgb(picture.pixels), colour.linear_to_srgb(expected), atol=0.002
+        colour.linear_to_srgb(image.pixels), colour.linear_to_srgb(expected), atol=0.002
     )
-    np.testing.assert_allclose(picture.alpha, alpha, atol=0.002)
-    assert picture.metadata["Software"].startswith("facerf ")
+    np.testing.assert_allclose(image.alpha, alpha, atol=0.002)
+    assert image.metadata["Software"].startswith("facerf ")
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:

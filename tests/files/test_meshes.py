@@ -53,7 +53,7 @@ def test_shape_and_texture_come_back(tmp_path: Path, kind: str) -> None:
     assert np.allclose(mesh.visual.uv[top_left], [0, 1])
 
 
-def test_obj_names_its_material_and_picture(tmp_path: Path) -> None:
+def test_obj_names_its_material_and_image(tmp_path: Path) -> None:
     path = written(tmp_path, "obj")
     text = path.read_text()
     assert "mtllib a quad.mtl" in text and "usemtl face" in text and "facerf:synthetic: 1" in text

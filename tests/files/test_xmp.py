@@ -7,9 +7,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from facerf_cli.files.images import read_image, write_display
-from facerf_cli.files.xmp import xmp_packet
-from facerf_cli.records import COMPOSITE_SOURCE_TYPE, Provenance
+from facerf_cli.files.images import read_image, write_display, xmp_packet
+from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, Provenance
 
 IPTC = "{http://iptc.org/std/Iptc4xmpExt/2008-02-29/}DigitalSourceType"
 
@@ -20,7 +19,7 @@ def properties(data: bytes) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
-def test_a_display_picture_says_that_it_is_synthetic(tmp_path: Path, suffix: str) -> None:
+def test_a_display_image_says_that_it_is_synthetic(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
     pixels = np.full((9, 14, 3), 0.25, np.float32)
     write_display(path, pixels, metadata=Provenance('a "b" <c> ü.jpg', "default").attributes())

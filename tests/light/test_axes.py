@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.light.axes import (
+from facerf_cli.light.forms import (
     MapAxes,
     from_dpr,
     from_map_axes,
@@ -14,9 +14,9 @@ from facerf_cli.light.axes import (
     to_map_axes,
     to_sfsnet,
 )
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import irradiance, rig_coefficients
 from facerf_cli.light.sphere import (
+    RigLight,
     azel_to_direction,
     direction_to_uv,
     latlong_directions,
@@ -139,13 +139,13 @@ def test_mitsuba_sees_our_map_as_it_stands() -> None:
             },
         }
     )
-    picture = torch.from_numpy(np.array(mitsuba.render(scene, seed=1), np.float32)[..., :3])
+    image = torch.from_numpy(np.array(mitsuba.render(scene, seed=1), np.float32)[..., :3])
     x, y = torch.meshgrid((torch.arange(24) + 0.5) / 12 - 1, 1 - (torch.arange(24) + 0.5) / 12, indexing="xy")
     seen = x * x + y * y < 0.7
     normals = torch.stack([x, y, (1 - x * x - y * y).clamp(min=0).sqrt()], -1)[seen]
     rig = latlong_directions(64, 128).reshape(-1, 3)
     power = (envmap * latlong_solid_angles(64, 128)[..., None]).reshape(-1, 3)
     truth = (normals @ rig.T).clamp(min=0) @ power / math.pi
-    assert float((picture[seen] - truth).abs().mean()) < 0.05 * float(truth.mean())
+    assert float((image[seen] - truth).abs().mean()) < 0.05 * float(truth.mean())
     mirrored = truth.reshape(-1, 3).flip(0)
-    assert float((picture[seen] - mirrored).abs().mean()) > 0.3 * float(truth.mean())  # it could fail
+    assert float((image[seen] - mirrored).abs().mean()) > 0.3 * float(truth.mean())  # it could fail

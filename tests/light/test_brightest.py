@@ -1,8 +1,7 @@
 import torch
 
-from facerf_cli.light.brightest import brightest_direction
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.rig_latlong import brightest_direction
+from facerf_cli.light.sphere import RigLight, rig_directions
 
 
 def _angle_deg(a: torch.Tensor, b: torch.Tensor) -> float:

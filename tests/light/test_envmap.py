@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.ball import ball
-from facerf_cli.light.envmap import check_envmap, envmap_weights, rotated_weights, texel_integrals
+from facerf_cli.light.envmap import ball, check_envmap, envmap_weights, rotated_weights, texel_integrals
 from facerf_cli.light.sphere import (
     azel_to_direction,
     direction_to_uv,
@@ -60,7 +59,7 @@ def test_a_coarse_map_is_cut_at_the_cells_and_not_at_its_pixels(rotate_deg: floa
     assert error.std() < 0.01 * truth.mean()
 
 
-def test_a_bright_texel_at_u_a_quarter_lights_the_pictures_right() -> None:
+def test_a_bright_texel_at_u_a_quarter_lights_the_images_right() -> None:
     envmap = one_texel(64, (0.25, 0.5))
     normals = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     right, left = lambert(normals, envmap_weights(envmap, RIG))[:, 0]

@@ -41,13 +41,13 @@ def flat(evidence: LightEvidence) -> tuple[torch.Tensor, torch.Tensor]:
     return evidence.olats[..., evidence.mask], evidence.photo[:, evidence.mask]
 
 
-def test_weights_that_made_a_picture_are_found_again() -> None:
+def test_weights_that_made_a_image_are_found_again() -> None:
     weights = some_weights()
-    olats, picture = flat(lit(shaded_ball(), weights))
-    found = estimate_light(olats, picture)
+    olats, image = flat(lit(shaded_ball(), weights))
+    found = estimate_light(olats, image)
     assert (found >= 0).all()
     remade = torch.einsum("lc,lcn->cn", found, olats)
-    assert (remade - picture).norm() < 0.03 * picture.norm()
+    assert (remade - image).norm() < 0.03 * image.norm()
     assert (found - weights)[weights > 0].norm() < 0.3 * weights.norm()
 
 
@@ -63,20 +63,20 @@ def test_the_plain_form_is_exact_where_lights_can_be_told_apart_even_if_they_are
     assert (seen.least_squares() >= 0).all()
 
 
-def test_a_covered_picture_gives_the_same_light() -> None:
+def test_a_covered_image_gives_the_same_light() -> None:
     for solve in ("quotient", "smooth"):
         evidence = lit(shaded_ball(), torch.full((LIGHTS, 3), 0.2))
-        olats, picture = flat(evidence)
-        spoilt = picture.clone()
+        olats, image = flat(evidence)
+        spoilt = image.clone()
         spoilt[:, ::10] = 0.0  # hair
-        none = torch.zeros_like(picture, dtype=torch.bool)
+        none = torch.zeros_like(image, dtype=torch.bool)
         found = (
             estimate_light(olats, spoilt)
             if solve == "quotient"
             else estimate_smooth_light(evidence.directions, olats, spoilt, none)
         )
         remade = torch.einsum("lc,lcn->cn", found, olats)
-        assert (remade - picture).norm() < 0.05 * picture.norm(), solve
+        assert (remade - image).norm() < 0.05 * image.norm(), solve
 
 
 def test_of_clipped_highlights_only_darkness_is_an_error() -> None:
@@ -118,9 +118,9 @@ def test_a_lone_lamp_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> None
     assert 0.75 < found < 1.05 and smeared < 0.8 * found
 
 
-def test_a_black_picture_has_no_light() -> None:
-    olats, picture = flat(shaded_ball())
-    assert estimate_light(olats, picture).abs().max() == 0
+def test_a_black_image_has_no_light() -> None:
+    olats, image = flat(shaded_ball())
+    assert estimate_light(olats, image).abs().max() == 0
     evidence = shaded_ball()
     red = LightEvidence(
         evidence.directions,

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from facerf_cli.light.estimate import LightEvidence
-from facerf_cli.light.refine import RefineSettings, refine_light
+from facerf_cli.light.estimate import LightEvidence, RefineSettings, refine_light
 from tests.light.test_estimate import LIGHTS, lit, shaded_ball, some_weights
 
 

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, latlong_directions, rig_directions
 
 RIG = rig_directions()
 

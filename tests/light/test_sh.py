@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import (
     coefficients_to_rig,
     cosine_lobe,
@@ -17,7 +16,7 @@ from facerf_cli.light.sh import (
     rotated,
     sh_basis,
 )
-from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles, rig_directions
+from facerf_cli.light.sphere import RigLight, latlong_directions, latlong_solid_angles, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation
 from tests.oracles.sh import real_harmonic
 

@@ -6,10 +6,15 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sh import irradiance, radiance, rig_coefficients, sh_basis
-from facerf_cli.light.sh_latlong import latlong_coefficients, sh_to_latlong
-from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles, rig_directions
+from facerf_cli.light.sh import (
+    irradiance,
+    latlong_coefficients,
+    radiance,
+    rig_coefficients,
+    sh_basis,
+    sh_to_latlong,
+)
+from facerf_cli.light.sphere import RigLight, latlong_directions, latlong_solid_angles, rig_directions
 from tests.oracles.sh import project_slowly
 
 

@@ -1,11 +1,14 @@
 import pytest
 import torch
 
-from facerf_cli.light.rig_light import RigLight
-from facerf_cli.light.sh import rig_coefficients
-from facerf_cli.light.sh_latlong import latlong_coefficients, sh_to_latlong
-from facerf_cli.light.sh_positive import clipped_series, positive_latlong
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.sh import (
+    clipped_series,
+    latlong_coefficients,
+    positive_latlong,
+    rig_coefficients,
+    sh_to_latlong,
+)
+from facerf_cli.light.sphere import RigLight, rig_directions
 
 
 def relative_error(found: torch.Tensor, truth: torch.Tensor) -> float:

@@ -6,10 +6,9 @@ import trimesh
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
-from facerf_cli.light.rays import build_scene
-from facerf_cli.light.rays import occluded as embree_occluded
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.transport import BakeSettings, bake_transport
+from facerf_cli.light.transport import BakeSettings, bake_transport, build_scene
+from facerf_cli.light.transport import occluded as embree_occluded
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import bake_attributes, normal_map

@@ -5,11 +5,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.light.rig_light import RigLight
 from facerf_cli.light.sh import irradiance, rig_coefficients, rotated
-from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.diffuse import DiffuseNetwork, DiffuseSettings, shading
-from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings, shading
+from facerf_cli.network.reflectance import MEAN_RADIANCE
 from facerf_cli.raster.camera import pose_to_rotation
 
 SETTINGS = DiffuseSettings(
@@ -52,7 +51,7 @@ def test_albedo_is_in_bounds_and_light_is_of_order_2(network: DiffuseNetwork) ->
     assert albedo.min() > 0 and albedo.max() < 1
 
 
-def test_what_it_explains_does_not_depend_on_the_pictures_exposure(network: DiffuseNetwork) -> None:
+def test_what_it_explains_does_not_depend_on_the_images_exposure(network: DiffuseNetwork) -> None:
     texture, normals, visible = faces(1, 16)
     plain, bright = network(texture, normals, visible), network(7 * texture, normals, visible)
     assert torch.allclose(plain.albedo, bright.albedo, atol=1e-5)

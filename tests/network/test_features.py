@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from facerf_cli.colour import linear_to_srgb
-from facerf_cli.network.features import (
+from facerf_cli.network.feature_networks import (
     LightNetwork,
     LightSettings,
     VggFeatures,
@@ -40,11 +40,11 @@ def test_features_are_those_of_the_slow_twin() -> None:
     network = VggFeatures(width=1 / 16).double()
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
-    picture = torch.rand(1, 3, 9, 12) * 1.5
-    picture[..., 0] = 0.001  # where the curve is straight
+    image = torch.rand(1, 3, 9, 12) * 1.5
+    image[..., 0] = 0.001  # where the curve is straight
     tensors = {name: tensor.numpy() for name, tensor in network.state_dict().items()}
-    slow = slow_features(tensors, picture[0].double().numpy())
-    for fast, expected in zip(network.layers(picture), slow.values(), strict=True):
+    slow = slow_features(tensors, image[0].double().numpy())
+    for fast, expected in zip(network.layers(image), slow.values(), strict=True):
         assert torch.allclose(fast[0], torch.from_numpy(expected), rtol=1e-4, atol=1e-4)
         assert (expected > 0).any() and (expected == 0).any()
 
@@ -58,7 +58,7 @@ def test_encoding_is_srgb_with_a_gradient_everywhere() -> None:
     assert linear.grad is not None and linear.grad.isfinite().all() and (linear.grad > 0).all()
 
 
-def test_distance_is_a_sum_over_layers_of_means_for_each_picture() -> None:
+def test_distance_is_a_sum_over_layers_of_means_for_each_image() -> None:
     network = VggFeatures(1 / 8)
     a, b = torch.rand(3, 3, 16, 16), torch.rand(3, 3, 16, 16)
     b[1] = a[1]

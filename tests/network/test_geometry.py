@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
+from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
-from facerf_cli.network.saved import load_networks, save_networks
 
 SMALL = GeometrySettings(identity=5, expression=3, mean_translation_m=(0.01, -0.02, -0.9))
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from facerf_cli.network.inputs import colour_cast
+from facerf_cli.network.reflectance import colour_cast
 
 SKIN = torch.tensor([0.5, 0.36, 0.28])
 
@@ -34,8 +34,8 @@ def test_a_strange_light_is_taken_off(light: tuple[float, float, float]) -> None
     seen = visible.expand_as(texture) > 0
     torch.testing.assert_close(plain[seen].mean(), texture[seen].mean())
 
-    def off(picture: torch.Tensor) -> float:
-        mean = (picture * visible).sum((2, 3))[0]
+    def off(image: torch.Tensor) -> float:
+        mean = (image * visible).sum((2, 3))[0]
         return float(((mean / mean[1]) / (SKIN / SKIN[1])).log().norm())
 
     assert off(plain) < 0.4 * off(texture)

@@ -7,8 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.paper_reflectance import PaperReflectanceNetwork, PaperReflectanceSettings
-from facerf_cli.network.saved import load_networks, save_networks
+from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 
 SMALL = PaperReflectanceSettings(side=32, widths=(8, 8, 12, 16), features=8)
 

@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from facerf_cli.colour import linear_to_srgb
-from facerf_cli.network.features import LPIPS_LAYERS, VggFeatures
-from facerf_cli.network.perceptual import Lpips
+from facerf_cli.network.feature_networks import LPIPS_LAYERS, Lpips, VggFeatures
 from tests.oracles.lpips import lpips as slow_lpips
 
 CHANNELS = (64, 128, 256, 512, 512)
@@ -37,12 +36,12 @@ def test_the_distance_is_that_of_the_slow_twin() -> None:
     second = (first + 0.2 * torch.rand_like(first)).clamp(0, 1)
     second[..., :4] = 0  # as masked pictures are
     tensors = {name: tensor.numpy() for name, tensor in network.trunk.state_dict().items()}
-    encoded = [linear_to_srgb(picture[0].numpy()).astype(np.float64) for picture in (first, second)]
+    encoded = [linear_to_srgb(image[0].numpy()).astype(np.float64) for image in (first, second)]
     expected = slow_lpips(tensors, [head.numpy() for head in network.heads], *encoded)
     assert network(first, second).item() == pytest.approx(expected, rel=1e-4) and expected > 0.01
 
 
-def test_equal_pictures_are_at_no_distance_and_each_of_a_batch_is_for_itself() -> None:
+def test_equal_images_are_at_no_distance_and_each_of_a_batch_is_for_itself() -> None:
     network = small()
     first, second = torch.rand(3, 3, 20, 24), torch.rand(3, 3, 20, 24)
     second[1] = first[1]
@@ -68,8 +67,8 @@ def test_tensors_have_vgg16s_shapes_up_to_conv5_3(whole: Lpips) -> None:
 def test_the_shallow_trunk_gives_the_same_layers_as_the_deep_one() -> None:
     deep, shallow = VggFeatures(1 / 16, LPIPS_LAYERS), VggFeatures(1 / 16)
     shallow.load_published(deep.state_dict())
-    picture = torch.rand(1, 3, 16, 24)
-    for a, b in zip(shallow.layers(picture), deep.layers(picture)[:3], strict=True):
+    image = torch.rand(1, 3, 16, 24)
+    for a, b in zip(shallow.layers(image), deep.layers(image)[:3], strict=True):
         assert torch.equal(a, b)
 
 
@@ -97,7 +96,7 @@ def test_heads_that_are_none_are_refused_in_words(whole: Lpips, trouble: str) ->
     assert all(torch.equal(a, b) for a, b in zip(whole.heads, before, strict=True))
 
 
-def test_pictures_too_small_for_the_last_layer_are_refused() -> None:
+def test_images_too_small_for_the_last_layer_are_refused() -> None:
     with pytest.raises(ValueError, match="15"):
         small()(torch.zeros(1, 3, 15, 40), torch.zeros(1, 3, 15, 40))
 

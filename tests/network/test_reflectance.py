@@ -2,8 +2,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.network.inputs import head_rotation
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings, head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 
 SMALL = ReflectanceSettings(

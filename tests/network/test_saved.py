@@ -5,13 +5,12 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.checkpoints import save_checkpoint
-from facerf_cli.network.diffuse import DiffuseNetwork
-from facerf_cli.network.features import LightNetwork
+from facerf_cli.network.checkpoint import load_networks, save_checkpoint
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
-from facerf_cli.network.paper_reflectance import PaperReflectanceSettings
 from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
-from facerf_cli.network.saved import load_networks
+from facerf_cli.network.reflectance_paper import PaperReflectanceSettings
 
 DESCRIBED: dict[str, dict[str, Any]] = {
     "reflectance": {"form": "default", **ReflectanceSettings().__dict__},

@@ -29,8 +29,8 @@ def rasterize_slowly(
                 triangle[row, column] = best
                 barycentric[row][column] = scaled[best] * distance[best]
                 depth[row][column] = distance[best]
-    return triangle, _picture(barycentric), _picture(depth)
+    return triangle, _image(barycentric), _image(depth)
 
 
-def _picture(rows: list[list[Tensor]]) -> Tensor:
+def _image(rows: list[list[Tensor]]) -> Tensor:
     return torch.stack([torch.stack(row) for row in rows])

@@ -22,7 +22,7 @@ def test_projection_by_hand() -> None:
     torch.testing.assert_close(px, torch.tensor([[21.0, 9], [31, 9], [21, 4]]))
 
 
-def test_pixel_centres_of_a_picture_that_is_not_square() -> None:
+def test_pixel_centres_of_a_image_that_is_not_square() -> None:
     centres = pixel_centres_px(Camera(1, 7, 4, 0, 0))
     assert centres.shape == (4, 7, 2)
     assert centres[0, 0].tolist() == [0.5, 0.5] and centres[3, 6].tolist() == [6.5, 3.5]

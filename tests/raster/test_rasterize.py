@@ -83,14 +83,14 @@ def test_pixel_centres_on_edges_and_corners_are_owned_once() -> None:
     assert isinstance(alone, Tensor) and bool((alone == 1).all())
 
 
-def test_a_triangle_far_larger_than_the_picture_fills_it() -> None:
+def test_a_triangle_far_larger_than_the_image_fills_it() -> None:
     vertices = torch.tensor([[-90.0, -90, -1], [90, -90, -1], [0, 180, -1]])
     fragments = rasterize(vertices, torch.tensor([[0, 1, 2]]), WIDE)
     assert bool(fragments.covered.all())
     torch.testing.assert_close(fragments.depth_m, torch.ones(22, 37))
 
 
-def test_work_in_parts_gives_the_same_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_in_parts_gives_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
     vertices, triangles = triangle_soup(60, seed=4)
     whole = rasterize(vertices, triangles, WIDE)
     monkeypatch.setattr("facerf_cli.raster.rasterize._CHUNK_PX", 300)
@@ -134,12 +134,12 @@ def test_gradients_to_vertices_and_attributes() -> None:
     vertices, triangles = triangle_soup(5, seed=11)
     attributes = torch.randn(len(vertices), 2, dtype=torch.float64)
 
-    def picture(v: Tensor, a: Tensor) -> Tensor:
+    def image(v: Tensor, a: Tensor) -> Tensor:
         fragments = rasterize(v, triangles, WIDE)
         return interpolate(a, triangles, fragments)
 
     assert torch.autograd.gradcheck(
-        picture, (vertices.requires_grad_(), attributes.requires_grad_()), eps=1e-7, atol=1e-5
+        image, (vertices.requires_grad_(), attributes.requires_grad_()), eps=1e-7, atol=1e-5
     )
 
 

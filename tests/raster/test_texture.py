@@ -164,7 +164,7 @@ def test_a_slanted_plane_does_not_hide_itself() -> None:
     assert visible.min() > 0.5
 
 
-def test_what_lies_outside_the_picture_is_unseen() -> None:
+def test_what_lies_outside_the_image_is_unseen() -> None:
     narrow = Camera(900.0, 80, 220, 40.0, 104.0)
     vertices = head()
     _, visible = unwrap(torch.ones(1, 220, 80), vertices, TRIANGLES, narrow, 128)
@@ -175,7 +175,7 @@ def test_what_lies_outside_the_picture_is_unseen() -> None:
     assert behind.max() == 0
 
 
-def test_unwrap_refuses_a_picture_of_another_size() -> None:
+def test_unwrap_refuses_a_image_of_another_size() -> None:
     with pytest.raises(ValueError, match="220, 300"):
         unwrap(torch.ones(3, 300, 220), head(), TRIANGLES, CAMERA, 32)
 
@@ -204,14 +204,14 @@ def test_render_has_gradients_to_texture_and_vertices() -> None:
     camera = Camera(90.0, 26, 20, 13.2, 9.6)
     texture, vertices = smooth_texture(32).double().requires_grad_(), head(TILTED).double().requires_grad_()
 
-    def picture(t: Tensor, shift: Tensor) -> Tensor:
+    def image(t: Tensor, shift: Tensor) -> Tensor:
         return render_texture(t, vertices + shift, TRIANGLES, UV.double(), camera)[0]
 
     shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(picture, (texture, shift), eps=1e-9, atol=1e-3, fast_mode=True)
+    assert torch.autograd.gradcheck(image, (texture, shift), eps=1e-9, atol=1e-3, fast_mode=True)
 
 
-def test_unwrap_has_gradients_to_picture_and_vertices() -> None:
+def test_unwrap_has_gradients_to_image_and_vertices() -> None:
     vertices = head(TILTED).requires_grad_()
     image = smooth_texture(300)[:, :220].clone().requires_grad_()
     found, visible = unwrap(image, vertices, TRIANGLES, CAMERA, 64)

@@ -1,17 +1,51 @@
-"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020)."""
+"""What lies in a folder, a .zip or a .tar, read with bounds.
+
+ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020).
+
+Face models that anyone may download without signing an agreement.
+"""
 
 import hashlib
+import lzma
 import re
-from collections.abc import Iterator
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.head_model import HEAD_PARTS
-from facerf_cli.face.importers.archives import DAMAGED, members
 from facerf_cli.face.importers.source import EXPRESSION_STD, SourceHead, SourceModel
-from facerf_cli.records import one_line
+from facerf_cli.face.morphable import HEAD_PARTS
+from facerf_cli.files.downloads import Published, cache_folder, fetch
+from facerf_cli.logs import one_line
+
+DAMAGED = (OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
+
+
+def members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
+    """Each file in a folder or archive: its name, and what reads at most so many bytes of it."""
+    if path.is_dir():
+        for file in sorted(path.rglob("*.obj")):
+            with file.open("rb") as stream:
+                yield file.as_posix(), stream.read
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as member:
+                    yield name, member.read
+    elif path.is_file() and tarfile.is_tarfile(path):
+        # One pass: seeking in a compressed tar would decompress it anew for each of its 150 files.
+        with tarfile.open(path, "r|*") as tar:
+            for entry in tar:
+                if entry.isfile() and (content := tar.extractfile(entry)):
+                    yield entry.name, content.read
+    else:
+        wrong = "" if path.exists() else "no such file; "
+        raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")
+
 
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, and of all
 
@@ -134,3 +168,30 @@ def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
     if not triangles or not 0 <= np.min(triangles) <= np.max(triangles) < VERTICES:
         raise InputError(f"{path}: the neutral mesh's faces are damaged; fetch ICT-FaceKit again")
     return np.array(triangles)
+
+
+_ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
+# GitHub packs an archive of a commit anew when it likes, and then its bytes are others; the .obj files inside
+# are the same for ever, so the digest is of them.
+ICT_FACEKIT = Published(
+    f"https://github.com/ICT-VGL/ICT-FaceKit/archive/{_ICT_COMMIT}/ICT-FaceKit-{_ICT_COMMIT}.tar.gz",
+    "76eafb7253344ed6dc7f6d92c6f409868f854b029d5a68a2f4e3583c5bc1ebeb",
+    512 << 20,
+    ict_content_sha256,
+)
+PUBLISHED = {"ict-facekit": ICT_FACEKIT}
+
+
+def fetch_face_model(kind: str) -> Path:
+    """The archive of a published model in the user's cache, fetched there first where it is not yet."""
+    return fetch(PUBLISHED[kind], f"`facerf face-model import {kind}` a copy that you have", _folder())
+
+
+def cached_face_model(kind: str) -> Path | None:
+    """Where a published model lies in the user's cache, if a file of its name does; it is not read."""
+    path = _folder() / PUBLISHED[kind].name
+    return path if path.is_file() else None
+
+
+def _folder() -> Path:
+    return cache_folder() / "face-models"

@@ -12,12 +12,11 @@ import pytest
 import scipy.io
 
 from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.face.importers import basel_2009, basel_2017
-from facerf_cli.face.importers.basel_2009 import read_basel_2009
-from facerf_cli.face.importers.basel_2017 import read_basel_2017
+from facerf_cli.face.importers import basel
+from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
 from facerf_cli.face.importers.carry import carry_over, landmarks_of
-from facerf_cli.face.importers.importing import import_face_model
-from facerf_cli.face.importers.registration import rigid_alignment
+from facerf_cli.face.importers.find_landmarks import rigid_alignment
+from facerf_cli.face.importers.import_model import import_face_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
@@ -26,7 +25,7 @@ from tests.face.importers.heads import Head, head, off_mm
 h5py = pytest.importorskip("h5py")
 
 SHAPES, EXPRESSIONS = 199, 100
-NAMES = {number: name for name, number in basel_2017._LANDMARKS.items()}
+NAMES = {number: name for name, number in basel._LANDMARKS_2017.items()}
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +135,7 @@ def test_basel_2009_becomes_a_model_with_the_built_in_expressions(face: Head, tm
 
 def test_the_published_mesh_of_2009_has_its_landmarks() -> None:
     mean = np.arange(53490 * 3).reshape(-1, 3)
-    known = basel_2009._known(mean)
+    known = basel._known_2009(mean)
     assert len(known) == 18 and set(known) <= set(range(17, 68))
     assert known[30][0] == 3 * 8319 and known[54][0] == 3 * 11714
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.basel_2017 import _LANDMARKS
+from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
 from facerf_cli.face.importers.find_landmarks import _missed, find_landmarks
 from facerf_cli.face.importers.ict import LANDMARK_IDS
 from facerf_cli.face.importers.source import SourceModel

@@ -14,9 +14,9 @@ from scipy import sparse
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.carry import carry_over, landmarks_of
+from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
-from facerf_cli.face.importers.importing import import_face_model
-from facerf_cli.face.importers.registration import nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.import_model import import_face_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LANDMARKS_M

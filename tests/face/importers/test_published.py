@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.importers import published
-from facerf_cli.face.importers.ict import ict_content_sha256
-from facerf_cli.face.importers.published import ICT_FACEKIT, cached_face_model, fetch_face_model
+from facerf_cli.face.importers import ict as published
+from facerf_cli.face.importers.ict import ICT_FACEKIT, cached_face_model, fetch_face_model, ict_content_sha256
 
 CONTENTS = {"generic_neutral_mesh": b"v 1 2 3\n" * 4000, "jawOpen": b"v 3 2 1\n" * 4000}
 

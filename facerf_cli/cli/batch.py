@@ -1,0 +1,384 @@
+"""From what the user names to a sorted list of items, each with its own place in the output folder.
+
+The contract of every verb that walks folders (DESIGN): what is read, skipped, written, reported.
+
+A verb hands `run_batch` (files) or `run_items` (whatever else it walks) two functions: `outputs_of(item)`
+names the files that an item will have when it is finished, and `process(item)` makes them. `process` raises
+`InputError` for an item that is at fault (the run goes on); any other `FacerfError` concerns the whole run
+and ends it.
+"""
+
+import json
+import logging
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from facerf_cli.cli.options import Settings, Shard, workers_of
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.logs import LOGGER_NAME, STDERR, json_line, one_line, unexpected
+from facerf_cli.workers import process_died, spread
+
+PHOTO_SUFFIXES = frozenset(
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+)
+_STACK, _SHEET = "_olat.exr", "_olat.png"  # a stack's contact sheet beside it is no photo
+
+
+@dataclass(frozen=True, order=True)
+class Item:
+    """One input, and its place in the mirrored output tree."""
+
+    input_path: Path
+    output_base: Path  # output folder / mirrored path, without suffix: the outputs' common beginning
+    name: str  # the mirrored path as text; the item's identity within the output folder
+
+    def output(self, ending: str) -> Path:
+        """One of its outputs: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
+        return Path(f"{self.output_base}{ending}")
+
+
+def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozenset[str]) -> list[Item]:
+    """Files as named, folders walked recursively for `suffixes`, `-` a list on stdin; sorted, each once.
+
+    The output tree mirrors the input from the deepest folder that all inputs share. Hidden files and folders
+    are left out, and so is an output folder that lies inside an input folder.
+    """
+    output_real = output_folder.resolve()
+    found: dict[Path, Path] = {}  # absolute -> as the user would write it
+    roots: set[Path] = set()
+    for path in map(Path, expand_stdin(inputs)):
+        absolute = Path(os.path.abspath(path))
+        if path.is_dir():
+            if path.resolve() == output_real:
+                raise UsageError(f"{path}: the output folder is an input folder; give -o another folder")
+            roots.add(absolute)
+            found.update((Path(os.path.abspath(file)), file) for file in _walk(path, output_real, suffixes))
+        else:
+            roots.add(absolute.parent)
+            found[absolute] = path
+    if not found:
+        kinds = " ".join(sorted(suffixes))
+        raise UsageError(f"{' '.join(inputs) or 'standard input'}: no inputs found (looked for {kinds})")
+    common = Path(os.path.commonpath(roots))
+    names = _unique_names([absolute.relative_to(common) for absolute in sorted(found)])
+    return [
+        Item(found[absolute], output_folder / name, name)
+        for absolute, name in zip(sorted(found), names, strict=True)
+    ]
+
+
+def expand_stdin(inputs: Sequence[str]) -> Iterator[str]:
+    """What the user names, with the lines of standard input in the place of `-`."""
+    for entry in inputs:
+        if entry == "-":
+            yield from filter(None, (line.rstrip("\r\n") for line in sys.stdin))
+        else:
+            yield entry
+
+
+def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator[Path]:
+    for here, folders, files in os.walk(folder):
+        folders[:] = [
+            name for name in folders if name[0] != "." and (Path(here) / name).resolve() != output_real
+        ]
+        for name in files:
+            sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files
+            if name[0] != "." and Path(name).suffix.lower() in suffixes and not sheet:
+                yield Path(here) / name
+
+
+def _unique_names(relatives: Sequence[Path]) -> list[str]:
+    """Mirrored paths without suffix; with it where two would share a name, upper and lower case alike."""
+    full = [path.as_posix() for path in relatives]
+    names = [path.with_suffix("").as_posix() for path in relatives]
+    while clashing := _repeated(name.casefold() for name in names):
+        longer = [
+            whole if name.casefold() in clashing else name for whole, name in zip(full, names, strict=True)
+        ]
+        if longer == names:
+            break  # only case tells them apart; the file system that holds the inputs can hold the outputs
+        names = longer
+    return names
+
+
+def _repeated(keys: Iterable[str]) -> set[str]:
+    return {key for key, count in Counter(keys).items() if count > 1}
+
+
+REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """The options of the contract, as the user gave them."""
+
+    output: Path
+    overwrite: bool = False
+    dry_run: bool = False
+    jobs: int = 1  # 0, with `--ray`: as many as there are processors
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What `process` made of one item: the files it wrote, and facts for the report's row."""
+
+    outputs: Sequence[Path]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Result:
+    """One item's end, in a form that crosses a process border."""
+
+    item: Item
+    seconds: float
+    outcome: Outcome | None = None
+    error: str = ""
+    trace: str = ""
+    stops_the_run: FacerfError | None = None
+
+
+def run_batch(
+    verb: str,
+    inputs: Sequence[str],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    suffixes: frozenset[str] = PHOTO_SUFFIXES,
+) -> int:
+    """Work through the files that `inputs` name: `run_items` over `collect_items`."""
+    items = collect_items(inputs, options.output, suffixes)
+    return run_items(verb, items, _OfFile(process), outputs_of, options, settings)
+
+
+def run_items(
+    verb: str,
+    items: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> int:
+    """Work through the items and give the exit code: 0 all done, 1 some failed.
+
+    With `--shard` through this process's share of them, which has a report of its own. Raises `UsageError`
+    (exit 2) where the output folder cannot be used. With `jobs` > 1 or `--ray` `process` runs in other
+    processes and must be picklable.
+    """
+    items = settings.shard.share(items)
+    finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
+    done = set(finished)
+    todo = [item for item in items if item not in done]
+    if options.dry_run:
+        return _say_what_would_be_done(todo, finished, outputs_of)
+    report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
+    if finished:
+        advice = "--overwrite makes them anew, as other options would have them"
+        log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
+    recover = _Recover(outputs_of, options.overwrite)
+    failures = 0
+    with closing(
+        spread(_Work(process), todo, workers_of(settings, options.jobs), _broken, recover)
+    ) as results:
+        for result in _with_progress(results, len(todo), verb, settings):
+            if result.stops_the_run is not None:
+                raise result.stops_the_run
+            with report.open("a", encoding="utf-8") as stream:
+                stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
+            failures += _tell(result)
+    if failures and len(items) > 1:
+        log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
+    return 1 if failures else 0
+
+
+def report_name(shard: Shard) -> str:
+    """The report's name; shards that work at the same time have one each."""
+    return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
+
+
+def sums_up(
+    items: Sequence[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> bool:
+    """Whether a verb that ends with something of all items, not of each, is to make that now.
+
+    Without `--shard` always. A shard does when the items of all shards are finished, so the last one does;
+    not with `--overwrite`, for an earlier run's outputs look the same.
+    """
+    if settings.shard.of == 1:
+        return True
+    left = len(items) if options.overwrite else sum(not _is_finished(outputs_of(item)) for item in items)
+    if left:
+        state = "may be unfinished" if options.overwrite else f"({left}) are unfinished"
+        log.info("items %s, so nothing is summed up; a run without --shard and --overwrite does that", state)
+    return not left
+
+
+@dataclass(frozen=True)
+class _OfFile:
+    """`process`, for items that are files."""
+
+    process: Callable[[Item], Outcome]
+
+    def __call__(self, item: Item) -> Outcome:
+        if not item.input_path.exists():
+            raise InputError(f"{item.input_path}: no such file")
+        return self.process(item)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Runs `process` on an item and turns whatever happens into a `_Result`."""
+
+    process: Callable[[Item], Outcome]
+
+    def __call__(self, item: Item) -> _Result:
+        start_s = time.perf_counter()
+
+        def result(**ends: Any) -> _Result:
+            return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
+
+        try:
+            return result(outcome=self.process(item))
+        except InputError as error:
+            return result(error=str(error), trace=traceback.format_exc())
+        except FacerfError as error:
+            return result(stops_the_run=error)
+        except Exception as error:  # a fault of ours must not cost the other items
+            return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+
+
+def _broken(item: Item, error: Exception) -> _Result:
+    """The result of an item whose process died under it."""
+    return _Result(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
+
+
+@dataclass(frozen=True)
+class _Recover:
+    """The result of an item that was finished when its worker was lost; None where it is to be done again."""
+
+    outputs_of: Callable[[Item], Sequence[Path]]
+    overwrite: bool  # then an earlier run's outputs cannot be told from the lost worker's
+
+    def __call__(self, item: Item) -> _Result | None:
+        outputs = self.outputs_of(item)
+        return None if self.overwrite or not _is_finished(outputs) else _Result(item, 0.0, Outcome(outputs))
+
+
+def _is_finished(outputs: Sequence[Path]) -> bool:
+    return bool(outputs) and all(path.exists() for path in outputs)
+
+
+def _say_what_would_be_done(
+    todo: list[Item], finished: list[Item], outputs_of: Callable[[Item], Sequence[Path]]
+) -> int:
+    for item in todo:
+        for path in outputs_of(item):
+            print(f"{item.input_path} -> {path}")
+    log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
+    return 0
+
+
+def _open_report(
+    path: Path,
+    verb: str,
+    todo: list[Item],
+    finished: list[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+) -> Path:
+    """Start the report: older rows stay, but for those of items that are about to be made anew.
+
+    A run without `--shard` takes over the rows of the shards that were before it.
+    """
+    rows = {(row.get("verb"), row.get("item")): row for row in _rows_of(path)}
+    for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
+        for row in _rows_of(shard):
+            key = row.get("verb"), row.get("item")
+            if key not in rows or rows[key].get("status") == "failed":
+                rows[key] = row
+    for item in todo:
+        rows.pop((verb, item.name), None)
+    for item in finished:
+        skipped = _Result(item, 0.0, Outcome(outputs_of(item)))
+        rows.setdefault((verb, item.name), _report_row(verb, skipped, path.parent) | {"status": "skipped"})
+    try:
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
+    except FacerfError as error:
+        cause = error.__cause__
+        reason = cause.strerror if isinstance(cause, OSError) else error
+        raise UsageError(
+            f"-o {path.parent}: cannot write to such a folder ({reason}); give another one"
+        ) from error
+    return path
+
+
+def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:  # a run that was killed may leave half a line
+            continue
+        if isinstance(row, dict):
+            yield row
+
+
+def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, Any]:
+    outcome = result.outcome or Outcome([])
+    row = {
+        "verb": verb,
+        "item": result.item.name,
+        "input": result.item.input_path,
+        "status": "failed" if result.error else "done",
+        "seconds": result.seconds,
+        "error": result.error or None,
+        "outputs": [
+            path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
+            for path in outcome.outputs
+        ],
+    }
+    return row | {name: value for name, value in outcome.facts.items() if name not in row}
+
+
+def _tell(result: _Result) -> int:
+    """Outputs to stdout, an error to stderr; 1 for a failure."""
+    if result.error:
+        log.error("%s", one_line(result.error))
+        if result.trace:
+            log.debug("%s", "\n" + result.trace)
+        return 1
+    for path in result.outcome.outputs if result.outcome else ():
+        print(path, flush=True)
+    return 0
+
+
+def _with_progress(
+    results: Iterator[_Result], total: int, verb: str, settings: Settings
+) -> Iterator[_Result]:
+    """Pass the results through, with a progress bar on stderr where that is a terminal."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
+    redirect = sys.stdout.isatty()
+    with Progress(*columns, console=STDERR, disable=not shown, redirect_stdout=redirect) as progress:
+        task = progress.add_task(verb, total=total)
+        for result in results:
+            yield result
+            progress.advance(task)

@@ -1,0 +1,106 @@
+"""Photos of faces without any truth but their landmarks, which the Geometry Network also learns from.
+
+Paper, 'Training': images of FFHQ for the landmark and regularisation terms. Faces are found once:
+
+    CACHE/KEY.jpg    the largest face's crop at automatic exposure
+    CACHE/KEY.json   its landmarks in the crop's pixels, or null where there is no face; written last
+
+KEY tells the photo's place, size and time. All of it can be removed.
+"""
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.files.documents import digest, read_document, write_document
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.network.reflectance import resize
+from facerf_cli.workers import in_shards
+
+CACHED_SIDE_PX = 512
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class PhotoCrops:
+    """B crops of photos [B, 3, S, S], linear, and their detected landmarks [B, 68, 2] in crop pixels."""
+
+    crops: Tensor
+    landmarks_px: Tensor
+
+    def to(self, device: torch.device) -> "PhotoCrops":
+        """The same crops on `device`."""
+        return PhotoCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Photos:
+    """Faces that were found, as crops of a side."""
+
+    paths: tuple[Path, ...]  # of the crops
+    landmarks_px: Tensor  # [N, 68, 2] in crops of `CACHED_SIDE_PX`
+    side_px: int
+
+    def draw(self, generator: torch.Generator) -> PhotoCrops:
+        """One of them, B = 1."""
+        place = int(torch.randint(len(self.paths), (), generator=generator))
+        crop = torch.from_numpy(read_image(self.paths[place]).pixels).permute(2, 0, 1)[None]
+        scale = self.side_px / CACHED_SIDE_PX
+        return PhotoCrops(resize(crop, self.side_px), self.landmarks_px[place][None] * scale)
+
+
+def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1) -> Photos:
+    """The faces of photos, found where `cache` does not know them; what has no face costs a line of the log.
+
+    Raises InputError where there is no face in any of them.
+    """
+    known = {path: _record(path, cache) for path in sorted(paths)}
+    missing = [path for path, record in known.items() if not record.is_file()]
+    if missing:
+        log.info("%s: looking for faces in %d photos, once", cache, len(missing))
+        work = partial(_find, cache)
+        if jobs > 1 and len(missing) > 1:
+            in_shards(work, missing, jobs)
+        else:
+            work(missing)
+    found, landmarks = [], []
+    for record in known.values():
+        content = read_document(record, "remove the folder")["landmarks_px"]
+        if content.value is not None:
+            found.append(record.with_suffix(".jpg"))
+            landmarks.append(content.array(68, 2))
+    if not found:
+        raise InputError(f"--photos: no face in any of {len(known)} photos; give a folder of photos of faces")
+    return Photos(tuple(found), torch.from_numpy(np.stack(landmarks)).float(), side_px)
+
+
+def _record(photo: Path, cache: Path) -> Path:
+    facts = photo.stat()
+    return cache / f"{digest(f'{photo.absolute()} {facts.st_size} {facts.st_mtime_ns}'.encode())}.json"
+
+
+def _find(cache: Path, photos: list[Path]) -> None:
+    """Write the crop and the record of each photo."""
+    cache.mkdir(parents=True, exist_ok=True)
+    for photo in photos:
+        record = _record(photo, cache)
+        landmarks_px = None
+        try:
+            pixels = read_image(photo).pixels
+            face = find_faces(pixels, str(photo))[0]
+            crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
+            write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
+            landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()
+        except InputError as error:
+            log.warning("%s", error)
+        write_document(record, {"photo": str(photo), "landmarks_px": landmarks_px})

@@ -1,0 +1,114 @@
+"""Subjects of a prepared dataset under environment maps (paper, 'Dataset'): weights times the OLAT stack.
+
+The product of weights [M, L] and a stack [L, P], a channel at a time, is done in tiles of always the same
+shape: `TILE_PICTURES` pictures (the last ones are padded with zeros) by some whole rows that depend on the
+picture's size and the number of lights alone. So a picture's bits depend neither on how many others are made
+beside it nor on how much memory there is.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.pairs import Pair, image_path
+from facerf_cli.dataset.weights import pair_weights
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import HALF_MAX, write_exr
+from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.logs import attributes_of_sum
+from facerf_cli.synth.heads_bank import one_thread
+
+TILE_IMAGES = 128
+_TILE_PX = 1 << 13  # at most, and
+_TILE_VALUES = 1 << 22  # so many lights times pixels, in floats three times over
+DEFAULT_MEMORY_BYTES = 2 << 30
+
+
+def relight_subject(
+    dataset: Dataset,
+    pairs: list[Pair],
+    weights: np.ndarray,
+    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    overwrite: bool = False,
+) -> int:
+    """Write the sources of a subject's pairs, of weights [rows, L, 3], that are missing; give how many."""
+    todo = [row for row, pair in enumerate(pairs) if overwrite or not image_path(dataset, *pair.key).exists()]
+    for camera in sorted({pairs[row].source_camera for row in todo}):
+        rows = [row for row in todo if pairs[row].source_camera == camera]
+        path = dataset.stack_path(pairs[rows[0]].subject, camera)
+        images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
+        made = attributes_of_sum(read_olat_header(path).metadata)
+        for row, image in zip(rows, images, strict=True):
+            pixels = image.permute(1, 2, 0).float().numpy()
+            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
+            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata=made | recipe)
+    return len(todo)
+
+
+def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
+    """The source [3, H, W] float16 of a line of pairs.jsonl, from the dataset and the map alone.
+
+    Bit for bit what `relight-dataset` writes.
+    """
+    pair = row if isinstance(row, Pair) else Pair.from_row(dict(row))
+    weights = pair_weights(dataset, pair)
+    return next(relit_images(dataset.stack_path(pair.subject, pair.source_camera), weights[None]))
+
+
+def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY_BYTES) -> Iterator[Tensor]:
+    """The pictures [3, H, W] float16 of a stack under weights [M, L, 3], in order, on one thread.
+
+    Half of the memory holds the stack or a strip of its rows, a quarter the pictures that are being made; the
+    stack is read once where it fits, else once for each lot of pictures.
+    """
+    header = read_olat_header(path)
+    (height, width), lights = header.seen.shape, len(header.directions)
+    if weights.shape[1] != lights:
+        raise InputError(f"{path}: {lights} lights, not {weights.shape[1]} as the dataset has")
+    rows = _strip_rows(lights, height, width, memory_bytes // 2)
+    whole = read_olats(path) if rows >= height else None
+    lot = max(1, memory_bytes // (4 * 6 * height * width))
+    lot = lot if lot < TILE_IMAGES else lot // TILE_IMAGES * TILE_IMAGES
+    for part in torch.split(weights, lot):
+        images = torch.empty(len(part), 3, height, width, dtype=torch.float16)
+        for first in range(0, height, rows):
+            strip = slice(first, min(first + rows, height))
+            multiply(read_olats(path, rows=strip) if whole is None else whole, part, images[:, :, strip])
+        yield from images
+
+
+def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
+    """Pictures [M, 3, h, W] of OLATs [L, 3, h, W] under weights [M, L, 3]; all but the weights float16."""
+    lights, _, height, width = olats.shape
+    rows = _tile_rows(lights, width)
+    blocks = torch.split(weights.permute(2, 0, 1), TILE_IMAGES, dim=1)  # [3, m, L]
+    padded = [torch.nn.functional.pad(block, (0, 0, 0, TILE_IMAGES - block.shape[1])) for block in blocks]
+    with one_thread():
+        for first in range(0, height, rows):
+            part = olats[:, :, first : first + rows]
+            tile = part.permute(1, 0, 2, 3).reshape(3, lights, -1).float()
+            for block, out in zip(padded, torch.split(images, TILE_IMAGES), strict=True):
+                lit = torch.bmm(block, tile).clamp_(-HALF_MAX, HALF_MAX).transpose(0, 1)[: len(out)]
+                out[:, :, first : first + rows] = lit.reshape(len(out), 3, -1, width)
+
+
+def _tile_rows(lights: int, width: int) -> int:
+    """Rows of a tile, a power of two."""
+    return _power_of_two(min(_TILE_PX, _TILE_VALUES // lights) // width)
+
+
+def _strip_rows(lights: int, height: int, width: int, memory_bytes: int) -> int:
+    """Rows of a stack that are held at once: all, or as many whole tiles and compressed blocks as fit."""
+    rows = memory_bytes // (6 * lights * width)
+    return height if rows >= height else max(_power_of_two(rows), _tile_rows(lights, width))
+
+
+def _power_of_two(number: int) -> int:
+    """The largest power of two up to a number, at least 1."""
+    return 1 << max(0, number.bit_length() - 1)

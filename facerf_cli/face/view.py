@@ -1,0 +1,98 @@
+"""A fitted face seen by a camera: what each pixel shows of it, and its soft mask."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
+from facerf_cli.raster.camera import Camera, project
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import sample_texture, vertex_normals
+
+_TINY = 1e-8
+_MASK_SIDE = 256  # texels of the mask; finer ones take seconds to draw
+FEATHER = 0.04  # of the mask's border, inward, in crop sides
+
+
+@dataclass(frozen=True, eq=False)
+class FaceView:
+    """A fitted face seen by its photo's camera; one z-buffer serves every texture.
+
+    All tensors cover the window [h, w] of the photo [H, W] at `top`, `left`.
+    """
+
+    height_px: int
+    width_px: int
+    top: int
+    left: int
+    uv: Tensor  # [h, w, 2]
+    normal: Tensor  # [h, w, 3] camera space
+    position_m: Tensor  # [h, w, 3] camera space
+    coverage: Tensor  # [h, w] 0 or 1
+    mask: Tensor  # [h, w] 0..1, the face inside jaw and hairline with a soft border
+
+    def render(self, texture: Tensor) -> Tensor:
+        """A texture [C, T, T] in the window [h, w, C], zero off the mesh."""
+        return sample_texture(texture, self.uv) * self.coverage[..., None]
+
+    def full(self, window: Tensor) -> np.ndarray:
+        """Values of the window [h, w, ...] in the photo's frame [H, W, ...], zero beyond it."""
+        frame = np.zeros((self.height_px, self.width_px, *window.shape[2:]), np.float32)
+        frame[self.window] = window.numpy()
+        return frame
+
+    @property
+    def window(self) -> tuple[slice, slice]:
+        """Rows and columns of the photo."""
+        height, width = self.coverage.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+
+def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
+    """The crop's camera, continued over the whole photo in the photo's pixels."""
+    half = crop.side_px / 2
+    focal_px = crop.camera.focal_px / crop.scale
+    return Camera(focal_px, width_px, height_px, crop.x0_px + half, crop.y0_px + half)
+
+
+def view_face(
+    vertices_camera: Tensor,
+    camera: Camera,
+    side_px: float,
+) -> FaceView:
+    """See the mesh [V, 3] with a camera; `side_px` is the crop's side in its pixels."""
+    top, left, window = _window(vertices_camera, camera)
+    triangles = grid_triangles()
+    fragments = rasterize(vertices_camera, triangles, window)
+    attributes = torch.cat([grid_uv(), vertex_normals(vertices_camera, triangles), vertices_camera], 1)
+    seen = interpolate(attributes, triangles, fragments)
+    uv, normal, position_m = seen[..., :2], seen[..., 2:5], seen[..., 5:]
+    coverage = fragments.covered.float()
+    mask = sample_texture(region_mask("face", _MASK_SIDE)[None], uv)[..., 0]
+    inside = (mask * coverage > 0.02).numpy()
+    if not inside.all():  # the chart's border is steep where the face turns away, so it is softened in pixels
+        edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
+        mask = mask * smooth(edge_px / max(FEATHER * side_px, 1))
+    unit = F.normalize(normal, dim=-1)
+    return FaceView(camera.height_px, camera.width_px, top, left, uv, unit, position_m, coverage, mask)
+
+
+def _window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
+    """First row and column of the part of the picture that holds the mesh, a pixel to spare; its camera."""
+    in_front = torch.cat([vertices_camera[:, :2], vertices_camera[:, 2:].clamp(max=-_TINY)], 1)
+    x, y = project(in_front, camera).T
+    left, right = (int(v.floor().clamp(0, camera.width_px - 1)) for v in (x.min() - 1, x.max() + 1))
+    top, bottom = (int(v.floor().clamp(0, camera.height_px - 1)) for v in (y.min() - 1, y.max() + 1))
+    width, height = right + 1 - left, bottom + 1 - top
+    return top, left, Camera(camera.focal_px, width, height, camera.cx_px - left, camera.cy_px - top)
+
+
+def smooth(x: Tensor) -> Tensor:
+    """Smooth step of 0..1, flat at both ends."""
+    x = x.clamp(0, 1)
+    return x * x * (3 - 2 * x)

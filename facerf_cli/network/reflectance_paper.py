@@ -1,0 +1,162 @@
+"""The Reflectance Network as the paper has it ('Network Architecture'): form `paper`.
+
+A U-Net of 8 down and 8 up convolutions, 3 x 3, with skips, over the source texture T_s and its normals N_s at
+512 x 512; the light direction enters at its bottleneck of 2 x 2. Five convolutions of stride 1 follow, over
+its features and the target's normals N_t, and give the texture T_t. The down path runs once a face, the rest
+once a light.
+
+Where the paper is silent: channels are 64 to 512, as is usual for such nets; a down convolution has stride 2,
+an up convolution follows a doubling by nearest neighbours; each but the first and the last is followed by
+group normalisation and a leaky rectifier; a linear layer spreads the light's three numbers over as many
+channels as the bottleneck has; the source's exposure is taken out and given back, and the network sees and
+gives square roots, which keep shadows apart as pictures' encodings do.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.reflectance import exposure_of, resize
+
+_SLOPE = 0.2  # of the leaky rectifiers
+_GROUPS = 4
+_LIGHT_CONVOLUTIONS = 5  # over the U-Net's features and the target's normals
+_FIRST_ROOT = 0.3  # what an untrained network answers everywhere, about: the square root of its radiance
+
+
+@dataclass(frozen=True)
+class PaperReflectanceSettings:
+    """Working side, channels after each halving of it, channels of the U-Net's output, and an ablation.
+
+    `normals` False leaves N_s and N_t out (paper, 'Ablative Study').
+    """
+
+    side: int = 512
+    widths: tuple[int, ...] = (64, 128, 256, 512, 512, 512, 512, 512)
+    features: int = 32
+    normals: bool = True
+
+
+@dataclass(frozen=True)
+class PaperEncoded:
+    """The down path's features of B faces, from fine to coarse, and what the output needs."""
+
+    features: list[Tensor]
+    exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
+    texture_side: int
+
+
+class PaperReflectanceNetwork(nn.Module):
+    """T_s, N_s, N_t, light directions -> OLAT textures, scene-linear and non-negative."""
+
+    def __init__(self, settings: PaperReflectanceSettings = PaperReflectanceSettings()) -> None:
+        super().__init__()
+        widths, features = settings.widths, settings.features
+        if not widths or settings.side % 2 ** len(widths):
+            raise ValueError(f"a side of {settings.side} cannot be halved {len(widths)} times")
+        self.settings = settings
+        maps = 3 if settings.normals else 0
+        before = (3 + maps, *widths[:-1])
+        self.down = nn.ModuleList(
+            _Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(before, widths, strict=True))
+        )
+        self.light = nn.Linear(3, widths[-1])
+        # From fine to coarse, as the down path; the coarsest takes the light's code in the place of a skip.
+        after = (features, *widths[:-1])
+        self.up = nn.ModuleList(_Up(a, a, b) for a, b in zip(widths, after, strict=True))
+        channels = (features + maps, *[features] * (_LIGHT_CONVOLUTIONS - 1))
+        self.light_convolutions = nn.ModuleList(
+            nn.Conv2d(c, features if i + 1 < _LIGHT_CONVOLUTIONS else 3, 3, padding=1)
+            for i, c in enumerate(channels)
+        )
+        self._begin_grey()
+
+    def _begin_grey(self) -> None:
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, a=_SLOPE)
+        last: Any = self.light_convolutions[-1]
+        nn.init.normal_(last.weight, std=1e-2)
+        nn.init.constant_(last.bias, float(torch.tensor(_FIRST_ROOT, device="cpu").expm1().log()))
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "paper", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """An untrained network of these; raises KeyError, TypeError or ValueError where they make none."""
+        settings: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value
+            for key, value in metadata.items()
+            if key != "form"
+        }
+        return cls(PaperReflectanceSettings(**settings))
+
+    def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> PaperEncoded:
+        """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
+        exposure = exposure_of(texture, visible)
+        root = (texture / exposure).clamp_min(0).add(1e-6).sqrt()  # a slope at black, too
+        maps = [root, normals_source] if self.settings.normals else [root]
+        x = torch.cat([resize(y, self.settings.side) for y in maps], 1)
+        features = []
+        for down in self.down:
+            x = down(x)
+            features.append(x)
+        return PaperEncoded(features, exposure, texture.shape[-1])
+
+    def decode(self, encoded: PaperEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3] and normals [B, 3, T, T]."""
+        faces, count, _ = lights.shape
+        *skips, bottleneck = encoded.features
+        x = bottleneck.repeat_interleave(count, 0)
+        code = F.leaky_relu(self.light(lights.flatten(0, 1)), _SLOPE)[..., None, None].expand(
+            -1, -1, *bottleneck.shape[-2:]
+        )
+        for up, skip in zip(reversed(self.up), (code, *reversed(skips)), strict=True):
+            x = up(x, skip)
+        if self.settings.normals:
+            normals = resize(normals_target, self.settings.side).to(x.dtype)
+            x = torch.cat([x, normals.repeat_interleave(count, 0)], 1)
+        *inner, last = self.light_convolutions
+        for convolution in inner:
+            x = F.leaky_relu(convolution(x), _SLOPE)
+        texture = F.softplus(last(x).float()) ** 2 * encoded.exposure.repeat_interleave(count, 0)
+        return resize(texture, encoded.texture_side).view(faces, count, 3, *[encoded.texture_side] * 2)
+
+
+class _Down(nn.Module):
+    """Halve the side by a convolution of stride 2."""
+
+    def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
+        super().__init__()
+        self.convolution = nn.Conv2d(channels_in, channels_out, 3, stride=2, padding=1)
+        self.norm = nn.Identity() if first else nn.GroupNorm(_GROUPS, channels_out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.leaky_relu(self.norm(self.convolution(x)), _SLOPE)
+
+
+class _Up(nn.Module):
+    """Double the side and convolve what comes from below [B L, ...] and the skip [B or B L, ...]."""
+
+    def __init__(self, channels_in: int, skip_channels: int, channels_out: int) -> None:
+        super().__init__()
+        self.channels_in = channels_in
+        self.convolution = nn.Conv2d(channels_in + skip_channels, channels_out, 3, padding=1)
+        self.norm = nn.GroupNorm(_GROUPS, channels_out)
+
+    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+        # The convolution of both, one below the other: the skip's share of it is the same for all lights.
+        weight = self.convolution.weight
+        own = F.conv2d(_doubled(x), weight[:, : self.channels_in], padding=1)
+        shared = F.conv2d(_doubled(skip), weight[:, self.channels_in :], self.convolution.bias, padding=1)
+        both = own + shared.repeat_interleave(len(own) // len(shared), 0)
+        return F.leaky_relu(self.norm(both), _SLOPE)
+
+
+def _doubled(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -1,0 +1,203 @@
+"""Hair that is painted on the skin: brows and beards of single strokes, stubble, the scalp's cover."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.face.topology import CHART_MM
+from facerf_cli.synth.appearance.people import People, each
+from facerf_cli.synth.random_fields import (
+    LANDMARK_MM,
+    Strokes,
+    Window,
+    blob,
+    hairs,
+    mask,
+    noise,
+    places_mm,
+    smooth,
+    splat,
+)
+
+# Of the brow from its inner to its outer end: half its height in millimetres, where the hairs point (degrees
+# above the way outward), how long they are.
+_BROW_HALF_MM = (3.3, 4.2, 3.7, 2.6, 1.1)
+_BROW_RISE_DEG = (74, 48, 26, 10, -6)
+_BROW_LENGTH_MM = (5.0, 7.5, 8.5, 8.0, 6.0)
+_BROW_HAIRS = 420
+_BEARD_HAIRS_MM2 = 0.6  # a square millimetre
+# Upper edge of the beard and of the scalp's hair: (u, v), u from the midline outward.
+_BEARD_EDGE = """
+0 0.80 | 0.05 0.80 | 0.075 0.755 | 0.11 0.72 | 0.14 0.68 | 0.20 0.665 | 0.30 0.60 | 0.38 0.49 | 0.43 0.40 |
+0.47 0.33 | 0.55 0.36 | 0.62 1.2 | 1.0 1.3
+"""
+_SCALP_EDGE = """
+0 -0.03 | 0.16 -0.035 | 0.29 -0.05 | 0.377 -0.01 | 0.443 0.10 | 0.49 0.20 | 0.525 0.30 | 0.549 0.40 |
+0.59 0.41 | 0.615 0.26 | 0.70 0.25 | 0.78 0.28 | 0.844 0.40 | 0.918 0.63 | 1.0 0.80
+"""
+
+
+@dataclass(frozen=True)
+class FacialHair:
+    """Cover by hair [B, 1, T, T] in 0..1, and the shadow of what is cut below the surface, as absorbance."""
+
+    brows: Tensor
+    beard: Tensor
+    shadow: Tensor
+
+    @property
+    def cover(self) -> Tensor:
+        """All hair together."""
+        return 1 - (1 - self.brows) * (1 - self.beard)
+
+
+def draw_facial_hair(people: People, window: Window, generator: torch.Generator) -> FacialHair:
+    """Brows and beard of every person."""
+    brows = _brows(people, window, generator)
+    beard, shadow = _beards(people, window, generator)
+    return FacialHair(brows, beard, shadow)
+
+
+def _coarseness(window: Window) -> float:
+    """How many hairs are drawn as one, where texels are too large to tell them apart."""
+    return max(1.0, min(window.texel_mm) / 0.6)
+
+
+def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor:
+    """Cover [B, 1, T, T] by the brows' single hairs."""
+    merged = _coarseness(window)
+    number = (_BROW_HAIRS * people.brow_fullness / merged).long()
+    sides = torch.stack([number, number], -1).view(-1)  # of every face the right brow, then the left
+    owner = torch.repeat_interleave(torch.arange(len(sides)), sides)
+    face, mirrored = owner // 2, (owner % 2).bool()
+    count = len(owner)
+    fullness = people.brow_fullness[face]
+
+    def normal() -> Tensor:
+        return torch.randn(count, generator=generator)
+
+    along = torch.rand(count, generator=generator) ** 0.9 * 1.02 - 0.01
+    across = 1.8 * torch.rand(count, generator=generator) - 0.9
+    across = across + 0.25 * normal() * (1 - across.abs())
+    middle, outward_deg = _brow_line(along)
+    half = _lookup(_BROW_HALF_MM, along) * (0.75 + 0.35 * fullness)
+    rise = torch.deg2rad(_lookup(_BROW_RISE_DEG, along) + 26 * across + 9 * normal() + outward_deg)
+    bend = torch.deg2rad(-18 - 16 * normal().abs()) * (1 - along)
+    length = _lookup(_BROW_LENGTH_MM, along) * (0.75 + 0.4 * torch.rand(count, generator=generator))
+    roots = middle + torch.stack([torch.zeros(count), across * half], -1)
+    # A hair begins behind its place, so that it is centred on it.
+    roots = roots - 0.35 * length[:, None] * torch.stack([rise.cos(), -rise.sin()], -1)
+    roots = torch.where(mirrored[:, None], roots * torch.tensor([-1.0, 1.0]), roots)
+    rise, bend = torch.where(mirrored, torch.pi - rise, rise), torch.where(mirrored, -bend, bend)
+    strokes = Strokes(roots, rise, bend, length, merged * (0.13 + 0.05 * fullness))
+    return 1 - torch.exp(-2.2 * hairs(window, strokes, face, len(people.age)))
+
+
+def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
+    """Middle of the right-hand brow [N, 2] at 0 (inner) to 1 (outer end), and its rise there in degrees."""
+    points = torch.from_numpy(LANDMARK_MM[22:27]).float() + torch.tensor([0.0, 1.8])
+    at = along.clamp(0, 1) * 4
+    low = at.floor().clamp(max=3).long()
+    step = points[low + 1] - points[low]
+    smooth_step = (points[(low + 2).clamp(max=4)] - points[(low - 1).clamp(min=0)]) / 3
+    return points[low] + (at - low)[:, None] * step, torch.rad2deg(
+        torch.atan2(-smooth_step[:, 1], smooth_step[:, 0])
+    )
+
+
+def _lookup(values: tuple[float, ...], at: Tensor) -> Tensor:
+    found = np.interp(at.numpy(), np.linspace(0, 1, len(values)), values)
+    return torch.from_numpy(found).float()
+
+
+def below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tensor:
+    """Millimetres [1 or B, 1, T, T] below an edge given from the midline outward, mirrored."""
+    x, y = places_mm(window)
+    out = (x.abs() / float(CHART_MM[0])).clamp(max=1)
+    u, v = np.array(edge.replace("|", " ").split(), float).reshape(-1, 2).T
+    edge_mm = torch.from_numpy(np.interp(out.numpy(), u, v) * CHART_MM[1]).float()
+    return (y - edge_mm)[None, None] - shift_mm
+
+
+@lru_cache(maxsize=4)
+def beard_ground(window: Window) -> Tensor:
+    """Where a beard grows [1, 1, T, T]: 0..1, thin toward the cheeks and on the neck."""
+    x, y = places_mm(window)
+    lower = smooth(below_edge(window, _BEARD_EDGE) / 20 + 0.5)
+    neck = smooth((186 - y) / 36)[None, None]
+    moustache = smooth((36 - x.abs()) / 12) * smooth((y - 104) / 8) * smooth((134 - y) / 10)
+    chin = 0.6 * blob(window, 8, 16) + 0.8 * blob(window, (0.5, 0.83), 8, 0.8)
+    ground = (torch.maximum(lower * neck, moustache[None, None]) + 0.3 * chin).clamp(0, 1.1)
+    ground = ground * (1 - 0.7 * blob(window, (0.5, 0.645), 2.5, 2))  # the groove under the nose
+    return ground * (1 - mask(window, "lips", 5.0, 2.0))
+
+
+def _beards(people: People, window: Window, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Cover and shadow [B, 1, T, T]: stubble everywhere it grows, longer hair where it is left."""
+    count = len(people.age)
+    cover, shadow = (torch.zeros(count, 1, window.side, window.side) for _ in "ab")
+    grown = (people.stubble_mm > 0).nonzero()[:, 0].tolist()
+    if not grown:
+        return cover, shadow
+    patchy = 1 + 0.25 * noise(len(grown), window, 18, generator, octaves=2)
+    ground = beard_ground(window)
+    for index, patch in zip(grown, patchy, strict=True):
+        there = ground * patch[None].clamp(0.3, 1.4)
+        cover[index], shadow[index] = _beard(people, index, window, there, generator)
+    return cover, shadow
+
+
+def _beard(
+    people: People, index: int, window: Window, ground: Tensor, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Cover and shadow [1, 1, T, T] of one lower face."""
+    stubble = float(people.stubble_mm[index])
+    x, y = places_mm(window)
+    goatee = smooth((38 - x.abs()) / 10)[None, None]
+    moustache = (smooth((34 - x.abs()) / 6) * smooth((130 - y) / 6) * (y > 100))[None, None]
+    beard = float(people.beard[index]) * (goatee if people.goatee[index] > 0 else 1) * (1 - moustache)
+    left = (beard * smooth((176 - y) / 16) + float(people.moustache[index]) * moustache) * ground
+    layers = _rooted(ground, window, 0.12, stubble, generator)
+    if float(left.max()) > 0.02:
+        layers = layers + _rooted(left, window, 0.30, 8.0, generator) + 0.5 * left
+    return 1 - torch.exp(-layers), ground * (0.10 + 0.12 * min(stubble, 1.0))
+
+
+def _rooted(
+    density: Tensor, window: Window, width_mm: float, length_mm: float, generator: torch.Generator
+) -> Tensor:
+    """Layers of hairs that grow down and a little outward, as dense as the field [1, 1, T, T] says."""
+    wide, high = 75.0, 115.0  # millimetres from the midline; from cheeks to neck
+    merged = _coarseness(window) ** 1.5
+    number = int(_BEARD_HAIRS_MM2 * 2 * wide * high / merged)
+    roots = torch.rand(number, 2, generator=generator) * torch.tensor([2 * wide, high])
+    roots = roots + torch.tensor([-wide, 85.0])
+    at = window.to_texels(roots).round().long()
+    seen = ((at >= 0) & (at < window.side)).all(-1)
+    at = at.clamp(0, window.side - 1)
+    kept = seen & (torch.rand(number, generator=generator) < density[0, 0, at[:, 1], at[:, 0]])
+    jitter = torch.randn(number, 2, generator=generator)
+    roots, jitter = roots[kept], jitter[kept]
+    if length_mm < 1.5 * min(window.texel_mm):  # a dot
+        area = torch.full((len(roots),), merged * width_mm * max(length_mm, width_mm))
+        return splat(window, roots, area * (1 + 0.4 * jitter[:, 0]).clamp_min(0.2))
+    down = -torch.pi / 2 + 0.008 * roots[:, 0] + 0.25 * jitter[:, 0]
+    lengths = length_mm * (1 + 0.25 * jitter[:, 1]).clamp(0.4, 1.8)
+    widths = torch.full((len(roots),), merged * width_mm)
+    return hairs(window, Strokes(roots, down, 0.4 * jitter[:, 1], lengths, widths))
+
+
+def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torch.Generator) -> Tensor:
+    """Cover [B, 1, T, T] by short hair as far above its ragged edge as `above_mm` says."""
+    count = len(people.age)
+    ragged = 3.0 * noise(count, window, 14, generator, octaves=3)
+    strands = noise(count, window, (1.2, 6), generator, octaves=1)
+    return (smooth((above_mm + ragged + 3) / 12) * (0.9 + 0.07 * strands)).clamp(0, 0.97)
+
+
+def above_hairline(people: People, window: Window) -> Tensor:
+    """Millimetres [B, 1, T, T] above each person's hairline."""
+    return -below_edge(window, _SCALP_EDGE, each(people.hairline_mm))

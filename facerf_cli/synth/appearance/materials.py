@@ -1,0 +1,210 @@
+"""What the parts of a synthetic head are made of: skin on its canvas, eyes, teeth, cloth, hair, frames."""
+
+from dataclasses import dataclass, replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.metrics import ita_deg
+from facerf_cli.raster.texture import texel_centres_uv
+from facerf_cli.synth.appearance.people import People, draw_people, eyeball, named
+from facerf_cli.synth.appearance.pigments import hair_albedo
+from facerf_cli.synth.appearance.skin import bare_skin, paint_skin, scattering_mm
+from facerf_cli.synth.head.mesh import PARTS
+from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_noise
+
+_SIDE = 256  # of the textures of small parts
+_HAIR_WISPS = 512
+_OF_CHART_HAIR = ("bald", "hairline_mm")  # parameters of hair painted on the chart; here it is geometry
+
+
+@dataclass(frozen=True)
+class Material:
+    """Textures of one part, float32, row v = 0 at the top.
+
+    albedo [3, H, W] linear Rec.709; specular [1, H, W] reflectance at normal incidence; roughness [1, H, W]
+    (GGX alpha is its square); relief [2, H, W] slopes of fine relief along +u and +v.
+    """
+
+    albedo: Tensor
+    specular: Tensor
+    roughness: Tensor
+    relief: Tensor
+
+
+@dataclass(frozen=True)
+class Appearance:
+    """Materials by the part's name (skin on the canvas, `CANVAS_SPAN`) and how the person was drawn.
+
+    scattering_mm [3]: the Gaussian's sigma by which light of each channel spreads under the skin.
+    """
+
+    materials: dict[str, Material]
+    scattering_mm: Tensor
+    traits: dict[str, float | str | bool]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The material at N points: albedo [N, 3], specular [N], roughness [N], relief [N, 2]."""
+
+    albedo: Tensor
+    specular: Tensor
+    roughness: Tensor
+    relief: Tensor
+
+
+def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
+    """One person, and what he or she wears; `side`, the canvas's, only sets how fine the skin is."""
+    people = draw_people(1, generator)
+    eye, eye_traits = eyeball(_SIDE, people, generator)
+    frame, frame_kind = _frame(generator)
+    cloth, cloth_kind = _cloth(generator)
+    materials = {
+        "eye": Material(*eye),
+        "mouth": _mouth(generator),
+        "teeth": _teeth(people, generator),
+        "cloth": cloth,
+        "hair": _hair(people, generator),
+        "frame": frame,
+    }
+    skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
+    materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
+    traits = named(people, 0)
+    for name in _OF_CHART_HAIR:
+        del traits[name]
+    traits["random_texture"] = bool(people.random_texture[0])
+    traits["ita_deg"] = round(float(ita_deg(bare_skin(people)[0].double().numpy())), 1)
+    traits["hair_colour"] = _hair_name(people)
+    traits.update(eye_traits, frame=frame_kind, cloth=cloth_kind)
+    return Appearance(materials, scattering_mm(people)[0], traits)
+
+
+def canvas_uv(side: int) -> Tensor:
+    """(u, v) [T, T, 2] of the chart at the centres of the canvas's texels."""
+    return CANVAS_SPAN[0] + (CANVAS_SPAN[1] - CANVAS_SPAN[0]) * texel_centres_uv(side)
+
+
+def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
+    """The same person with a scalp that hair grows on: its short hair, by its share [T, T] of the canvas.
+
+    The colour is the mean of the hair's roots.
+    """
+    skin, hair = appearance.materials["skin"], appearance.materials["hair"]
+    colour = hair.albedo[:, :8].mean((1, 2)).view(3, 1, 1)
+    streaks = (1 + 0.2 * torch.randn(1, *cover.shape, generator=generator)).clamp(0.3, 1.8)
+    share = 0.9 * cover.float()[None]
+    stained = Material(
+        skin.albedo + share * (colour * streaks - skin.albedo),
+        skin.specular * (1 - 0.5 * share),
+        (skin.roughness + 0.15 * share).clamp(max=0.85),
+        skin.relief * (1 - share),
+    )
+    return replace(appearance, materials=appearance.materials | {"skin": stained})
+
+
+def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Surface:
+    """The materials at points: part [N] as in `mesh.PARTS`, uv [N, 2]; bilinear, clamped at the borders."""
+    values = torch.zeros(len(uv), 7)
+    for index in sorted(set(part.tolist())):
+        name = PARTS[index]
+        chosen = (part == index).nonzero()[:, 0]
+        at = uv[chosen].float()
+        if name == "skin":
+            at = (at - CANVAS_SPAN[0]) / (CANVAS_SPAN[1] - CANVAS_SPAN[0])
+        material = appearance.materials[name]
+        texture = torch.cat([material.albedo, material.specular, material.roughness, material.relief])
+        grid = (2 * at - 1).view(1, 1, -1, 2)
+        found = F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
+        values[chosen] = found[0, :, 0].T
+    return Surface(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
+
+
+def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | None = None) -> Material:
+    """A material of one gloss."""
+    one = torch.ones(1, *albedo.shape[1:])
+    return Material(
+        albedo.clamp(0.003, 0.95),
+        specular * one,
+        roughness * one,
+        torch.zeros(2, *albedo.shape[1:]) if relief is None else relief,
+    )
+
+
+def _uniform(low: float, high: float, generator: torch.Generator) -> float:
+    return float(Uniform(generator)(low, high))
+
+
+def _mouth(generator: torch.Generator) -> Material:
+    """Gums and tongue, wet."""
+    colour = torch.tensor([0.30, 0.075, 0.065]) * _uniform(0.5, 1.1, generator)
+    patches = plain_noise((64, 64), 10, generator)
+    return _flat(colour.view(3, 1, 1) * (1 + 0.15 * patches), 0.03, 0.3)
+
+
+def _teeth(people: People, generator: torch.Generator) -> Material:
+    """Enamel, yellower with age."""
+    yellow = 0.35 + 0.65 * float(people.age[0] - 18) / 57 * _uniform(0.3, 1, generator)
+    white, old = torch.tensor([0.60, 0.57, 0.52]), torch.tensor([0.50, 0.43, 0.31])
+    colour = (white + yellow * (old - white)) * _uniform(0.8, 1.1, generator)
+    return _flat(colour.view(3, 1, 1) * (1 + 0.06 * plain_noise((64, 64), 12, generator)), 0.045, 0.25)
+
+
+def _cloth(generator: torch.Generator) -> tuple[Material, str]:
+    """Plain, heathered or striped cloth, woven."""
+    grey = torch.full((3,), _uniform(0.02, 0.6, generator))
+    colour = grey * torch.exp(_uniform(0, 0.9, generator) * torch.randn(3, generator=generator))
+    kind = ("plain", "plain", "heather", "stripes")[int(torch.randint(4, (), generator=generator))]
+    side = _SIDE
+    weave = torch.randn(1, side, side, generator=generator)
+    albedo = colour.clamp(0.015, 0.75).view(3, 1, 1) * (1 + 0.06 * weave)
+    if kind == "heather":
+        albedo = albedo * (1 + 0.25 * weave)
+    if kind == "stripes":
+        phase = torch.arange(side).view(1, -1, 1) / side * round(_uniform(6, 30, generator))
+        other = torch.rand(3, 1, 1, generator=generator) * 0.6 + 0.02
+        stripe = torch.sigmoid(12 * (torch.sin(2 * torch.pi * phase) - _uniform(-0.6, 0.6, generator)))
+        albedo = albedo * (1 - stripe) + stripe * other * (1 + 0.06 * weave)
+    relief = 0.12 * torch.randn(2, side, side, generator=generator)
+    return _flat(albedo, 0.02, _uniform(0.7, 0.9, generator), relief), kind
+
+
+def _hair(people: People, generator: torch.Generator) -> Material:
+    """Wisps along u, root to tip along v: each a little different, lighter and drier to the tip."""
+    wisps = _HAIR_WISPS
+    melanin = torch.exp(0.18 * torch.randn(wisps, generator=generator))
+    grey = people.grey[0]
+    white = (torch.rand(wisps, generator=generator) * 0.6 + 0.2 < grey).float() * 0.6 + 0.4 * grey
+    tip = torch.linspace(1.1, _uniform(0.55, 1.0, generator), 64)[:, None]
+    eumelanin = people.hair_eumelanin[0] * melanin * tip
+    albedo = hair_albedo(eumelanin, people.hair_pheomelanin[0] * melanin * tip, white.expand(64, -1))
+    strands = 1 + 0.1 * torch.randn(64, wisps, generator=generator)
+    return _flat(albedo.permute(2, 0, 1) * strands, 0.046, _uniform(0.35, 0.5, generator))
+
+
+def _hair_name(people: People) -> str:
+    """How a person would call the colour."""
+    eumelanin, pheomelanin = float(people.hair_eumelanin[0]), float(people.hair_pheomelanin[0])
+    if people.grey[0] > 0.5:
+        return "grey"
+    if pheomelanin > 0.7 and eumelanin < 3:
+        return "red"
+    names = ((0.8, "blond"), (2.0, "light brown"), (4.0, "brown"))
+    return next((name for most, name in names if eumelanin < most), "black")
+
+
+def _frame(generator: torch.Generator) -> tuple[Material, str]:
+    """Of glasses: metal, acetate of one colour, or tortoiseshell."""
+    kind = ("metal", "acetate", "acetate", "tortoise")[int(torch.randint(4, (), generator=generator))]
+    flat = torch.ones(3, 64, 64)
+    if kind == "metal":
+        tint = torch.tensor([[0.55, 0.55, 0.56], [0.60, 0.46, 0.24], [0.10, 0.10, 0.11]])
+        shine = tint[int(torch.randint(3, (), generator=generator))]
+        return _flat(flat * shine.view(3, 1, 1) * 0.25, float(shine.mean()), 0.3), kind
+    if kind == "tortoise":
+        spots = torch.sigmoid(4 * plain_noise((64, 64), 10, generator))
+        dark, amber = torch.tensor([0.02, 0.010, 0.006]), torch.tensor([0.28, 0.11, 0.025])
+        return _flat(dark.view(3, 1, 1) + spots * (amber - dark).view(3, 1, 1), 0.04, 0.15), kind
+    colour = torch.exp(torch.randn(3, generator=generator) * 0.8 - 3.2).clamp(0.01, 0.5)
+    return _flat(flat * colour.view(3, 1, 1), 0.04, 0.15), kind

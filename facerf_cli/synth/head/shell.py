@@ -1,0 +1,218 @@
+"""Any face model's chart closed into a whole head for the synthetic stage.
+
+The chart's surface is sampled finely and goes on over skull, sides and neck (`cranium.py`); eyes and mouth
+are cut open between the lids and between the lips (`openings.py`) where they are open, and filled.
+"""
+
+from functools import cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.face.topology import BOTTOM_M, CHART_MM, HALF_ANGLE_DEG, TOP_M, landmark_weights
+from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.synth.head import eyes as eyeballs
+from facerf_cli.synth.head import mesh as ears
+from facerf_cli.synth.head import mouth
+from facerf_cli.synth.head.cranium import Surroundings, on_chart, template
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, unit
+from facerf_cli.synth.head.openings import Sheet, lips, outline, skin_sheet
+
+_LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
+_LIPS = ((61, 67), (62, 66), (63, 65))
+_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
+_OVERSHUT_LIDS_MM = 0.5  # a lid drawn further over the other one is cut free of it, or it would fold
+_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0
+_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
+_EAR_OUT_MM = 1.5
+
+
+def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: int) -> HeadMesh:
+    """The whole bare head of a face given as canonical vertices [GRID * GRID, 3] in metres.
+
+    gaze: azimuth to the picture's right, elevation up, in degrees. The skin's samples are about
+    1 mm / 2 ** (subdivisions - 1) apart.
+    """
+    face_mm = vertices.detach().cpu().double().numpy() * 1000
+    corners, weights = (array.numpy() for array in landmark_weights())
+    landmarks_mm = (face_mm[corners] * weights[..., None]).sum(1)
+    cut = _open(landmarks_mm)
+    sheet = skin_sheet(subdivisions, cut)
+    skin_mm = _skin(face_mm, sheet, subdivisions, cut)
+    roots = {side: _ear_root(skin_mm, sheet, side) for side in (-1.0, 1.0)}
+    for side, root in roots.items():
+        skin_mm = _hollowed(skin_mm, root, side)
+    around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _LIDS}
+    balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _LIDS}
+    normals = _normals(skin_mm, sheet.triangles, sheet.same)
+    parts = [_ear(root, side) for side, root in roots.items()]
+    parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
+    rims = {}
+    for name, rim in sheet.rims.items():
+        edge, down = skin_mm[rim], -normals[rim]
+        inward = _inward(edge, normals[rim])
+        rims[name] = _lips(edge, inward, down) if name == "mouth" else _lid(edge, inward, balls[name], down)
+    if "mouth" in rims:
+        inner = rims["mouth"][-1]
+        parts.append(_part("mouth", *mouth.bag(inner)))
+        parts += [_part("mouth", *mesh) for mesh in mouth.gums_and_tongue(landmarks_mm, inner)]
+        parts.append(_part("teeth", *mouth.teeth(landmarks_mm, inner)))
+    return joined(_rimmed(skin_mm, sheet, rims), *parts)
+
+
+def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]) -> HeadMesh:
+    """The skin with the rims' rings [N, 3] added to its openings; a rim has the uv of its edge."""
+    vertices, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
+    for name, rings in rims.items():
+        triangles.append(_strip(sheet.rims[name], sum(map(len, vertices)), len(rings)))
+        vertices += rings
+        uv += [uv[0][sheet.rims[name]]] * len(rings)
+    count = sum(map(len, vertices))
+    same = np.concatenate([sheet.same, np.arange(len(skin_mm), count)])
+    return _part("skin", np.concatenate(vertices), np.concatenate(triangles), np.concatenate(uv), same)
+
+
+def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
+    """Which openings are wide enough to be cut."""
+    gaps = {
+        name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
+        for name, pairs in _LIDS.items()
+    }
+    found = [name for name, gap in gaps.items() if not -_OVERSHUT_LIDS_MM < gap <= _SHUT_LIDS_MM]
+    parted = max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in _LIPS)
+    return (*found, "mouth") if parted > _SHUT_LIPS_MM else tuple(found)
+
+
+def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, ...]) -> np.ndarray:
+    """Positions [N, 3] in millimetres of the sheet's samples."""
+    on = _on_chart(sheet.u_level)
+    skin = np.empty((len(on), 3))
+    skin[on] = on_chart(face_mm, sheet.u_level[on])
+    for name in cut:
+        for lip, held in zip(lips(name), _held(subdivisions, cut, name), strict=True):
+            side_mm = face_mm.copy()
+            side_mm[lip.replaced] = lip.weights @ face_mm[lip.sources]
+            skin[held] = on_chart(side_mm, sheet.u_level[held])
+    skin[~on] = _surroundings(subdivisions).positions(face_mm)
+    return skin[sheet.same]
+
+
+@cache
+def _held(subdivisions: int, cut: tuple[str, ...], name: str) -> list[np.ndarray]:
+    """Samples of the upper and of the lower side of an opening."""
+    return [np.flatnonzero(lip.holds(skin_sheet(subdivisions, cut).u_level)) for lip in lips(name)]
+
+
+@cache
+def _surroundings(subdivisions: int) -> Surroundings:
+    u_level = skin_sheet(subdivisions, ()).u_level
+    return Surroundings(u_level[~_on_chart(u_level)])
+
+
+def _on_chart(u_level: np.ndarray) -> np.ndarray:
+    inside: np.ndarray = (u_level >= 0) & (u_level <= 1)
+    return inside[:, 0] & inside[:, 1]
+
+
+@cache
+def _around_eye(subdivisions: int, cut: tuple[str, ...], name: str) -> np.ndarray:
+    """Samples [M] of the skin about an eye."""
+    uv, line = skin_sheet(subdivisions, cut).u_level, outline(name)
+    margin = _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
+    return np.flatnonzero(((uv > line.min(0) - margin) & (uv < line.max(0) + margin)).all(-1))
+
+
+def _chart_uv(u_level: np.ndarray) -> np.ndarray:
+    """The extended chart's uv [N, 2]: heights over the crown are those of the average head."""
+    v = u_level[:, 1].copy()
+    crown = v < 0
+    y = template(*u_level[crown].T)[:, 1] / 1000
+    v[crown] = (TOP_M - y) / (TOP_M - BOTTOM_M)
+    return np.stack([u_level[:, 0], v], -1)
+
+
+def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Unit vectors [N, 3] in the surface from a counter-clockwise rim into its opening."""
+    along = np.roll(edge, -1, 0) - np.roll(edge, 1, 0)
+    across = np.cross(normals, along)
+    for _ in range(2):
+        across = unit(across)
+        across = np.roll(across, 1, 0) + 2 * across + np.roll(across, -1, 0)
+    return unit(across)
+
+
+def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
+    """Rings of a lid's margin, from its edge to just under the eyeball's surface."""
+    low = edge + 0.6 * inward
+    to_ball = low - ball
+    foot = ball + unit(to_ball) * (eyeballs.RADIUS_MM - 0.3)
+    rounded = edge + 0.2 * inward + 0.15 * down
+    return [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
+
+
+def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
+    """Rings of the lips rolling back into the mouth."""
+    back = np.array([0.0, 0, -1])
+    return [
+        edge + 0.25 * inward + 0.35 * down + 0.2 * back,
+        edge + 0.3 * inward + 1.0 * back + 0.5 * down,
+        edge - 0.3 * inward + 3.0 * back,
+    ]
+
+
+def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
+    """Triangles between the rim's vertices and rings of new ones that start at `first`."""
+    count = len(rim)
+    ids = np.concatenate([rim[None], first + np.arange(rings * count).reshape(rings, count)])
+    a, b = ids[:-1], np.roll(ids[:-1], -1, 1)
+    c, d = ids[1:], np.roll(ids[1:], -1, 1)
+    return np.concatenate([np.stack([a, b, d], -1).reshape(-1, 3), np.stack([a, d, c], -1).reshape(-1, 3)])
+
+
+def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
+    """Where the ear sits [3] at the head's `side` (1: the picture's right)."""
+    u = 0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG)
+    v = (TOP_M - _EAR_Y_MM / 1000) / (TOP_M - BOTTOM_M)
+    nearest = (((sheet.u_level - [u, v]) * CHART_MM) ** 2).sum(-1).argmin()
+    return skin_mm[nearest] + [side * _EAR_OUT_MM, 0, 0]
+
+
+def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
+    """The skin drawn in behind the ear's bowl."""
+    near = np.flatnonzero((np.abs(skin_mm - root) < _AROUND_EAR_MM).all(-1))
+    drawn = skin_mm.copy()
+    drawn[near, 0] -= side * ears.hollow_mm((skin_mm[near] - root) * [side, 1, 1])
+    return drawn
+
+
+def _ear(root: np.ndarray, side: float) -> HeadMesh:
+    vertices, triangles = ears.ear()
+    points = root + vertices * [side, 1, 1]
+    azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
+    u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
+    uv = np.stack([u, (TOP_M - points[:, 1] / 1000) / (TOP_M - BOTTOM_M)], -1)
+    return _part("skin", points, triangles if side > 0 else triangles[:, ::-1], uv)
+
+
+def _part(
+    name: str, vertices_mm: np.ndarray, triangles: np.ndarray, uv: np.ndarray, same: np.ndarray | None = None
+) -> HeadMesh:
+    """A piece of mesh of one part, without vertices that no triangle uses."""
+    used = np.zeros(len(vertices_mm), bool)
+    used[triangles] = True
+    stands = np.arange(len(vertices_mm)) if same is None else same
+    normals = _normals(vertices_mm, triangles, stands)[used]
+    return HeadMesh(
+        vertices=(vertices_mm[used] / 1000).astype(np.float32),
+        normals=normals.astype(np.float32),
+        triangles=(np.cumsum(used) - 1)[triangles],
+        part=np.full(len(normals), PARTS.index(name), np.uint8),
+        uv=uv[used].astype(np.float32),
+        tangents=np.zeros((len(normals), 3), np.float32),
+    )
+
+
+def _normals(vertices: np.ndarray, triangles: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """Unit normals [V, 3], area-weighted; vertices that stand for one place share theirs."""
+    return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(same[triangles])).numpy()[same]

@@ -1,0 +1,198 @@
+"""Stage `diffuse-sh`: the network of the diffuse baseline (`network/diffuse_sh.py`), in the chart.
+
+Albedo is learnt from targets, which it has to explain under lights that are known; light from the source,
+which it has to explain with that albedo. Were the albedo to learn from the source too, a copy of it under a
+constant light would explain it at once, and training stays there. Order 2 cannot explain a single light, nor
+is the baseline used in one: a target is a sum of several. All are at the network's own exposure.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.light.sh import rig_coefficients
+from facerf_cli.light.sphere import RigLight
+from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
+from facerf_cli.network.reflectance import to_root
+from facerf_cli.synth.texture_samples import Sample, SampleSource
+from facerf_cli.training.losses import clipped_si_mse, root_loss
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_VALIDATION_SEED = 12345
+_SHEET_FACES = 5
+_TOTAL = 1.5  # of the weights of a sum: a face in front light then has about the albedo's radiance
+_UNEVEN = 2.0  # power of the draws that weights are made of: some sums are nearly one light
+_TINT = 0.15  # deviation of the logarithm of a light's colour
+
+
+@dataclass(frozen=True)
+class SumSettings:
+    """Single lights of a face and step, and their sums; and held-out heads, each drawn several times."""
+
+    lights: int = 8
+    sums: int = 3
+    held_out_heads: int = 12
+    held_out_draws: int = 4
+
+
+@dataclass(frozen=True)
+class DiffuseBatch:
+    """B faces, M targets each: fields as in `Sample`, and the targets' light.
+
+    source, normals_source, normals_target [B, 3, T, T], visible and weight [B, 1, T, T], targets
+    [B, M, 3, T, T], coefficients [B, M, 9, 3] in camera space; `heads` [B] are the heads' numbers.
+    """
+
+    source: Tensor
+    visible: Tensor
+    normals_source: Tensor
+    normals_target: Tensor
+    targets: Tensor
+    coefficients: Tensor
+    weight: Tensor
+    heads: Tensor
+
+    def to(self, device: torch.device) -> "DiffuseBatch":
+        """The same batch on `device`."""
+        moved = {name: tensor.to(device) for name, tensor in self.__dict__.items() if name != "heads"}
+        return DiffuseBatch(**moved, heads=self.heads)
+
+
+class DiffuseObjective(Objective):
+    """`root_loss` of the source in its own light, and of sums of lights that are known."""
+
+    def __init__(
+        self,
+        source: SampleSource,
+        network: DiffuseNetwork | None = None,
+        settings: SumSettings = SumSettings(),
+    ) -> None:
+        super().__init__()
+        network = network or DiffuseNetwork()
+        network.set_mean_face(source.mean_face()[0])
+        self.networks = nn.ModuleDict({"diffuse_sh": network})
+        self.chooses_by = "si_mse"
+        self.provenance = source.provenance
+        self.source = source
+        self.settings = settings
+        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        self._validation: list[DiffuseBatch] = []
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> DiffuseBatch:
+        """`count` faces, sample i with `generator_of(i)` alone."""
+        drawn = []
+        for i in range(count):
+            generator = generator_of(i)
+            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+            drawn.append(self._sums(head, generator))
+        return concatenate(drawn)
+
+    def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
+        """The terms `source`, of the light alone, and `targets`, of the albedo; means over faces."""
+        with self.mixed_precision():
+            estimate = self._network()(batch.source, batch.normals_source, batch.visible)
+        source = (batch.source / estimate.exposure)[:, None]
+        targets = batch.targets / estimate.exposure[:, None]
+        own, _ = explained(estimate._replace(albedo=estimate.albedo.detach()), batch)
+        _, relit = explained(estimate, batch)
+        return {
+            "source": root_loss(to_root(own), source, batch.visible),
+            "targets": root_loss(to_root(relit), targets, batch.weight),
+        }
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Mean Si-MSE of held-out heads, clipped at white: of the relit sums, by pose, and of the source.
+
+        The sheet has a face in two rows: source and targets; the source as explained, and the relit, then
+        albedo and shading.
+        """
+        network = self._network()
+        device = next(network.parameters()).device
+        errors: list[tuple[Tensor, Tensor]] = []
+        same_pose: list[bool] = []
+        rows: list[np.ndarray] = []
+        for batch in self._held_out():
+            there = batch.to(device)
+            estimate = network(there.source, there.normals_source, there.visible)
+            own, relit = (image.cpu() for image in explained(estimate, there))
+            of_source = clipped_si_mse(own, batch.source[:, None], batch.visible).mean()
+            errors.append((clipped_si_mse(relit, batch.targets, batch.weight).mean(), of_source))
+            turned = (batch.normals_source - batch.normals_target).abs().max()
+            same_pose.append(bool(turned < 1e-3))
+            rows += [_sheet_rows(batch, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
+        return Validation(_metrics(torch.tensor(errors), torch.tensor(same_pose)), np.concatenate(rows))
+
+    def _held_out(self) -> Iterator[DiffuseBatch]:
+        """Always the same samples, one a face; drawn once."""
+        if not self._validation:
+            self._validation = [
+                self._sums(head[None], seeded(_VALIDATION_SEED, int(head), draw))
+                for draw in range(self.settings.held_out_draws)
+                for head in self.held_out
+            ]
+        yield from self._validation
+
+    def _sums(self, heads: Tensor, generator: torch.Generator) -> DiffuseBatch:
+        """One face, and sums of its single lights of random colours."""
+        sample = self.source.draw(heads, self.settings.lights, generator)
+        weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
+        return summed(sample, weights, heads)
+
+    def _network(self) -> Any:
+        return self.networks["diffuse_sh"]
+
+
+def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:
+    """Weights [M, L, 3] of lights, not negative, from nearly one light to all alike."""
+    share = torch.rand(sums, lights, 1, generator=generator) ** _UNEVEN
+    tint = torch.exp(_TINT * torch.randn(sums, lights, 3, generator=generator))
+    weights = share * tint
+    return _TOTAL * weights / weights.mean(2, keepdim=True).sum(1, keepdim=True)
+
+
+def summed(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
+    """One face of a sample under M sums, weights [M, L, 3], of its lights."""
+    coefficients = [rig_coefficients(RigLight(sample.lights[0], w), ORDER) for w in weights]
+    return DiffuseBatch(
+        source=sample.source,
+        visible=sample.visible,
+        normals_source=sample.normals_source,
+        normals_target=sample.normals_target,
+        targets=torch.einsum("mlc,lcij->mcij", weights, sample.target[0])[None],
+        coefficients=torch.stack(coefficients)[None],
+        weight=sample.weight,
+        heads=heads,
+    )
+
+
+def explained(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Tensor, Tensor]:
+    """Sources [B, 1, 3, T, T] in their own light and targets [B, M, 3, T, T], at the network's exposure."""
+    albedo = estimate.albedo[:, None]
+    own = shading(batch.normals_source, estimate.coefficients[:, None])
+    return albedo * own, albedo * shading(batch.normals_target, batch.coefficients)
+
+
+def _metrics(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
+    """Of errors [N, 2]: of what is relit, and of sources."""
+    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
+    relit = {f"si_mse{name}": float(errors[part, 0].mean()) for name, part in parts.items() if part.any()}
+    return {**relit, "si_mse_source": float(errors[:, 1].mean())}
+
+
+def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
+    """Two rows of pictures [2T, (M + 3) T, 3] of one face."""
+    exposure = estimate.exposure[0].cpu()
+    seen, mask = batch.visible[0], (batch.weight[0] > 0).float()
+    albedo = estimate.albedo[0].cpu()
+    lit = shading(batch.normals_source, estimate.coefficients[:, None].cpu())[0, 0]
+    truth = [batch.source[0] / exposure, *(batch.targets[0] / exposure * mask)]
+    guess = [own[0, 0] * seen, *(relit[0] * mask)]
+    blank = torch.zeros_like(albedo)
+    rows = (torch.cat([*truth, blank, blank], -1), torch.cat([*guess, albedo, lit / 4], -1))
+    image: np.ndarray = torch.cat(rows, -2).permute(1, 2, 0).numpy()
+    return image

@@ -1,0 +1,183 @@
+"""Stage `geometry`: the Geometry Network alone, on rendered faces whose landmarks are known.
+
+The landmarks of the estimated head are compared with the true ones in the picture, as in the paper's landmark
+loss but for the contour: here every point is known, also those that are hidden, so none has to slide. The
+fit to the same landmarks says what pose and coefficients are wanted; it is what the network is a start for.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.face.fit import FitSettings
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometrySettings
+from facerf_cli.raster.camera import crop_camera, project
+from facerf_cli.synth.image_samples import FaceCrops, RenderedFaces
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_VALIDATION_SEED = 20211
+_SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
+
+
+@dataclass(frozen=True)
+class GeometryObjectiveSettings:
+    """Weights of the terms, and how many held-out heads are drawn how often for validation."""
+
+    landmarks: float = 10.0  # of the distances in units of the inter-ocular distance
+    contour: float = 0.5  # of a contour landmark beside another one
+    rotation: float = 2.0  # of the chord between rotations
+    depth: float = 2.0  # of the ratio of depths
+    coefficients: float = 0.08  # of squared differences, in units of the fit's priors
+    held_out_heads: int = 12
+    held_out_draws: int = 16
+
+
+class GeometryObjective(Objective):
+    """Landmarks, pose and coefficients of rendered faces."""
+
+    mean_m: Tensor
+    identity_m: Tensor
+    expression_m: Tensor
+
+    def __init__(
+        self,
+        faces: RenderedFaces,
+        network: GeometryNetwork | None = None,
+        settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
+    ) -> None:
+        super().__init__()
+        network = network or GeometryNetwork(GeometrySettings(mean_translation_m=faces.mean_translation_m()))
+        self.networks = nn.ModuleDict({"geometry": network})
+        self.chooses_by = "landmarks_percent"
+        self.provenance = faces.provenance
+        self.faces = faces
+        self.side = network.side
+        self.settings = settings
+        self.heads, self.held_out = faces.heads(settings.held_out_heads)
+        model = load_face_model()
+        own = network.settings
+        points = [model.landmarks(x) for x in (model.mean[None], model.identity, model.expression)]
+        self.register_buffer("mean_m", points[0][0])
+        self.register_buffer("identity_m", points[1][: own.identity])
+        self.register_buffer("expression_m", points[2][: own.expression])
+        self._validation: FaceCrops | None = None
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> FaceCrops:
+        """`count` crops of random heads."""
+        drawn = []
+        for i in range(count):
+            generator = generator_of(i)
+            head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
+            drawn.append(self.faces.draw(head, self.side, generator))
+        return concatenate(drawn)
+
+    def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
+        """The weighted terms, each a mean over faces."""
+        with self.mixed_precision():
+            estimate = GeometryEstimate(*(x.float() for x in self.estimate(batch.crops)))
+        settings, fit = self.settings, FitSettings()
+        weight = torch.ones(68, device=batch.crops.device)
+        weight[list(CONTOUR)] = settings.contour
+        distance = self.distances_iod(estimate, batch)
+        landmarks = (distance * weight).sum(1).mean() / weight.sum()
+        chord = (estimate.rotation - batch.rotation).flatten(1).norm(dim=1) / 2**0.5
+        depth = (estimate.translation_m[:, 2] / batch.translation_m[:, 2]).log().abs()
+        alpha = (estimate.alpha - batch.alpha[:, : estimate.alpha.shape[1]]) / fit.identity_std
+        beta = (estimate.beta - batch.beta[:, : estimate.beta.shape[1]]) / fit.expression_std
+        squared = alpha.square().sum(1) + beta.square().sum(1)
+        return {
+            "landmarks": settings.landmarks * landmarks,
+            "rotation": settings.rotation * chord.mean(),
+            "depth": settings.depth * depth.mean(),
+            "coefficients": settings.coefficients * squared.mean(),
+        }
+
+    def estimate(self, crops: Tensor) -> GeometryEstimate:
+        """The network's estimate."""
+        found: GeometryEstimate = self.networks["geometry"](crops)
+        return found
+
+    def landmarks_px(self, estimate: GeometryEstimate, side: int) -> Tensor:
+        """The estimate's landmarks [B, 68, 2] in a crop of that side, differentiable."""
+        offset = torch.einsum("bk,knc->bnc", estimate.alpha, self.identity_m)
+        offset = offset + torch.einsum("bk,knc->bnc", estimate.beta, self.expression_m)
+        in_camera = (self.mean_m + offset) @ estimate.rotation.mT + estimate.translation_m[:, None]
+        return project(in_camera, crop_camera(side))
+
+    def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
+        """Distances [B, 68] to the true landmarks in units of the inter-ocular distance.
+
+        Here that is the mean face's at the head's depth: a turned head's eyes come close in the picture, and
+        its landmarks would weigh the more.
+        """
+        predicted = self.landmarks_px(estimate, batch.crops.shape[-1])
+        unit_px = _frontal_iod_px(self.mean_m, batch)
+        return (predicted - batch.landmarks_px).norm(dim=-1) / unit_px[:, None]
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Mean errors on held-out heads; of landmarks in percent of the inter-ocular distance."""
+        if self._validation is None:
+            self._validation = self._held_out()
+        device = next(self.networks.parameters()).device
+        batch = self._validation.to(device)
+        estimate = self.estimate(batch.crops)
+        distance_px = (self.landmarks_px(estimate, self.side) - batch.landmarks_px).norm(dim=-1)
+        left, right = OUTER_EYE_CORNERS
+        eyes_px = (batch.landmarks_px[:, left] - batch.landmarks_px[:, right]).norm(dim=-1)
+        percent = 100 * distance_px / eyes_px[:, None]
+        chord = (estimate.rotation - batch.rotation).flatten(1).norm(dim=1)
+        angle_deg = torch.rad2deg(2 * torch.asin((chord / 8**0.5).clamp(max=1)))
+        depth = (estimate.translation_m[:, 2] / batch.translation_m[:, 2]).log().abs()
+        metrics = {
+            "landmarks_percent": float(percent.mean()),
+            "inner_percent": float(percent[:, len(CONTOUR) :].mean()),
+            "angle_deg": float(angle_deg.mean()),
+            "depth_percent": float(100 * depth.mean()),
+        }
+        return Validation(metrics, self._sheet(batch, estimate))
+
+    def _held_out(self) -> FaceCrops:
+        return concatenate(
+            [
+                self.faces.draw(int(head), self.side, seeded(_VALIDATION_SEED, int(head), index))
+                for index in range(self.settings.held_out_draws)
+                for head in self.held_out
+            ]
+        )
+
+    def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
+        """Held-out crops with true landmarks in green and the estimate's in red."""
+        side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
+        images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
+        images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6) * 0.18
+        predicted = self.landmarks_px(estimate, side)[:count].cpu()
+        for points, colour in (
+            (batch.landmarks_px[:count].cpu(), (0.0, 1.0, 0.0)),
+            (predicted, (1.0, 0.0, 0.0)),
+        ):
+            for image, own in zip(images, points, strict=True):
+                column, row = (own * size / side).long().clamp(0, size - 2).unbind(-1)
+                for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
+                    image[:, row + y, column + x] = torch.tensor(colour)[:, None]
+        rows = [
+            torch.cat(list(chunk), 2)
+            for chunk in torch.split(images, _SHEET_COLUMNS)
+            if len(chunk) == _SHEET_COLUMNS
+        ]
+        sheet: np.ndarray = torch.cat(rows or [torch.cat(list(images), 2)], 1).permute(1, 2, 0).numpy()
+        return sheet
+
+
+def _frontal_iod_px(mean_m: Tensor, batch: FaceCrops) -> Tensor:
+    """Pixels [B] that the mean face's inter-ocular distance takes at each head's depth."""
+    left, right = OUTER_EYE_CORNERS
+    depth_m = -(mean_m[[left, right]].mean(0) @ batch.rotation.mT + batch.translation_m)[:, 2]
+    iod_m: Any = (mean_m[left] - mean_m[right]).norm()
+    return crop_camera(batch.crops.shape[-1]).focal_px * iod_m / depth_m

@@ -1,0 +1,155 @@
+"""Stage `light-features`: S_f learns to tell from a texture where its one light stands.
+
+The paper trains S_f 'to predict the light direction from images' after Meka et al. (*Deep reflectance
+fields*, 2019), and says no more of it; what it learns to look at, shading, shadows and highlights, is what
+the loss L_L then compares. Textures are those that the Reflectance Network is trained to make, of one light
+each, black where the target pose does not see the face.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.network.reflectance import head_rotation, resize
+from facerf_cli.synth.texture_samples import SampleSource
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_NORMALS_SIDE = 64  # at which head frames are found
+_VALIDATION_SEED = 12345
+_SHEET_FACES = 6
+
+
+@dataclass(frozen=True)
+class LightTextures:
+    """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
+
+    The lights are unit vectors in the head's own frame; `heads` [B] are the heads' numbers.
+    """
+
+    textures: Tensor
+    lights_head: Tensor
+    heads: Tensor
+
+    def to(self, device: torch.device) -> "LightTextures":
+        """The same batch on `device`."""
+        return LightTextures(self.textures.to(device), self.lights_head.to(device), self.heads)
+
+
+@dataclass(frozen=True)
+class LightFeaturesSettings:
+    """Lights of a face and step; and held-out heads, each seen `held_out_views` times."""
+
+    lights: int = 8
+    held_out_heads: int = 12
+    held_out_views: int = 4
+
+
+class LightFeaturesObjective(Objective):
+    """1 - the cosine between the predicted direction and the light's."""
+
+    def __init__(
+        self,
+        source: SampleSource,
+        network: LightNetwork | None = None,
+        settings: LightFeaturesSettings = LightFeaturesSettings(),
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleDict({"light_features": network or LightNetwork()})
+        self.chooses_by = "angle_deg"
+        self.provenance = source.provenance
+        self.source = source
+        self.settings = settings
+        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
+        self._validation: LightTextures | None = None
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> LightTextures:
+        """`count` faces, sample i with `generator_of(i)` alone."""
+        drawn = []
+        for i in range(count):
+            generator = generator_of(i)
+            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+            drawn.append(self._textures(head, generator))
+        return concatenate(drawn)
+
+    def forward(self, batch: LightTextures) -> dict[str, Tensor]:
+        """The one term, a mean over faces and their lights."""
+        with self.mixed_precision():
+            return {"light": 1 - _cosines(self._network(), batch).mean()}
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Mean and median angle in degrees to the true light of held-out heads, and by where it stands."""
+        if self._validation is None:
+            self._validation = self._held_out()
+        network = self._network()
+        batch = self._validation.to(next(network.parameters()).device)
+        cosines = torch.cat([_cosines(network, face) for face in _one_by_one(batch)])
+        angles = torch.rad2deg(cosines.double().clamp(-1, 1).acos())
+        metrics = {"angle_deg": float(angles.mean()), "angle_median_deg": float(angles.median())}
+        front = batch.lights_head[..., 2] > 0  # of the plane of the face
+        for name, lights in (("angle_front_deg", front), ("angle_behind_deg", ~front)):
+            if lights.any():
+                metrics[name] = float(angles[lights].mean())
+        return Validation(metrics, _sheet(network, self._validation))
+
+    def _network(self) -> LightNetwork:
+        network: Any = self.networks["light_features"]
+        return network
+
+    def _held_out(self) -> LightTextures:
+        return concatenate(
+            [
+                self._textures(head[None], seeded(_VALIDATION_SEED, int(head), view))
+                for view in range(self.settings.held_out_views)
+                for head in self.held_out
+            ]
+        )
+
+    def _textures(self, heads: Tensor, generator: torch.Generator) -> LightTextures:
+        sample = self.source.draw(heads, self.settings.lights, generator)
+        seen = (sample.weight > 0).float()
+        head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
+        lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
+        return LightTextures(sample.target * seen[:, None], lights_head, heads)
+
+
+def _one_by_one(batch: LightTextures) -> Iterator[LightTextures]:
+    for i in range(len(batch.textures)):
+        one = slice(i, i + 1)
+        yield LightTextures(batch.textures[one], batch.lights_head[one], batch.heads[one])
+
+
+def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
+    """Between predicted and true directions [B, L]."""
+    predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
+    return (predicted * batch.lights_head).sum(-1)
+
+
+def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
+    """For some faces three rows of pictures: textures, a ball under the true light, and under the predicted.
+
+    The balls are seen from before the face, in the head's frame.
+    """
+    rows = []
+    for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
+        predicted = network(textures.to(next(network.parameters()).device)).cpu()
+        for images in (textures, _balls(lights, textures.shape[-1]), _balls(predicted, textures.shape[-1])):
+            rows.append(torch.cat(list(images), -1))
+    image: np.ndarray = torch.cat(rows, -2).permute(1, 2, 0).numpy()
+    return image
+
+
+def _balls(lights: Tensor, side: int) -> Tensor:
+    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black around them."""
+    along = torch.linspace(-1, 1, side) * 1.05
+    y, x = torch.meshgrid(-along, along, indexing="ij")
+    inside = 1 - x**2 - y**2
+    normals = torch.stack([x, y, inside.clamp_min(0).sqrt()])
+    shading = torch.einsum("nc,cij->nij", lights, normals).clamp_min(0) * 0.45 + 0.01
+    return (shading * (inside > 0))[:, None].expand(-1, 3, -1, -1)

@@ -1,0 +1,241 @@
+"""The training loop: draw, losses, backward, step, log, validate, save, resume. It knows no stage."""
+
+import logging
+import math
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.training.batches import (
+    Drawn,
+    drawn_batches,
+    first_says,
+    mean_of_all,
+    own_device,
+    process_count,
+    process_rank,
+    shared,
+)
+from facerf_cli.training.objective import Objective, seeded
+from facerf_cli.training.run_folder import RunLog, refuse_another_run, stop_on_signals
+from facerf_cli.training.settings import TrainSettings
+from facerf_cli.training.state import State, averaged, begin, load_state, save_state, update_average
+
+CPU = torch.device("cpu")
+Row = dict[str, Any]
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class Start:
+    """The checkpoint that a run begins from: its other networks, which are carried over, and its metadata."""
+
+    carried: dict[str, nn.Module] = field(default_factory=dict)
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+
+def train(
+    objective: Objective,
+    folder: Path,
+    settings: TrainSettings,
+    start: Start = Start(),
+    resume: bool = False,
+    device: torch.device = CPU,
+    report: Callable[[Row], None] = lambda row: None,
+) -> Path:
+    """Minimise an objective until the steps or the time are up; returns `folder/last.safetensors`.
+
+    On a CPU a run that ends by its steps is the same to the last digit however often it was stopped and
+    resumed, for draws and dropout depend on (seed, step, index) alone. Rows go to `folder/log.jsonl` and
+    `report`. Under torchrun (`runs.processes`) every process calls this; the first one alone writes.
+    """
+    if process_rank() == 0 and not resume:
+        refuse_another_run(folder)
+    device = own_device(device)
+    objective.to(device)
+    objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    objective.bf16 = settings.bf16
+    state = begin(objective.networks, settings, start.metadata, objective.provenance)
+    if resume and (folder / "state.pt").exists():
+        load_state(folder / "state.pt", state, settings)
+        saved, _ = load_networks(folder / "last.safetensors", LAYOUT_VERSION)
+        start = Start({name: saved[name] for name in saved.keys() - objective.networks.keys()})
+    if settings.done(state.step, state.seconds) >= 1:
+        log.info("%s: complete at step %d; give more --steps or --max-time to go on", folder, state.step)
+    elif process_rank() == 0:
+        with RunLog(folder, state.step) as run_log:
+            _loop(_Run(objective, folder, settings, state, start.carried, device, run_log, report))
+    else:
+        _loop(_Run(objective, folder, settings, state, start.carried, device, None, report))
+    return folder / "last.safetensors"
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What the loop works on."""
+
+    objective: Objective
+    folder: Path
+    settings: TrainSettings
+    state: State
+    carried: dict[str, nn.Module]
+    device: torch.device
+    log: RunLog | None  # of process 0 alone
+    report: Callable[[Row], None]
+
+
+def _loop(run: _Run) -> None:
+    """Steps from where the state is, to the end or to a signal."""
+    settings, state = run.settings, run.state
+    if settings.compile:
+        run.objective.compile()
+    model, clock = shared(run.objective, run.objective.skips_networks), _Clock(state.seconds)
+    run.objective.networks.train()
+    with stop_on_signals() as stop:
+        for drawn in _draws(run):
+            clock.waited_s += drawn.waited_s
+            seconds, signal = first_says(torch.tensor([clock.seconds(), stop.signal]).double()).tolist()
+            row = {"step": drawn.step, "seconds": seconds}
+            row |= _step(run, model, drawn, settings.done(drawn.step - 1, seconds))
+            row |= {"waiting": clock.waiting()}
+            state.step, state.seconds = drawn.step, clock.seconds()
+            ended = bool(signal) or settings.done(state.step, seconds) >= 1
+            due = not signal and (ended or state.step % settings.validate_every == 0)
+            if run.log:
+                with clock.stopped():
+                    _write(run, row, validate=due, save=due or ended)
+            if ended:
+                break
+        stop.leave()
+
+
+def _draws(run: _Run) -> Any:
+    """This process's share of every batch after the state's step."""
+    processes, batch = process_count(), run.settings.batch
+    if batch % processes:
+        raise UsageError(f"{processes} processes cannot share a batch of {batch}; give another --batch")
+    share, seed, workers = batch // processes, run.settings.seed, run.settings.workers
+    return drawn_batches(run.objective, run.state.step + 1, share, process_rank() * share, seed, workers)
+
+
+def _step(run: _Run, model: nn.Module, drawn: Drawn, done: float) -> Row:
+    """One step down the gradient; what there is to log of it. One that is not finite moves nothing."""
+    settings, state = run.settings, run.state
+    rate = settings.optimizer.learning_rate * settings.schedule.factor(drawn.step - 1, done)
+    for group in state.optimizer.param_groups:
+        group["lr"] = rate
+    torch.manual_seed(seeded(settings.seed, drawn.step, process_rank(), 0).initial_seed())  # of dropout
+    state.optimizer.zero_grad(set_to_none=True)
+    terms = model(drawn.batch.to(run.device))
+    loss = torch.stack(list(terms.values())).sum()
+    loss.backward()  # type: ignore[no-untyped-call]
+    clip = settings.gradient_clip or math.inf
+    norm = nn.utils.clip_grad_norm_(state.networks.parameters(), clip)
+    values = mean_of_all(torch.stack([loss, *terms.values()]).detach())
+    total, gradient, *parts = torch.cat([values[:1], norm[None], values[1:]]).tolist()
+    _stop_if_not_finite(run, drawn, total, gradient)
+    state.optimizer.step()
+    if settings.ema_decay:
+        update_average(state, settings.ema_decay, drawn.step)
+    return {"loss": total, "terms": dict(zip(terms, parts, strict=True)), "gradient": gradient, "rate": rate}
+
+
+def _stop_if_not_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -> None:
+    if math.isfinite(loss) and math.isfinite(gradient):
+        return
+    what = "loss" if not math.isfinite(loss) else "gradient"
+    heads = getattr(drawn.batch, "heads", None)
+    of = f", heads {heads.tolist()}" if heads is not None else ""
+    kept = run.folder / "state.pt"
+    raise FacerfError(
+        f"the {what} is not finite at step {drawn.step} (seed {run.settings.seed}{of}); "
+        + (f"the last good state is kept in {kept}" if kept.exists() else "no state was saved before it")
+    )
+
+
+def _write(run: _Run, row: Row, validate: bool, save: bool) -> None:
+    """The row, after a validation if one is due; the state last, so that all it knows of is on disk."""
+    last = run.folder / "last.safetensors"
+    with averaged(run.state) if save else nullcontext():
+        if validate:
+            row["validation"] = _validate(run, row["step"])
+        if save:
+            save_networks(last, {**run.carried, **run.objective.networks}, _metadata(run, row))
+    chosen = row.get("validation", {}).get(run.objective.chooses_by, math.inf)
+    if chosen < run.state.best:
+        run.state.best = chosen
+        with atomic_path(run.folder / "best.safetensors") as temporary:
+            shutil.copyfile(last, temporary)
+    assert run.log
+    run.log.write(row)
+    if save:
+        save_state(run.folder / "state.pt", run.state, run.settings)
+    run.report(row)
+
+
+@torch.no_grad()
+def _validate(run: _Run, step: int) -> dict[str, float]:
+    run.objective.networks.eval()
+    validation = run.objective.validate()
+    run.objective.networks.train()
+    if validation.sheet is not None and run.log:
+        run.log.sheet(step, validation.sheet)
+    return validation.metrics
+
+
+def _metadata(run: _Run, row: Row) -> dict[str, Any]:
+    """Of the checkpoint; what it began from is part of its past."""
+    start, provenance = run.state.start, dict(run.objective.provenance)
+    licences = [*provenance["licence"].split("; "), *start.get("licence", "").split("; ")]
+    if "provenance" in start:
+        provenance["started_from"] = start["provenance"]
+    leg = {
+        "objective": type(run.objective).__name__,
+        "networks": sorted(run.objective.networks),
+        "steps_done": row["step"],
+        "seconds": round(run.state.seconds, 1),
+        "processes": process_count(),
+        **asdict(run.settings),
+    }
+    return {
+        "layout_version": LAYOUT_VERSION,
+        "licence": "; ".join(dict.fromkeys(words for words in licences if words)),
+        "provenance": provenance,
+        "training": [*start.get("training", []), leg],
+        "metrics": {"step": row["step"], "loss": row["loss"], **row.get("validation", {})},
+    }
+
+
+@dataclass
+class _Clock:
+    """Seconds of a run in all its legs, and the share of this leg's steps that waited for batches."""
+
+    before_s: float
+    waited_s: float = 0.0
+    begun: float = field(default_factory=time.monotonic)
+    paused_s: float = 0.0
+
+    def seconds(self) -> float:
+        return self.before_s + time.monotonic() - self.begun
+
+    def waiting(self) -> float:
+        return self.waited_s / max(time.monotonic() - self.begun - self.paused_s, 1e-9)
+
+    @contextmanager
+    def stopped(self) -> Iterator[None]:
+        """Validating and saving is not a step."""
+        begun = time.monotonic()
+        yield
+        self.paused_s += time.monotonic() - begun

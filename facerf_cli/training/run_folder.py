@@ -1,0 +1,136 @@
+"""The files of a run: log.jsonl, validation-*.png and, where it is installed, what TensorBoard shows.
+
+Ctrl-C and SIGTERM end a run between two steps, so that nothing is lost; a second one ends it at once.
+"""
+
+import json
+import logging
+import math
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.errors import UsageError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.images import write_display
+from facerf_cli.logs import LOGGER_NAME, json_line
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+def refuse_another_run(folder: Path) -> None:
+    """UsageError where a folder holds a run already, which would be written over."""
+    if any((folder / name).exists() for name in ("state.pt", "log.jsonl", "last.safetensors")):
+        raise UsageError(f"{folder}: holds a run already; give --resume to go on with it, or another folder")
+
+
+class RunLog:
+    """Rows to log.jsonl and TensorBoard. Rows after `step`, which a killed run leaves, are taken out."""
+
+    def __init__(self, folder: Path, step: int) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder = folder
+        path = folder / "log.jsonl"
+        if path.exists():
+            rows = [line for line in path.read_text().splitlines() if _step_of(line) <= step]
+            with atomic_path(path) as temporary:
+                temporary.write_text("".join(f"{line}\n" for line in rows))
+        self.file = path.open("a")
+        self.board = _tensorboard(folder / "tensorboard", step)
+
+    def __enter__(self) -> "RunLog":
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.file.close()
+        if self.board:
+            self.board.close()
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Write a row; what it holds of dictionaries is named by both keys in TensorBoard."""
+        self.file.write(json_line(row) + "\n")
+        self.file.flush()
+        if self.board:
+            for name, value in _flat(row).items():
+                self.board.add_scalar(name, value, row["step"])
+
+    def sheet(self, step: int, sheet: np.ndarray) -> None:
+        """Write a contact sheet [H, W, 3], scene-linear."""
+        path = self.folder / f"validation-{step:07d}.png"
+        write_display(path, sheet.astype(np.float32), exposure=1.0)  # EV
+        if self.board:
+            from facerf_cli.colour import linear_to_srgb
+
+            self.board.add_image("sheet", linear_to_srgb(sheet.clip(0, 1)), step, dataformats="HWC")
+
+
+def _step_of(line: str) -> float:
+    """The step of a row, infinite for a line that was not written to its end."""
+    try:
+        return float(json.loads(line)["step"])
+    except (ValueError, KeyError, TypeError):
+        return math.inf
+
+
+def _flat(row: dict[str, Any]) -> dict[str, float]:
+    flat: dict[str, float] = {}
+    for name, value in row.items():
+        if isinstance(value, dict):
+            flat |= {f"{name}/{inner}": number for inner, number in value.items()}
+        elif name != "step":
+            flat[name] = value
+    return flat
+
+
+def _tensorboard(folder: Path, step: int) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        log.info("no TensorBoard here: the log is in log.jsonl alone (pip install 'facerf[tensorboard]')")
+        return None
+    return SummaryWriter(folder, purge_step=step + 1)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@dataclass
+class Stop:
+    """Whether the run was asked to end."""
+
+    signal: int = 0
+
+    def leave(self) -> None:
+        """End as the signal would have."""
+        if self.signal == signal.SIGINT:
+            raise KeyboardInterrupt
+        if self.signal:
+            sys.exit(128 + self.signal)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """Note the signals in the place of their handlers; threads but the main one cannot."""
+    stop = Stop()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def note(number: int, _: Any) -> None:
+        stop.signal = number
+        for which, handler in before.items():
+            signal.signal(which, handler)
+
+    before = {which: signal.signal(which, note) for which in _SIGNALS}
+    try:
+        yield stop
+    finally:
+        for which, handler in before.items():
+            signal.signal(which, handler)

@@ -1,0 +1,160 @@
+"""Stage `reflectance`: the Reflectance Network alone, in the chart, on the bank or a dataset's textures.
+
+With S_f the paper's feature loss on textures, L_L, joins the form's own.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.errors import InputError
+from facerf_cli.network.feature_networks import LightNetwork, feature_distance
+from facerf_cli.network.reflectance import ReflectanceNetwork, from_root, to_root
+from facerf_cli.synth.texture_samples import Sample, SampleSource
+from facerf_cli.training.losses import clipped_si_mse, root_loss
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_VALIDATION_SEED = 12345
+_SHEET_FACES = 5
+
+
+@dataclass(frozen=True)
+class ChartSettings:
+    """Lights of a face and step; and held-out heads, each drawn `held_out_draws` times."""
+
+    lights: int = 4
+    held_out_heads: int = 12
+    held_out_draws: int = 4
+    held_out_lights: int = 6
+    light_features: float = 0.25  # weight of L_L, whose gradient is then a third of the rest's
+
+
+@dataclass(frozen=True)
+class ChartBatch:
+    """Samples, and the numbers of their heads [B]."""
+
+    sample: Sample
+    heads: Tensor
+
+    def to(self, device: torch.device) -> "ChartBatch":
+        """The same batch on `device`."""
+        return ChartBatch(self.sample.to(device), self.heads)
+
+
+class ChartObjective(Objective):
+    """`root_loss` of OLAT textures at the network's own exposure; `light` is a frozen S_f."""
+
+    def __init__(
+        self,
+        source: SampleSource,
+        network: nn.Module | None = None,
+        light: LightNetwork | None = None,
+        settings: ChartSettings = ChartSettings(),
+    ) -> None:
+        super().__init__()
+        network = network or ReflectanceNetwork()
+        if isinstance(network, ReflectanceNetwork):
+            _set_mean_face(network, source)
+        self.networks = nn.ModuleDict({"reflectance": network})
+        self.chooses_by = "si_mse"
+        self.provenance = source.provenance
+        self.source = source
+        self.light = light
+        self.settings = settings
+        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        self._validation: list[Sample] = []
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> ChartBatch:
+        """`count` faces, sample i with `generator_of(i)` alone."""
+        samples, heads = [], []
+        for i in range(count):
+            generator = generator_of(i)
+            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+            samples.append(self.source.draw(head, self.settings.lights, generator))
+            heads.append(head)
+        return ChartBatch(concatenate(samples), torch.cat(heads))
+
+    def forward(self, batch: ChartBatch) -> dict[str, Tensor]:
+        """The term `root`, a mean over faces."""
+        network, sample = self._network(), batch.sample
+        with self.mixed_precision():
+            encoded = network.encode(sample.source, sample.normals_source, sample.visible)
+            root = _root(network, encoded, sample).float()
+        # The network divides by its own measure of exposure, which the fill of unseen texels does not enter.
+        target = sample.target / encoded.exposure[:, None]
+        terms = {"root": root_loss(root, target, sample.weight)}
+        if self.light is not None:
+            seen = (sample.weight > 0).float()[:, None]
+            textures = ((x * seen).flatten(0, 1) for x in (from_root(root), target))
+            with self.mixed_precision():
+                distance = feature_distance(self.light, *textures).mean()
+            terms["light_features"] = self.settings.light_features * distance
+        return terms
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
+
+        The sheet has a face in two rows: source and true OLATs, then what is seen of it and the predicted.
+        """
+        network = self._network()
+        device = next(network.parameters()).device
+        errors: list[Tensor] = []
+        same_pose: list[bool] = []
+        rows: list[np.ndarray] = []
+        for sample in self._held_out():
+            there = sample.to(device)
+            encoded = network.encode(there.source, there.normals_source, there.visible)
+            predicted = network.decode(encoded, there.normals_target, there.lights).cpu()
+            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
+            turned = (sample.normals_source - sample.normals_target).abs().max()
+            same_pose.append(bool(turned < 1e-3))
+            rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
+        return Validation(_by_pose(torch.stack(errors), torch.tensor(same_pose)), np.concatenate(rows))
+
+    def _held_out(self) -> Iterator[Sample]:
+        """Always the same samples, one a face; drawn once."""
+        lights = self.settings.held_out_lights
+        if not self._validation:
+            self._validation = [
+                self.source.draw(head[None], lights, seeded(_VALIDATION_SEED, int(head), draw))
+                for draw in range(self.settings.held_out_draws)
+                for head in self.held_out
+            ]
+        yield from self._validation
+
+    def _network(self) -> Any:
+        return self.networks["reflectance"]
+
+
+def _set_mean_face(network: ReflectanceNetwork, source: SampleSource) -> None:
+    try:
+        network.set_mean_face(*source.mean_face())
+    except ValueError as error:
+        raise InputError(f"{error}, as these heads were baked; give --bank or --start-from others") from None
+
+
+def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
+    """Roots [B, L, 3, T, T] at the normalised exposure, of either form."""
+    if isinstance(network, ReflectanceNetwork):
+        return network.decode_root(encoded, sample.normals_target, sample.lights)
+    linear: Tensor = network.decode(encoded, sample.normals_target, sample.lights)
+    return to_root(linear.float() / encoded.exposure[:, None])
+
+
+def _by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
+    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
+    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
+
+
+def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
+    """Two rows of pictures [2T, (L + 1) T, 3] of a sample's face."""
+    mask = (sample.weight[0] > 0).float()
+    truth = torch.cat([sample.source[0], *(sample.target[0] * mask)], -1)
+    guess = torch.cat([sample.source[0] * sample.visible[0], *(predicted[0] * mask)], -1)
+    image: np.ndarray = torch.cat([truth, guess], -2).permute(1, 2, 0).numpy()
+    return image

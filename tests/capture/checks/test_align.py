@@ -1,0 +1,108 @@
+"""Heads that moved between frames, found in pixels and taken back while the frames are read."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from facerf_cli.capture.capture import moved
+from facerf_cli.capture.checks import motion as path_module
+from facerf_cli.capture.checks.motion import align_shifts, head_path, with_alignment
+from facerf_cli.capture.layouts import read_capture
+from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
+
+PLANTED = {2: (3.0, -4.0), 5: (0.0, 1.5), 7: (-2.25, 0.5)}  # frames and how far they moved, down and right
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    frames = images(directions())
+    for row, by in PLANTED.items():
+        frames[row] = ndimage.shift(frames[row], by, order=3, mode="nearest")
+    return write_stage(tmp_path_factory.mktemp("moved") / "s", frames)
+
+
+def test_shifts_undo_the_motion(stage: Path) -> None:
+    shifts = align_shifts(read_capture(stage), SUBJECT, CAMERA, set())
+    for row, (down, right) in PLANTED.items():
+        assert shifts[IDS[row]] == pytest.approx((-down, -right), abs=0.7)  # of a few lamps, far apart
+    front = [light for light, way in zip(IDS, directions(), strict=True) if way[2] > 0.5]
+    still = set(front) - {IDS[row] for row in PLANTED}
+    assert not any(np.hypot(*shifts.get(light, (0, 0))) > 0.7 for light in still)
+
+
+def test_frames_are_read_where_the_head_was(stage: Path) -> None:
+    capture = read_capture(stage)
+    aligned = with_alignment(capture, SUBJECT, {CAMERA: {IDS[7]}})
+    truth = images(directions())[2]
+    inside = np.s_[12:-12, 12:-12]
+    before, after = (
+        np.abs(source.frame(SUBJECT, CAMERA, 2)[..., 0] - truth)[inside].mean()
+        for source in (capture, aligned)
+    )
+    assert after < 0.4 * before
+    assert (SUBJECT, CAMERA, IDS[7]) not in aligned.shifts  # a broken frame is not looked at
+
+
+def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
+    image = np.arange(12, dtype=np.float32).reshape(3, 4, 1)
+    assert (moved(image, 1, 0)[1:] == image[:-1]).all() and (moved(image, 1, 0)[0] == image[0]).all()
+    assert (moved(image, 0, -1)[:, :-1] == image[:, 1:]).all()
+    ramp = np.repeat(np.arange(8, dtype=np.float32)[None, :, None], 2, 0)
+    assert moved(ramp, 0, 0.25)[:, 2:-2, 0] == pytest.approx(ramp[:, 2:-2, 0] - 0.25)  # with the border away
+    there_and_back = moved(moved(ramp**2, 0, 0.5), 0, -0.5)
+    assert there_and_back[:, 4, 0] == pytest.approx(ramp[:, 4, 0] ** 2)  # parabolas come back, too
+    assert moved(image, 0, 0) is image
+
+
+def test_a_shift_in_the_capture_moves_its_frame_alone(stage: Path) -> None:
+    capture = read_capture(stage)
+    shifted = replace(capture, shifts={(SUBJECT, CAMERA, IDS[1]): (2.0, 0.0)})
+    assert (shifted.frame(SUBJECT, CAMERA, 1)[2:] == capture.frame(SUBJECT, CAMERA, 1)[:-2]).all()
+    assert (shifted.frame(SUBJECT, CAMERA, 0) == capture.frame(SUBJECT, CAMERA, 0)).all()
+
+
+def test_a_still_head_is_left_alone(tmp_path: Path) -> None:
+    assert not align_shifts(read_capture(write_stage(tmp_path / "s")), SUBJECT, CAMERA, set())
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_camera_that_sees_no_lamp_in_front_is_left_alone(tmp_path: Path) -> None:
+    capture = read_capture(write_stage(tmp_path / "s"))
+    behind = replace(capture, directions_world=capture.directions_world * [1, 1, -1])
+    assert not align_shifts(behind, SUBJECT, CAMERA, set(IDS[35:]))
+
+
+def test_a_path_of_thousands_of_frames_costs_no_more_than_hundreds(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, turn = np.random.default_rng(0), np.arange(2000) * 2.399963
+    lamps = np.stack([np.cos(turn), np.sin(turn), np.full(2000, 1.0)], 1) / np.sqrt(2)
+    path = 2 * np.stack([np.sin(np.arange(2000) / 40), np.cos(np.arange(2000) / 50)], 1)
+    sizes, likelihood = [], path_module._log_likelihood
+    monkeypatch.setattr(
+        path_module, "_log_likelihood", lambda *given: sizes.append(len(given[1])) or likelihood(*given)
+    )
+    measured = path + generator.normal(size=path.shape) * 0.2
+    off = np.hypot(*(head_path(measured, np.ones(2000, bool), lamps) - path).T)
+    assert off.mean() < 0.1 and max(sizes) <= 300
+    assert not head_path(measured, np.zeros(2000, bool), lamps).any()
+
+
+def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:
+    """Errors are the same under neighbouring lamps, a path bends slowly in the order of the list."""
+    generator, turn = np.random.default_rng(0), np.arange(120) * 2.399963
+    front = np.linspace(0.95, -0.9, 120)
+    flat = np.sqrt(1 - front**2)
+    lamps = np.stack([flat * np.cos(turn), flat * np.sin(turn), front], 1)
+    shading = 0.5 * lamps[:, :2] + generator.normal(size=(120, 2)) * 0.2
+    path = 2 * np.stack([np.sin(np.arange(120) / 20), np.cos(np.arange(120) / 25)], 1)
+    jumps = np.zeros((120, 2))
+    jumps[::9] = 5 * generator.normal(size=(14, 2))
+    told = lamps[:, 2] > -0.2
+    assert not head_path(shading, told, lamps).any()
+    assert not head_path(shading + jumps, told, lamps).any()
+    listed = np.argsort(lamps[:, 0])  # then errors of shading bend slowly, too
+    assert not head_path(shading[listed], told[listed], lamps[listed]).any()
+    off = np.hypot(*(head_path(shading + path, told, lamps) - path).T)
+    assert off[told].mean() < 0.4 < np.hypot(*path.T).mean() and off[~told][:10].max() < 1.0

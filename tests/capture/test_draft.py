@@ -1,0 +1,208 @@
+"""Drafts of stage.json from folders: what the files tell stands there, the rest is null and said."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.capture import draft as scan
+from facerf_cli.capture.draft import as_text, draft_stage
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.colour import ACESCG
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.images import write_display, write_exr
+
+SUFFIXES = frozenset({".exr", ".png", ".pgm"})
+FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
+
+
+def image(path: Path, height: int = 6, width: int = 8) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write = write_exr if path.suffix == ".exr" else write_display
+    write(path, np.full((height, width, 3), 0.25, np.float32))
+
+
+def stage_at(folder: Path, cameras: int = 2, form: str = "s{}/cam{}/L{}.exr") -> Path:
+    """Pictures of two subjects by some cameras under four lights."""
+    for subject in (1, 2):
+        for camera in range(cameras):
+            for light in (1, 2, 3, 10):
+                image(folder / form.format(subject, camera, light), width=8 + camera)
+    return folder
+
+
+def noted(stage: dict[str, object], words: str) -> bool:
+    notes = stage["draft"]
+    assert isinstance(notes, list)
+    return any(words in note for note in notes)
+
+
+def test_what_files_tell_and_what_they_do_not(tmp_path: Path) -> None:
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    assert [light["id"] for light in stage["lights"]] == ["L1", "L2", "L3", "L10"]
+    assert all(light["direction"] is None for light in stage["lights"])
+    sizes = [(camera["id"], camera["width"], camera["height"]) for camera in stage["cameras"]]
+    assert sizes == [("cam0", 8, 6), ("cam1", 9, 6)] and stage["colour_space"] == "lin_rec709"
+    assert stage["cameras"][1]["K"] == [[36, 0, 4.5], [0, 36, 3], [0, 0, 1]]
+    assert all(camera["world_to_camera"] is None for camera in stage["cameras"])
+    assert noted(stage, "direction of 4 of 4 lights") and noted(stage, "world_to_camera of 2 of 2 cameras")
+    assert (
+        noted(stage, "2 subjects, 2 cameras, 4 lights; all 16 frames are there") and "subjects" not in stage
+    )
+
+
+def test_a_draft_is_refused_until_it_is_filled_in(tmp_path: Path) -> None:
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    (tmp_path / "stage.json").write_text(as_text(stage))
+    with pytest.raises(InputError, match=r"lights\[0\]: direction is null; fill it in \(and 5 more\)"):
+        read_capture(tmp_path)
+    for light in stage["lights"]:
+        light["direction"] = [0, 0, 1]
+    for camera in stage["cameras"]:
+        camera["world_to_camera"] = FACING
+    (tmp_path / "stage.json").write_text(as_text(stage))
+    capture = read_capture(tmp_path)
+    assert list(capture.subjects) == ["s1", "s2"] and capture.frame("s2", "cam1", 3).shape == (6, 9, 3)
+
+
+def test_the_text_is_json_with_a_lamp_a_line(tmp_path: Path) -> None:
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    lines = as_text(stage).splitlines()
+    assert json.loads(as_text(stage)) == stage and sum('"direction"' in line for line in lines) == 4
+
+
+@pytest.mark.parametrize(
+    ("form", "subjects"),
+    [("s{}/L{2}.exr", ["s1", "s2"]), ("anna/L{2}.exr", ["anna"]), ("L{2}.exr", ["folder"])],
+)
+def test_one_camera_is_the_world(tmp_path: Path, form: str, subjects: list[str]) -> None:
+    """Its directions are camera space, and the draft needs nothing but them."""
+    folder = stage_at(tmp_path / "folder", 1, form.replace("{}", "{0}"))
+    (folder / "scene.lp").write_text("4\nL1.jpg 0.6 0 0.8\nL2.jpg 0 1 0\nL3.jpg -1 0 0\nL10.jpg 0 0 2\n")
+    stage = draft_stage(folder, SUFFIXES)
+    assert stage["cameras"][0]["world_to_camera"] == FACING and noted(stage, "directions of scene.lp")
+    assert noted(stage, "1 to 2 long")
+    (folder / "stage.json").write_text(as_text(stage))
+    capture = read_capture(folder)
+    assert list(capture.subjects) == subjects and list(capture.cameras) == ["C0"]
+    in_camera = capture.directions_world @ capture.cameras["C0"].rotation.numpy().T
+    assert in_camera == pytest.approx(np.array([[0.6, 0, 0.8], [0, 1, 0], [-1, 0, 0], [0, 0, 1]]))
+    assert capture.frame(subjects[0], "C0", 1).shape == (6, 8, 3)
+
+
+def test_angles_are_read_from_names(tmp_path: Path) -> None:
+    for name in ("A+030E+00", "A-030E+00", "A+000E+45", "Ambient"):
+        image(tmp_path / f"b01/b01_P00{name}.pgm".replace(".pgm", ".png"))
+        image(tmp_path / f"b02/b02_P00{name}.pgm".replace(".pgm", ".png"))
+    stage = draft_stage(tmp_path, SUFFIXES)
+    directions = {light["id"]: light["direction"] for light in stage["lights"]}
+    assert directions["A+030E+00"] == pytest.approx([0.5, 0, 0.866025], abs=1e-5)
+    assert stage["pattern"] == "{subject}/{subject}_P00{light}.png"
+    assert stage["ambient"] == "{subject}/{subject}_P00Ambient.png" and noted(stage, "azimuth > 0")
+    assert stage["colour_space"] == "sRGB" and not noted(stage, "fill in")
+    (tmp_path / "stage.json").write_text(as_text(stage))
+    capture = read_capture(tmp_path, subtract_ambient=True)
+    assert capture.frame("b02", "C0", 0) == pytest.approx(0)
+
+
+def test_a_list_that_is_of_other_images_is_said(tmp_path: Path) -> None:
+    folder = stage_at(tmp_path)
+    (folder / "lights.txt").write_text("K1 0 0 1\n")
+    assert noted(draft_stage(folder, SUFFIXES), "name none of the 4 lights")
+    (folder / "lights.txt").write_text("K1 0 0\n")
+    stage = draft_stage(folder, SUFFIXES)
+    assert noted(stage, "line 1") and stage["lights"][0]["direction"] is None
+
+
+def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None:
+    folder = stage_at(tmp_path, form="s{}/cam{}/L{}.png")
+    assert draft_stage(folder, SUFFIXES)["colour_space"] == "sRGB"
+    import OpenImageIO as oiio
+
+    for path in folder.glob("s1/cam0/*.png"):
+        spec = oiio.ImageSpec(8, 6, 3, "uint16")
+        stream = oiio.ImageOutput.create(path.name)
+        assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.uint16))
+        stream.close()
+    stage = draft_stage(folder, SUFFIXES)
+    assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
+
+
+def with_primaries(folder: Path, chromaticities: tuple[float, ...]) -> Path:
+    """Linear pictures whose headers have other primaries."""
+    import OpenImageIO as oiio
+
+    for path in stage_at(folder).rglob("*.exr"):
+        spec = oiio.ImageSpec(8, 6, 3, "half")
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), chromaticities)
+        stream = oiio.ImageOutput.create(path.name)
+        assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.float32))
+        stream.close()
+    return folder
+
+
+def test_primaries_are_named_or_said_to_be_unknown(tmp_path: Path) -> None:
+    assert ACESCG.chromaticities is not None
+    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES)
+    assert stage["colour_space"] == "ACEScg" and noted(stage, "ACEScg, by the headers")
+    camera_s = (0.78, 0.31, 0.22, 0.88, 0.09, -0.08, 0.3127, 0.329)
+    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES)
+    assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
+    assert noted(stage, "16 of 16 headers have primaries that no space known here has")
+
+
+def test_what_is_amiss_is_said(tmp_path: Path) -> None:
+    folder = stage_at(tmp_path)
+    (folder / "s2/cam1/L3.exr").unlink()
+    (folder / "s1/cam0/L1.exr").write_bytes(b"torn")
+    image(folder / "s1/cam0/L2.exr", 12, 16)
+    image(folder / "s1/cam0/thumb.exr")
+    image(folder / "s1/cam0/all_on.exr")
+    stage = draft_stage(folder, SUFFIXES)
+    assert noted(stage, "1 of 16 frames are not there") and noted(stage, "1 of 15 pictures looked at cannot")
+    assert noted(stage, "cam0 have several sizes: 8 x 6, 16 x 12")
+    assert noted(stage, "1 picture that do not fit the pattern (s1/cam0/thumb.exr)")
+    assert noted(stage, "1 picture with all lamps on")
+
+
+def test_folders_that_are_no_capture(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no such folder"):
+        draft_stage(tmp_path / "nowhere", SUFFIXES)
+    with pytest.raises(UsageError, match="no pictures found"):
+        draft_stage(tmp_path, SUFFIXES)
+    image(tmp_path / "anna.png")
+    image(tmp_path / "bob.png")
+    with pytest.raises(UsageError, match="2 lights"):
+        draft_stage(tmp_path, SUFFIXES)
+    for number in range(6):
+        image(tmp_path / f"photo{number}.png", 6 + number, 8)
+    with pytest.raises(UsageError, match="sizes among"):
+        draft_stage(tmp_path, SUFFIXES)
+    for path in tmp_path.glob("*.png"):
+        path.write_bytes(b"torn")
+    with pytest.raises(UsageError, match="can be read"):
+        draft_stage(tmp_path, SUFFIXES)
+
+
+def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
+    folder = stage_at(tmp_path / "a", 1)
+    (folder / "loop").symlink_to(folder)
+    (folder / "itself").symlink_to(folder / "itself")
+    (folder / "s3").symlink_to(stage_at(tmp_path / "b", 1) / "s1")
+    for name in ("line\nbreak", "\u202eback", os.fsdecode(b"\xff")):
+        shutil.copytree(folder / "s1", folder / name)
+    os.mkfifo(folder / "lights.txt")
+    os.mkfifo(folder / "s1/cam0/L4.exr")
+    stage = draft_stage(folder, SUFFIXES)
+    assert noted(stage, "3 subjects, 1 camera") and noted(stage, "rename them")
+    assert not noted(stage, "do not fit")  # nothing was found twice
+    assert all(note.isprintable() for note in stage["draft"])
+
+
+def test_the_scan_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scan, "_MOST_ENTRIES", 15)
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    assert noted(stage, "after the first 15 files")

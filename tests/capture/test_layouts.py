@@ -1,0 +1,244 @@
+"""Captures on disk: axes, lamps and values become DESIGN's; whatever is wrong is said in one line."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.colour import matrix_to_rec709, named_space
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.documents import read_document, write_document
+from facerf_cli.files.images import write_exr
+
+K = [[500.0, 0, 33], [0, 500.0, 30], [0, 0, 1]]
+# A camera 2 m before the origin, upright: OpenCV's y is down and its z looks toward the origin (world -z).
+FACING = [[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 2]]
+GOOD: dict[str, Any] = {
+    "format": "facerf-stage-1",
+    "colour_space": "lin_rec709",
+    "black_level": 0.25,
+    "axes": "opencv",
+    "unit": "m",
+    "pattern": "{subject}/{camera}/{light}.exr",
+    "lights": [
+        {"id": "L0", "direction": [0, 0, 1], "intensity": [1, 2, 4]},
+        {"id": "L1", "direction": [0.6, 0, 0.8], "intensity": [1, 1, 1]},
+    ],
+    "cameras": [{"id": "C0", "width": 64, "height": 60, "K": K, "world_to_camera": FACING}],
+}
+
+
+def capture_at(folder: Path, pixels: np.ndarray | None = None, **changes: Any) -> Path:
+    """A capture of one subject, `0000`, with pictures of one colour, and changes to its description."""
+    (folder / "stage.json").write_text(json.dumps(GOOD | changes))
+    place = folder / "0000/C0"
+    place.mkdir(parents=True, exist_ok=True)
+    for light in ("L0", "L1"):
+        write_exr(
+            place / f"{light}.exr", np.full((60, 64, 3), 2.25, np.float32) if pixels is None else pixels
+        )
+    return folder
+
+
+def test_cameras_become_designs(tmp_path: Path) -> None:
+    camera = read_capture(capture_at(tmp_path)).cameras["C0"]
+    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0, 1.0]])
+    expected = [[33, 30], [33 + 25, 30], [33, 30 - 25], [33 + 50, 30]]  # x right, y up, z toward the camera
+    assert np.abs(camera.project(points).numpy() - expected).max() < 1e-5
+    in_camera = points.double() @ camera.rotation.mT + camera.translation_m
+    assert (in_camera[:, 2] < 0).all() and torch.linalg.det(camera.rotation) == pytest.approx(1)
+
+
+def test_a_pose_of_four_rows_is_the_same(tmp_path: Path) -> None:
+    four = [{**GOOD["cameras"][0], "world_to_camera": [*FACING, [0, 0, 0, 1]]}]
+    here = read_capture(capture_at(tmp_path, cameras=four)).cameras["C0"]
+    there = read_capture(capture_at(tmp_path)).cameras["C0"]
+    assert torch.equal(here.rotation, there.rotation) and torch.equal(here.translation_m, there.translation_m)
+
+
+def test_black_level_and_intensity_go(tmp_path: Path) -> None:
+    capture = read_capture(capture_at(tmp_path))
+    assert capture.frame("0000", "C0", 0)[5, 5] == pytest.approx([2, 1, 0.5])
+    assert capture.frame("0000", "C0", 1)[5, 5] == pytest.approx([2, 2, 2])
+
+
+def test_the_named_colour_space_is_believed_over_the_file(tmp_path: Path) -> None:
+    capture = read_capture(capture_at(tmp_path, colour_space="ACEScg", black_level=0))
+    space = named_space("ACEScg")
+    assert space.chromaticities is not None
+    expected = matrix_to_rec709(space.chromaticities) @ np.full(3, 2.25)
+    assert capture.frame("0000", "C0", 1)[0, 0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_nan_is_zero_and_noise_below_black_stays(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    import OpenImageIO as oiio
+
+    pixels = np.full((60, 64, 3), 0.2, np.float32)
+    pixels[3, 4] = np.nan
+    capture = read_capture(capture_at(tmp_path))
+    spec = oiio.ImageSpec(64, 60, 3, "half")
+    stream = oiio.ImageOutput.create("x.exr")
+    path = str(capture.frame_path("0000", "C0", "L1"))
+    assert stream.open(path, spec) and stream.write_image(pixels) and stream.close()
+    frame = capture.frame("0000", "C0", 1)
+    assert np.isfinite(frame).all() and frame[3, 4] == pytest.approx(-0.25)
+    assert frame[0, 0] == pytest.approx(-0.05, abs=1e-3)  # the stack clips it after the crop
+
+
+def light(**changes: Any) -> list[dict[str, Any]]:
+    return [GOOD["lights"][0] | changes, GOOD["lights"][1]]
+
+
+def camera(**changes: Any) -> list[dict[str, Any]]:
+    return [GOOD["cameras"][0] | changes]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"format": "facerf-stage-9"}, "facerf-stage-1"),
+        ({"axes": "opengl"}, "opencv"),
+        ({"unit": "mm"}, "'m'"),
+        ({"colour_space": "mauve"}, "unknown colour space 'mauve'"),
+        ({"black_level": "none"}, "black_level"),
+        ({"lights": []}, "one entry"),
+        ({"lights": {}}, "a list"),
+        ({"lights": light(direction=[0, 0, 2])}, "length 1"),
+        ({"lights": light(direction=[0, 1])}, "finite"),
+        ({"lights": light(intensity=[1, 0, 1])}, "lamp L0"),
+        ({"lights": light(intensity=[1, -1, 1])}, "lamp L0"),
+        ({"lights": light(intensity=[1, 1e-60, 1])}, "lamp L0"),
+        ({"lights": light(id="L1")}, "no other"),
+        ({"lights": light(id="../L0")}, "a name"),
+        ({"lights": light(id=".L0")}, "a name"),
+        ({"cameras": camera(width=10**9)}, "whole number"),
+        ({"cameras": camera(width=60_000, height=60_000)}, "megapixels"),
+        ({"cameras": camera(width=64.0)}, "whole number"),
+        ({"cameras": camera(K=[[1, 0], [0, 1]])}, "3 x 3"),
+        ({"cameras": camera(K=[[500, 3, 32], [0, 500, 30], [0, 0, 1]])}, "fx, 0, cx"),
+        ({"cameras": camera(K=[[500, 0, 32], [0, 600, 30], [0, 0, 1]])}, "square"),
+        ({"cameras": camera(world_to_camera=[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2]])}, "rotation"),
+        ({"cameras": camera(world_to_camera=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 2]])}, "rotation"),
+        ({"cameras": camera(world_to_camera=[*FACING, [0, 0, 1, 1]])}, "last row"),
+        ({"cameras": camera(world_to_camera="eye")}, "3 x 4"),
+        ({"pattern": "../{subject}/{camera}/{light}.exr"}, "below the capture"),
+        ({"pattern": "/{subject}/{camera}/{light}.exr"}, "below the capture"),
+        ({"pattern": "{camera}/{light}.exr"}, "names {subject} and {light}"),
+        ({"pattern": "{subject}/{light}.exr", "cameras": [*camera(), *camera(id="C1")]}, "and {camera} and"),
+        ({"pattern": "{subject}/{camera}.exr"}, "names {subject} and {light}"),
+        ({"ambient": "{subject}/{light}.exr"}, "names {subject}, without"),
+        ({"colour_space": None}, "colour_space is null; fill it in$"),
+        ({"lights": light(direction=None), "cameras": camera(K=[None, 3])}, r"direction is null.*and 1 more"),
+        ({"pattern": "{subject}/{camera}/{light}{gain}.exr"}, "and {light}, without '{' '}' elsewhere, is"),
+        ({"pattern": "{subject}/{camera}/*/{light}.exr"}, "without '\\*' "),
+        ({"pattern": "{subject}/{camera}/\n/{light}.exr"}, r"without '\\n' "),
+        ({"pattern": "{subject.x}/{camera}/{light}{subject}.exr"}, "below the capture"),
+        ({"subjects": ["0000"]}, "an object"),
+        ({"subjects": {"a/b": {}}}, "a name"),
+        ({"subjects": {"..": {}}}, "a name"),
+        ({"subjects": {"0000.json": {}}}, "a name"),  # fits/0000.json is the record of 0000
+        ({"subjects": {"0000": 3}}, "an object"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(tmp_path: Path, change: dict[str, Any], said: str) -> None:
+    with pytest.raises(InputError, match=said) as raised:
+        read_capture(capture_at(tmp_path, **change))
+    assert "stage.json" in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("missing", sorted(GOOD))
+def test_nothing_is_guessed(tmp_path: Path, missing: str) -> None:
+    capture_at(tmp_path)
+    (tmp_path / "stage.json").write_text(json.dumps({k: v for k, v in GOOD.items() if k != missing}))
+    with pytest.raises(InputError, match=f"has no '{missing}'"):
+        read_capture(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        '{"format": NaN}',
+        '{"format": 1e999}',
+        '{"a": ' + "9" * 5000 + "}",
+        '{"subjects": {"0000": {"age": 30}, "0000": {}}}',
+    ],
+)
+def test_broken_json(tmp_path: Path, text: str) -> None:
+    (tmp_path / "stage.json").write_text(text)
+    with pytest.raises(InputError, match="not JSON"):
+        read_capture(tmp_path)
+
+
+def test_a_description_that_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "stage.json")  # reading one would wait for ever
+    with pytest.raises(InputError, match="is no file"):
+        read_capture(tmp_path)
+
+
+def test_a_text_that_is_no_unicode_is_written_as_it_was_read(tmp_path: Path) -> None:
+    content = {"name": "\ud800 \N{LATIN SMALL LETTER E WITH ACUTE}"}
+    write_document(tmp_path / "a.json", content)
+    assert read_document(tmp_path / "a.json", "").table() == content
+
+
+def test_no_capture_and_no_such_layout(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"stage\.json: no such file"):
+        read_capture(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        read_capture(tmp_path / "nowhere")
+    with pytest.raises(UsageError, match="there is extended-yale-b, stage"):
+        read_capture(tmp_path, "multipie")
+
+
+def test_a_frame_that_is_missing_torn_or_of_another_size_is_named(tmp_path: Path) -> None:
+    capture = read_capture(capture_at(tmp_path))
+    path = capture.frame_path("0000", "C0", "L1")
+    write_exr(path, np.zeros((60, 60, 3), np.float32))
+    with pytest.raises(InputError, match=r"L1\.exr: 60 x 60 pixels; camera C0 has 64 x 60"):
+        capture.frame("0000", "C0", 1)
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(InputError, match=r"L1\.exr: .*(read|damaged)"):
+        capture.frame("0000", "C0", 1)
+    path.unlink()
+    with pytest.raises(InputError, match=r"L1\.exr: no such file"):
+        capture.frame("0000", "C0", 1)
+
+
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "{subject}/{camera}/{light}.exr",
+        "all/{subject}-{camera}-{light}.exr",
+        "{camera}/{subject}/{light}.exr",
+    ],
+)
+def test_subjects_are_found_by_their_images(tmp_path: Path, pattern: str) -> None:
+    capture_at(tmp_path, pattern=pattern)
+    for subject in ("anna", "zoe"):
+        path = tmp_path / pattern.format(subject=subject, camera="C0", light="L1")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    (tmp_path / "transport").mkdir()
+    (tmp_path / ".hidden/C0").mkdir(parents=True)
+    (tmp_path / ".hidden/C0/L0.exr").touch()
+    found = set(read_capture(tmp_path).subjects) - {"0000"}
+    assert found == {"anna", "zoe"}
+
+
+def test_what_there_is_one_of_needs_no_place_in_the_pattern(tmp_path: Path) -> None:
+    capture_at(tmp_path, pattern="0000/C0/{light}.exr", subjects={"anna": {"age": None}})
+    capture = read_capture(tmp_path)
+    assert list(capture.subjects) == ["anna"] and capture.frame("anna", "C0", 1)[5, 5] == pytest.approx(
+        [2, 2, 2]
+    )
+
+
+def test_traits_are_kept(tmp_path: Path) -> None:
+    capture = read_capture(capture_at(tmp_path, subjects={"0001": {"melanin": 0.3}, "0000": {}}))
+    assert list(capture.subjects) == ["0000", "0001"] and capture.subjects["0001"] == {"melanin": 0.3}

@@ -1,0 +1,51 @@
+"""The table of findings: errors first, alike ones put together, nothing where there is nothing."""
+
+import io
+
+from rich.console import Console
+
+from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.cli.items.prepare_dataset import show_findings, summary
+
+STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
+WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
+UNLIT = [
+    Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{k:03d}", {}, True)
+    for k in range(9)
+]
+
+
+def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    show_findings([finding.row() for finding in findings], strict, console)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_no_findings_print_nothing() -> None:
+    assert shown([]) == ""
+
+
+def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
+    text = shown([WARNS, *UNLIT, STOPS])
+    assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
+    assert text.index("0000/C0/L002") < text.index("the head moves")
+    assert "are mirrored [left] to right" in text  # brackets are no markup
+
+
+def test_a_log_file_is_no_narrow_terminal() -> None:
+    assert "the lights are mirrored [left] to right" in shown([STOPS], width=60)
+
+
+def test_strict_stops_subjects_whatever_it_is() -> None:
+    assert "warning" not in shown([WARNS, *UNLIT, STOPS], strict=True)
+    assert "left out" not in shown(UNLIT, strict=True)
+
+
+def test_many_alike_are_counted() -> None:
+    text = shown(UNLIT)
+    assert "0000/C0/L002" in text and "L003" not in text and "(and 6 more like it)" in text
+
+
+def test_the_summary_counts_what_follows() -> None:
+    rows = [finding.row() for finding in [WARNS, *UNLIT, STOPS]]
+    assert summary(rows) == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"

@@ -1,0 +1,244 @@
+"""The contract of every verb that walks folders (DESIGN), with a verb that only copies bytes."""
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli.batch import PHOTO_SUFFIXES, BatchOptions, Item, Outcome, collect_items, run_batch
+from facerf_cli.cli.options import Settings
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.logs import configure_logging
+
+
+def outputs_of(item: Item) -> list[Path]:
+    return [item.output("_copy.bin")]
+
+
+def copy(item: Item) -> Outcome:
+    data = item.input_path.read_bytes()
+    if data == b"bad":
+        raise InputError(f"{item.input_path}: is bad;\n try another")
+    if data == b"bug":
+        raise RuntimeError("a bug")
+    if data == b"stop":
+        raise FacerfError("the checkpoint is broken")
+    if data == b"die":
+        os._exit(9)
+    (path,) = outputs_of(item)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+    return Outcome([path], {"bytes": len(data), "ratio": float("nan")})
+
+
+def run(inputs: list[Path | str], output: Path, **options: object) -> int:
+    configure_logging()
+    texts = [str(entry) for entry in inputs]
+    return run_batch("copy", texts, copy, outputs_of, BatchOptions(output, **options), Settings())  # type: ignore[arg-type]
+
+
+def rows(output: Path) -> dict[str, dict]:
+    return {row["item"]: row for row in map(json.loads, (output / "report.jsonl").read_text().splitlines())}
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    for name in ("b.jpg", "a.png", "x/a.jpg", "x/a.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return folder
+
+
+def test_folder_is_mirrored_and_no_two_items_share_an_output(photos: Path, tmp_path: Path) -> None:
+    items = collect_items([str(photos)], tmp_path / "out", PHOTO_SUFFIXES)
+    assert [item.name for item in items] == ["Z", "a", "b", "x/a.jpg", "x/a.png"]
+    assert len({item.output("_copy.bin") for item in items}) == len(items)
+
+
+def test_same_stem_in_different_folders_and_a_file_given_twice(photos: Path, tmp_path: Path) -> None:
+    inputs = [str(photos / "a.png"), str(photos / "x" / "a.png"), str(photos / "a.png"), str(photos / "x")]
+    names = [item.name for item in collect_items(inputs, tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["a", "x/a.jpg", "x/a.png"]
+
+
+def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
+    photo = tmp_path / os.fsdecode(b"a\xff.png")
+    photo.write_bytes(b"bad")
+    assert run([photo], tmp_path / "out") == 1
+    assert rows(tmp_path / "out")["a\udcff"]["status"] == "failed"
+
+
+def test_a_single_file_has_no_folders_in_its_output(photos: Path, tmp_path: Path) -> None:
+    (item,) = collect_items([str(photos / "x" / "a.png")], tmp_path / "out", PHOTO_SUFFIXES)
+    assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"
+
+
+def test_names_that_look_like_a_clash_resolved_elsewhere(tmp_path: Path) -> None:
+    for name in ("a.jpg", "a.png", "a.jpg.png", "A.tif"):
+        (tmp_path / name).touch()
+    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert len({name.casefold() for name in names}) == 4
+
+
+def test_outputs_inside_the_input_folder_are_not_inputs(photos: Path) -> None:
+    (photos / "out").mkdir()
+    (photos / "out" / "b_relit.png").touch()
+    names = [item.name for item in collect_items([str(photos)], photos / "out", PHOTO_SUFFIXES)]
+    assert not [name for name in names if name.startswith("out")]
+    with pytest.raises(UsageError, match="output folder"):
+        collect_items([str(photos)], photos, PHOTO_SUFFIXES)
+
+
+def test_the_contact_sheet_beside_a_stack_is_no_input(tmp_path: Path) -> None:
+    for name in ("a_olat.exr", "a_olat.png", "b_olat.png"):
+        (tmp_path / name).touch()
+    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["a_olat", "b_olat"]
+
+
+def test_a_list_on_stdin(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
+    names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["b", "x/a.jpg", "x/a.png"]
+
+
+def test_nothing_to_work_on(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no inputs found"):
+        run([tmp_path], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_bad_item_does_not_harm_the_others(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, jobs: int
+) -> None:
+    (photos / "b.jpg").write_bytes(b"bad")
+    (photos / "Z.EXR").write_bytes(b"bug")
+    out = tmp_path / "out"
+    assert run([photos, photos / "gone.jpg"], out, jobs=jobs) == 1
+    streams = capsys.readouterr()
+    assert [Path(line).name for line in streams.out.splitlines()] == [
+        "a_copy.bin",
+        "a.jpg_copy.bin",
+        "a.png_copy.bin",
+    ]
+    assert f"facerf: error: {photos / 'b.jpg'}: is bad; try another\n" in streams.err
+    assert "gone.jpg: no such file" in streams.err and "unexpected RuntimeError: a bug" in streams.err
+    assert "Traceback" not in streams.err
+    report = rows(out)
+    assert {name: row["status"] for name, row in report.items()} == {
+        "Z": "failed", "a": "done", "b": "failed", "gone": "failed", "x/a.jpg": "done", "x/a.png": "done",
+    }  # fmt: skip
+    assert report["a"]["bytes"] == 5 and report["a"]["ratio"] is None and report["a"]["error"] is None
+    assert (out / report["x/a.png"]["outputs"][0]).read_bytes() == b"x/a.png"
+
+
+def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (photos / "b.jpg").write_bytes(b"bad")
+    assert run([photos], out) == 1
+    before = rows(out)
+    (out / "a_copy.bin").write_bytes(b"mine")
+    (photos / "b.jpg").write_bytes(b"good")
+    assert run([photos], out) == 0
+    assert (out / "a_copy.bin").read_bytes() == b"mine"
+    assert rows(out)["x/a.png"] == before["x/a.png"] and rows(out)["b"]["status"] == "done"
+    assert len((out / "report.jsonl").read_text().splitlines()) == 5  # the older row of b is gone
+    (out / "report.jsonl").unlink()
+    assert run([photos], out) == 0
+    assert [row["status"] for row in rows(out).values()] == ["skipped"] * 5
+    assert run([photos], out, overwrite=True) == 0
+    assert (out / "a_copy.bin").read_bytes() == b"a.png"
+
+
+def test_dry_run_writes_nothing(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert run([photos / "b.jpg"], tmp_path / "out", dry_run=True) == 0
+    assert capsys.readouterr().out == f"{photos / 'b.jpg'} -> {tmp_path / 'out' / 'b_copy.bin'}\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, jobs: int) -> None:
+    (photos / "Z.EXR").write_bytes(b"stop")
+    with pytest.raises(FacerfError, match="checkpoint"):
+        run([photos], tmp_path / "out", jobs=jobs)
+
+
+def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (photos / "Z.EXR").write_bytes(b"die")
+    assert run([photos], tmp_path / "out", jobs=2) == 1
+    assert "Z.EXR: its process died" in capsys.readouterr().err
+
+
+def test_an_output_folder_that_cannot_be(photos: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "out"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot write .*; give another"):
+            run([photos], folder)
+
+
+def test_half_a_line_in_an_old_report_is_passed_over(photos: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run([photos], out)
+    with (out / "report.jsonl").open("a") as stream:
+        stream.write('{"verb": "copy", "it')
+    assert run([photos], out) == 0
+    assert len(rows(out)) == 5
+
+
+def test_other_verbs_rows_stay(photos: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "report.jsonl").write_text('{"verb": "other", "item": "elsewhere"}\n')
+    run([photos], out)
+    assert "elsewhere" in rows(out)
+
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+SLOW_VERB = """
+import sys, time
+from pathlib import Path
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.options import Settings
+from facerf_cli.files.atomic import atomic_path
+
+def outputs_of(item):
+    return [item.output(".bin")]
+
+def slow(item):
+    with atomic_path(outputs_of(item)[0]) as temporary:
+        temporary.write_bytes(b"half")
+        Path(sys.argv[2], "started").touch()
+        time.sleep(60)
+        temporary.write_bytes(b"whole")
+    return Outcome(outputs_of(item))
+
+if __name__ == "__main__":
+    options = BatchOptions(Path(sys.argv[2]), jobs=int(sys.argv[3]))
+    run_batch("slow", [sys.argv[1]], slow, outputs_of, options, Settings())
+"""
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path, jobs: int) -> None:
+    (tmp_path / "slow_verb.py").write_text(SLOW_VERB)
+    out = tmp_path / "out"
+    command = [sys.executable, str(tmp_path / "slow_verb.py"), str(photos), str(out), str(jobs)]
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, env=ENVIRONMENT)
+    deadline_s = time.monotonic() + 60
+    while not (out / "started").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
+    process.wait(timeout=30)
+    assert process.returncode != 0
+    left = sorted(path.name for path in out.rglob("*") if path.is_file())
+    assert left == ["report.jsonl", "started"]

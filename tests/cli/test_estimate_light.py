@@ -1,0 +1,137 @@
+"""`facerf estimate-light` and `relight --light-from`, with a network that is Lambert's law."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.light_files import read_light
+from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.sh import rig_coefficients
+from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.main import main
+from tests.cli.test_relight import PHOTO, given
+
+__all__ = ["given"]  # the fixture
+
+
+def estimate(given: Path, output: Path, *line: str, photo: Path = PHOTO, lights: str = "12") -> int:
+    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "estimate-light", str(photo)]
+    more = ["-o", str(output), "--lights", lights, "--landmarks", str(given / "astronaut.json")]
+    return main([*fixed, *more, "--width", "64", *line])
+
+
+@pytest.fixture(scope="module")
+def estimated(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the default estimate writes."""
+    folder = tmp_path_factory.mktemp("estimated")
+    assert estimate(given, folder, "--sh-order", "3") == 0
+    return folder
+
+
+def row_of(output: Path) -> dict:
+    return json.loads((output / "report.jsonl").read_text().splitlines()[-1])
+
+
+def test_a_light_is_a_map_numbers_and_a_image(
+    given: Path, estimated: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    light = read_light(estimated / "astronaut_light.json")
+    assert torch.allclose(light.directions, rig_directions(12), atol=1e-6) and (light.weights >= 0).all()
+    harmonics = rig_coefficients(RigLight(light.directions, light.weights), 3)
+    assert light.sh is not None and torch.allclose(light.sh.coefficients, harmonics, atol=1e-5)
+    envmap = read_image(estimated / "astronaut_light.exr").pixels
+    assert envmap.shape == (32, 64, 3)
+    taken_back = envmap_weights(torch.from_numpy(envmap), light.directions)
+    assert (taken_back - light.weights).abs().max() < 0.02 * light.weights.max()
+    assert read_image(estimated / "astronaut_light.png").pixels.shape[1] == 5 * 256
+    row = row_of(estimated)
+    assert row["quality"] == "good" and 0 < row["residual"] < 0.6 and row["features"] is None
+    assert row["lights"] == 12 and 0 <= row["clipped"] < 0.05 and len(row["brightest_azel_deg"]) == 2
+    assert light.attributes["facerf:checkpoint"] == "lambert"
+    assert estimate(given, estimated) == 0
+    assert row_of(estimated)["status"] == "done" and not capsys.readouterr().out  # finished already
+
+
+def test_the_plain_form_fits_better_and_is_signed(given: Path, estimated: Path, tmp_path: Path) -> None:
+    assert estimate(given, tmp_path, "--signed") == 0
+    plain = row_of(tmp_path)
+    assert plain["residual"] < row_of(estimated)["residual"] and not plain["non_negative"]
+    assert (read_light(tmp_path / "astronaut_light.json").weights < 0).any()
+
+
+def test_refinement_says_by_which_features_and_lowers_their_loss(given: Path, tmp_path: Path) -> None:
+    assert estimate(given, tmp_path, "--refine", "features", "--sh-order", "0") == 0
+    row = row_of(tmp_path)
+    assert row["features"] == "S_f (shipped)" and row["feature_loss"][1] < row["feature_loss"][0]
+    assert (
+        read_light(tmp_path / "astronaut_light.json").attributes["facerf:light_features"] == "S_f (shipped)"
+    )
+
+
+@pytest.mark.parametrize(
+    "line, word",
+    [
+        (["--vgg-weights", "imagenet"], "--refine features"),
+        (["--reflectance", "prt", "--signed"], "--reflectance prt"),
+        (["--lights", "2000"], "1024"),
+        (["--width", "101"], "even"),
+        (["--matte", "nowhere.png"], "no such file"),
+    ],
+)
+def test_what_does_not_go_together_is_said(
+    given: Path, tmp_path: Path, line: list[str], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert estimate(given, tmp_path, *line) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert word in said
+
+
+def test_a_face_that_is_not_to_be_seen_is_one_line(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = read_image(PHOTO).pixels
+    black, cut, matte, half = (tmp_path / f"{name}.png" for name in ("black", "cut", "matte", "half"))
+    nothing = np.zeros(photo.shape[:2], np.float32)
+    write_display(black, np.zeros_like(photo))
+    write_display(cut, photo, alpha=nothing)
+    for path, word in ((black, "black"), (cut, "masked out")):
+        assert estimate(given, tmp_path / "out", photo=path) == 1
+        (said,) = capsys.readouterr().err.splitlines()
+        assert word in said and str(path) in said
+    write_display(matte, np.zeros_like(photo))
+    assert estimate(given, tmp_path / "out", "--matte", str(matte)) == 1
+    assert "masked out" in capsys.readouterr().err
+    sliver = photo.copy() * 0
+    sliver[:, 210:214] = 1
+    write_display(half, sliver)
+    assert estimate(given, tmp_path / "out", "--matte", str(half)) == 1
+    assert "too little of the face" in capsys.readouterr().err
+    write_display(matte, np.ones((8, 9, 3), np.float32))
+    assert estimate(given, tmp_path / "out", "--matte", str(matte)) == 1
+    assert "9 x 8" in capsys.readouterr().err
+
+
+def test_the_light_of_another_photo_is_that_of_the_two_commands(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other, places = tmp_path / "other.png", tmp_path / "places"
+    write_display(other, read_image(PHOTO).pixels * np.float32([1.0, 0.8, 0.5]))
+    places.mkdir()
+    for name in ("astronaut", "other"):
+        (places / f"{name}.json").write_text((given / "astronaut.json").read_text())
+    models, landmarks = ["--checkpoint", str(given / "lambert.safetensors")], ["--landmarks", str(places)]
+    relit = [*models, "relight", str(PHOTO), *landmarks, "--lights", "12", "--rotate", "90", "-o"]
+    assert main([*relit, str(tmp_path / "one"), "--light-from", str(other), "--ball"]) == 0
+    assert main([*models, "estimate-light", str(other), *landmarks, "-o", str(tmp_path)]) == 0
+    assert main([*relit, str(tmp_path / "two"), "--envmap", str(tmp_path / "other_light.exr"), "--ball"]) == 0
+    for name in ("astronaut_other_light_rot90.exr", "balls/other_light_rot90.exr"):
+        estimated = read_image(tmp_path / "one" / name)
+        assert estimated.metadata["facerf:face_model"] == "builtin"  # the balls' light, too, comes by it
+        one, two = estimated.pixels, read_image(tmp_path / "two" / name).pixels
+        assert one.max() > 0 and (one == two).all()
+    assert main([*relit, str(tmp_path / "no"), "--light-from", str(tmp_path / "none.jpg")]) == 1
+    assert "none.jpg: no such file" in capsys.readouterr().err

@@ -1,0 +1,148 @@
+"""`facerf evaluate pairs` from the command line, and the options that protocols share."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from facerf_cli.cli.evaluate import PROTOCOLS
+from facerf_cli.cli.evaluation_options import EvaluateOptions, with_shared_options
+from facerf_cli.errors import UsageError
+from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.main import main
+from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
+
+Said = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> Path:
+    """truth/PERSON/NUMBER.exr, good/, and bad/ as PNG; masks/."""
+    for person in PEOPLE:
+        for number in range(2):
+            own = comparison(person, number)
+            good, bad = (np.clip(own.predictions[name], 0, 1) for name in NOISE)
+            write_exr(tmp_path / f"truth/{person}/{number}.exr", own.truth)
+            write_exr(tmp_path / f"good/{person}/{number}.exr", good)
+            write_display(tmp_path / f"bad/{person}/{number}.png", bad)
+            mask = np.repeat(own.mask[..., None], 3, 2)
+            write_exr(tmp_path / f"masks/{person}/{number}.exr", mask)
+    return tmp_path
+
+
+def pairs(folders: Path, *more: str) -> int:
+    names = [str(folders / name) for name in ("good", "bad")]
+    line = ["--truth", str(folders / "truth"), "--masks", str(folders / "masks"), "-o", str(folders / "out")]
+    return main(["evaluate", "pairs", *names, *line, *more])
+
+
+def test_folders_are_measured(folders: Path, capsys: Said) -> None:
+    facts = folders / "facts.csv"
+    rows = [f"{person}/{n},{person},{tone}" for person in PEOPLE for n, tone in enumerate(("light", "dark"))]
+    facts.write_text("\n".join(["name,person,tone", *rows]) + "\n")
+    assert pairs(folders, "--facts", str(facts)) == 0
+    assert "tone: dark" in capsys.readouterr().out
+    summary = json.loads((folders / "out/summary.json").read_text())
+    assert summary["methods"] == ["good", "bad"] and (summary["pictures"], summary["persons"]) == (6, 3)
+    first = summary["groups"][0]["metrics"]
+    assert first["si_mse"]["good"]["mean"] < first["si_mse"]["bad"]["mean"]
+    assert first["ssim"]["bad"]["less_the_first"]["won"] == 0
+    assert not any(name.startswith("checkpoint") for name in summary)  # no network had a part in it
+
+
+def test_what_is_missing_or_of_another_size_makes_no_table(folders: Path, capsys: Said) -> None:
+    (folders / "bad/bea/1.png").rename(folders / "bad/bea/2.png")
+    assert pairs(folders) == 1
+    said = capsys.readouterr()
+    assert "1 of 6 missing (bea/1)" in said.err and "1 without a truth (bea/2)" in said.err
+    assert len(said.err.splitlines()) == 1 and not (folders / "out").exists()
+    (folders / "bad/bea/2.png").rename(folders / "bad/bea/1.png")
+    write_exr(folders / "good/anna/0.exr", np.zeros((4, 5, 3), np.float32))
+    assert pairs(folders) == 1
+    assert "anna/0 is 5 x 4, its truth 48 x 36" in capsys.readouterr().err
+
+
+def test_a_folder_may_be_given_from_inside(
+    folders: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folders / "good")
+    line = ["evaluate", "pairs", ".", "../bad", "--truth", "../truth", "-o", "../out"]
+    assert main(line) == 0
+    summary = json.loads((folders / "out/summary.json").read_text())
+    assert summary["methods"] == ["good", "bad"] and summary["title"].endswith("truth")
+    assert "finished" not in capsys.readouterr().err
+    monkeypatch.chdir(folders)  # the same run by another way
+    absolute = [str(folders / name) for name in ("good", "bad", "truth", "out")]
+    assert main(["evaluate", "pairs", *absolute[:2], "--truth", absolute[2], "-o", absolute[3]]) == 0
+    assert "6 of 6 already finished" in capsys.readouterr().err
+
+
+def test_a_link_is_a_method_of_its_own_name(folders: Path) -> None:
+    (folders / "link").symlink_to("good")
+    truth, out = str(folders / "truth"), str(folders / "out")
+    line = ["evaluate", "pairs", str(folders / "link"), "--truth", truth, "-o", out]
+    assert main(line) == 0
+    assert json.loads((folders / "out/summary.json").read_text())["methods"] == ["link"]
+    (folders / "link").unlink()
+    (folders / "link").symlink_to("bad")  # as PNG: other files, which are not the ones that were measured
+    assert main(line) == 2
+
+
+def test_bad_lines(folders: Path, capsys: Said) -> None:
+    good, truth, out = (str(folders / name) for name in ("good", "truth", "out"))
+    for line, words in (
+        (["pairs", good, "-o", out], "--truth"),
+        (["pairs", str(folders / "none"), "--truth", truth, "-o", out], "no such folder"),
+        (["pairs", good, "--truth", truth, "-o", truth], "give another one"),
+        (["pairs", good, "--truth", truth, "-o", f"{truth}/here"], "lies in it"),
+        (["pairs", good, "--truth", truth, "-o", f"{good}/here"], "lies in it"),
+        (["olat", "x", "-o", f"{good}/here", "--compare", good], "lies in it"),
+        (["pairs", good, "--truth", truth, "-o", out, "--lpips", "y"], "--vgg-weights"),
+        (["pairs", good, "--truth", truth, "-o", out, "--preset", "paper"], "--preset"),
+        (["olat", "x", "-o", out, "--reflectance", "phong"], "give field, diffuse-sh"),
+    ):
+        assert main(["evaluate", *line]) == 2
+        said = capsys.readouterr().err
+        assert words in said and len(said.splitlines()) == 1, said
+
+
+@pytest.mark.parametrize(("function", "left_out"), PROTOCOLS, ids=lambda x: getattr(x, "__name__", ""))
+def test_every_protocol_has_help_and_the_shared_options(
+    function: Callable[..., int], left_out: tuple[str, ...], capsys: Said
+) -> None:
+    name = function.__name__.replace("_", "-")
+    assert main(["evaluate", name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "--output" in out and "--space" in out and "{options}" not in out
+    assert ("--reflectance" in out) == ("reflectance" not in left_out)
+
+
+def test_shared_options_reach_the_protocol() -> None:
+    got: list[EvaluateOptions] = []
+
+    def toy(first: str, options: EvaluateOptions, second: int = 2) -> int:
+        """Toy."""
+        got.append(options)
+        return second
+
+    app = typer.Typer()
+    app.command()(with_shared_options(toy, ("preset",)))
+    line = [
+        "x",
+        "-o",
+        "out",
+        "--reflectance",
+        "prt",
+        "--reflectance",
+        "field",
+        "--keep-eyes",
+        "--second",
+        "3",
+    ]
+    assert app(line, standalone_mode=False) == 3
+    assert got == [EvaluateOptions(Path("out"), ("prt", "field"), keep_eyes=True)]
+    with pytest.raises(UsageError, match="no such file"):
+        app(["x", "-o", "out", "--against", "none.safetensors"], standalone_mode=False)

@@ -1,0 +1,203 @@
+"""`facerf evaluate olat`, `reconstruction`, `transfer` and `geometry` on a tiny dataset and a photo."""
+
+import csv
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from facerf_cli.cli import evaluate_geometry, evaluate_reconstruction, evaluate_transfer
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.evaluation_items import MethodOptions, portraits
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.photo_options import PhotoOptions, face_model, load_models_once
+from facerf_cli.dataset.dataset import read_dataset
+from facerf_cli.dataset.pairs import read_pairs
+from facerf_cli.files.images import write_exr
+from facerf_cli.main import main
+from tests.dataset.dataset_fixture import write_small_dataset
+from tests.evaluation.method_doubles import Double
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    write_small_dataset(folder, counts=(1, 0, 2), lights=12, crop_px=64)
+    assert main(["relight-dataset", str(folder), "--envmaps", "procedural:3", "--per-subject", "6"]) == 0
+    return folder
+
+
+@pytest.fixture
+def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reconstructions by the photo's own texture, which no network delays."""
+
+    def load(options: MethodOptions) -> list[Double]:
+        return [Double("field", models=load_models_once(options.photo))]
+
+    for module in (evaluate_reconstruction, evaluate_transfer, evaluate_geometry):
+        monkeypatch.setattr(module, "load_methods", load)
+
+
+def run(protocol: str, *words: str | Path) -> int:
+    return main(["--device", "cpu", "evaluate", protocol, *map(str, words)])
+
+
+def refused(capsys: pytest.CaptureFixture[str], protocol: str, *words: str | Path) -> str:
+    capsys.readouterr()
+    assert run(protocol, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+def images(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "images.csv").read_text().splitlines()))
+
+
+def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone") == 0
+    assert "lambert" in capsys.readouterr().out
+    found = json.loads((out / "summary.json").read_text())
+    assert (found["pictures"], found["persons"], found["methods"]) == (3, 2, ["field", "lambert"])
+    held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::4]
+    assert {row["case"] for row in images(out)} == {f"{p.subject}/{p.index:05d}" for p in held_out}
+    assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
+    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone") == 0
+    assert "already finished" in capsys.readouterr().err
+
+
+def test_a_checkpoint_that_is_none_is_said_once(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in (["olat", folder, "--against"], ["geometry", folder, "--mean-checkpoint"]):
+        capsys.readouterr()
+        assert run(*map(str, words), PHOTO, "-o", tmp_path / "out") == 1
+        assert len([x for x in capsys.readouterr().err.splitlines() if "astronaut.jpg" in x]) == 1
+
+
+def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = "-o", tmp_path / "out"
+    line = refused(capsys, "olat", folder, *out, "--preset", "paper")
+    assert "3 maps" in line and "160" in line and "relight-dataset" in line and "--per-subject" in line
+    assert "12 sources" in refused(capsys, "reconstruction", folder, *out, "--preset", "paper")
+    assert "pictures in couples" in refused(capsys, "transfer", folder, *out, "--preset", "paper")
+    assert "exclude" in refused(capsys, "olat", folder, *out, "--preset", "paper", "--every", "2")
+    assert "validation" in refused(capsys, "olat", folder, *out, "--split", "validation")
+    assert "one dataset alone" in refused(capsys, "geometry", folder, PHOTO, *out)
+    assert "--photos" in refused(capsys, "transfer", PHOTO, *out)
+    assert "two of each person" in refused(capsys, "transfer", "--photos", PHOTO, *out)
+    assert "1 photos" in refused(capsys, "reconstruction", PHOTO, *out, "--preset", "paper")
+    assert "--mean-checkpoint" in refused(capsys, "geometry", PHOTO, *out, "--against", PHOTO)
+    assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def test_options_that_would_do_nothing_are_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = "-o", tmp_path / "out"
+    for words in (["--every", "1"], ["--split", "all"], ["--refit"]):
+        line = refused(capsys, "reconstruction", PHOTO, *out, *words)
+        assert words[0] in line and "prepared dataset" in line
+    assert "--every" in refused(capsys, "geometry", PHOTO, *out, "--every", "2")
+    assert "--refit" in refused(capsys, "transfer", "--photos", PHOTO, PHOTO, *out, "--refit")
+    assert "is for photos" in refused(capsys, "reconstruction", folder, *out, "--face", "all")
+    assert "--landmarks" in refused(capsys, "transfer", folder, *out, "--landmarks", tmp_path)
+    alone = "--reflectance", "prt"
+    assert "is for the field" in refused(capsys, "olat", folder, *out, *alone, "--network-alone")
+    assert "is for the field" in refused(capsys, "transfer", folder, *out, *alone, "--held-to-photo")
+    assert "is for the field" in refused(capsys, "geometry", PHOTO, *out, *alone, "--mean-checkpoint", "x")
+
+
+def test_couples_are_of_two_photos_and_given_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = "-o", tmp_path / "out"
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(PHOTO, tmp_path / name)
+    (tmp_path / "link.jpg").symlink_to("a.jpg")
+    a, b, link = (tmp_path / name for name in ("a.jpg", "b.jpg", "link.jpg"))
+    for couple in ((a, a), (a, link), (a, tmp_path / "../" / tmp_path.name / "a.jpg")):
+        assert "given twice" in refused(capsys, "transfer", "--photos", *couple, *out)
+    assert "a couple twice" in refused(capsys, "transfer", "--photos", a, b, b, a, *out)
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr("sys.stdin", io.StringIO(f"{a}\n{b}\n"))
+    assert run("transfer", "--photos", "-", *out, "--dry-run") == 0
+    assert "a--b" in capsys.readouterr().out
+
+
+def test_what_a_photos_alpha_leaves_out_is_not_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = np.asarray(Image.open(PHOTO).convert("RGB"))
+    shown = np.zeros(photo.shape[:2], np.uint8)
+    shown[:, 220:] = 255  # beside the nose
+    path = tmp_path / "half.png"
+    Image.fromarray(np.dstack([photo, shown])).save(path)
+    options = PhotoOptions(Settings(device="cpu"))
+    (_, whole), (_, half) = (next(portraits(Item(x, x, x.stem), options, False)) for x in (PHOTO, path))
+    crop = half.view.fit.crop
+    column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
+    left, right = column < 215, column > 225
+    assert whole.view.mask[:, left].max() == 1 and half.view.mask[:, left].max() == 0
+    np.testing.assert_allclose(half.view.mask[:, right], whole.view.mask[:, right], atol=0.01)
+    assert half.face.visible.sum() < 0.8 * whole.face.visible.sum()
+    assert half.fitted_with(face_model(options)).view.mask[:, left].max() == 0
+    Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
+    assert run("reconstruction", path, "-o", tmp_path / "out") == 1
+    assert f"{path}: " in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("doubles")
+def test_photos_are_reconstructed_in_their_crops(tmp_path: Path) -> None:
+    for protocol, methods in (("reconstruction", {"field"}), ("geometry", {"all components", "mean face"})):
+        out = tmp_path / protocol
+        assert run(protocol, PHOTO, "-o", out) == 0
+        rows = images(out)
+        assert {row["method"] for row in rows} == methods
+        assert all(float(row["si_mse"]) < 1e-3 and float(row["face_distance"]) < 0.2 for row in rows)
+    assert len({row["si_mse"] for row in rows}) == 2  # the mean face is another geometry
+
+
+@pytest.mark.usefixtures("doubles")
+def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) -> None:
+    person = tmp_path / "ann"
+    person.mkdir()
+    for name in ("a.jpg", "b.jpg"):
+        shutil.copy(PHOTO, person / name)
+    assert run("transfer", "--photos", person, "-o", tmp_path / "out") == 0
+    rows = images(tmp_path / "out")
+    assert [row["case"] for row in rows] == ["a_by_b", "b_by_a"]
+    assert {row["person"] for row in rows} == {"ann"}
+    shutil.copy(PHOTO, person / "c.jpg")
+    assert run("transfer", "--photos", person, "-o", tmp_path / "odd") == 2
+    (person / "b.jpg").unlink()
+    (person / "c.jpg").unlink()
+    assert run("transfer", "--photos", person, "-o", tmp_path / "alone") == 2
+
+
+@pytest.mark.usefixtures("doubles")
+def test_people_of_a_dataset_by_every_protocol(folder: Path, tmp_path: Path) -> None:
+    assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6") == 0
+    assert all(float(row["light_error_deg"]) <= 180 for row in images(tmp_path / "r"))
+    assert run("transfer", folder, "-o", tmp_path / "t", "--every", "9") == 0
+    assert {row["person"] for row in images(tmp_path / "t")} <= {"0001", "0002"}
+    assert run("geometry", folder, "-o", tmp_path / "g", "--every", "12", "--jobs", "1") == 0
+    assert len(images(tmp_path / "g")) == 2
+
+
+@pytest.mark.usefixtures("doubles")
+def test_a_photo_without_a_face_fails_and_no_summary_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_exr(tmp_path / "black.exr", np.zeros((80, 60, 3), np.float32))
+    assert run("reconstruction", tmp_path / "black.exr", "-o", tmp_path / "out") == 1
+    assert "black.exr: no face" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "summary.json").exists()

@@ -1,0 +1,123 @@
+"""The verb: people of Extended Yale B measured from the command line, and bad input in words."""
+
+import csv
+import json
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facerf_cli.capture.yale_b import Flash, read_yale_b
+from facerf_cli.cli import evaluate_yale_b
+from facerf_cli.cli.evaluation_items import MethodOptions
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.evaluation.protocols import yale_b
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.main import main
+from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
+from tests.evaluation.toy_sitters import Lambert, Networks, someone
+
+Said = pytest.CaptureFixture[str]
+FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write_yale_b(tmp_path / "yale", flashes=FEW)
+
+
+@pytest.fixture
+def toys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A face in every picture, and methods without networks."""
+    models: Any = Networks(load_face_model("builtin"))
+    monkeypatch.setattr(evaluate_yale_b, "load_methods", lambda _: (Lambert("field", models),))
+    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+
+
+@pytest.mark.usefixtures("toys")
+def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> None:
+    out = tmp_path / "out"
+    assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--pictures"]) == 0
+    said = capsys.readouterr().out
+    assert "of 2 people" in said and "published, Yale B" in said and "without --shifts" in said
+    with (out / "images.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    # yaleB05 lacks one flash, which is known to be damaged: from the front, and from four soft lights
+    assert len(rows) == (2 + 12 + 8) + (1 + 8 + 8)
+    assert {row["person"]: row["subjects"] for row in rows} == {"yaleB05": "settings", "yaleB07": "test"}
+    summary = json.loads((out / "summary.json").read_text())
+    counts = {
+        (group["fact"], group["value"]): group["metrics"]["si_mse"]["field"]["pictures"]
+        for group in summary["groups"][1:]
+    }
+    assert counts["column", "frontal"] == 3 and counts["column", "environment"] == 16
+    assert sum(count for (fact, _), count in counts.items() if fact == "angle") == 3
+    for kind in ("source", "truth", "mask", "field"):
+        assert (out / "pictures" / kind / "yaleB07" / "overhead" / "A+035E+40.exr").is_file()
+
+
+@pytest.mark.usefixtures("toys")
+def test_a_missing_prediction_of_another_method(folder: Path, tmp_path: Path, capsys: Said) -> None:
+    others, out = tmp_path / "others", tmp_path / "out"
+    line = ["evaluate", "yale-b", str(folder), "-o", str(out), "--compare", str(others)]
+    path = others / "yaleB07" / "frontal" / "A-025E+00.npy"
+    path.parent.mkdir(parents=True)
+    np.save(path, np.full((192, 168), 0.5, np.float32))
+    assert main([*line, "--subjects", "yaleB07"]) == 1
+    said = capsys.readouterr()
+    assert "no prediction for case yaleB07/frontal/A+035E+40" in said.err
+    assert "frontal/A-025E+00" not in said.err and said.err.count("no prediction for case") == 21
+    assert not (out / "summary.json").exists()
+
+
+@pytest.mark.usefixtures("toys")
+def test_no_table_without_a_subject(folder: Path, tmp_path: Path, capsys: Said) -> None:
+    out = tmp_path / "out"
+    write_pgm(folder / "yaleB05" / f"yaleB05_P00{FEW[1].name}.pgm", np.zeros((96, 84)))
+    assert main(["evaluate", "yale-b", str(folder), "-o", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "84 x 96 pixels, not 168 x 192" in said.err and "Traceback" not in said.err
+    assert (out / "cases" / "yaleB07.json").is_file() and not (out / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "complaint"),
+    [
+        (["nowhere"], 1, "no such folder"),
+        (["."], 1, "no folders yaleB01"),
+        (["yale", "--subjects", "yaleB07,yaleB99"], 2, "--subjects yaleB99: not in"),
+        (["yale", "--shifts", "shifts.csv"], 1, "no such file of shifts"),
+        (["yale", "--compare", "nowhere"], 2, "no such folder"),
+        (["yale", "--keep-eyes"], 2, "no such option"),
+        (["yale", "--preset", "paper"], 2, "no such option"),
+    ],
+)
+def test_bad_lines(
+    folder: Path,
+    tmp_path: Path,
+    capsys: Said,
+    monkeypatch: pytest.MonkeyPatch,
+    line: list[str],
+    code: int,
+    complaint: str,
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    assert main(["evaluate", "yale-b", *line, "-o", str(tmp_path / "out")]) == code
+    said = capsys.readouterr().err
+    assert complaint in said.lower().replace("yaleb", "yaleB") and len(said.splitlines()) == 1
+
+
+def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) -> None:
+    out = tmp_path / "out"
+    assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--dry-run"]) == 0
+    assert "yaleB05.json" in capsys.readouterr().out and not out.exists()
+
+
+def test_the_work_goes_to_other_processes(folder: Path) -> None:
+    methods = MethodOptions(PhotoOptions(Settings()), ("field", "prt"), ())
+    sent = pickle.loads(pickle.dumps(evaluate_yale_b._YaleB(methods, read_yale_b(folder), False)))
+    assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
+    np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

@@ -1,0 +1,216 @@
+"""The driver of every protocol, driven by a toy one: skips, goes on, refuses to sum up what is not whole."""
+
+import csv
+import json
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.cli import evaluation_run
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.evaluate_transfer import _OfPhotos
+from facerf_cli.cli.evaluation_items import MethodOptions
+from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.evaluation_run import evaluation_key, item_key
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, configure_logging
+from tests.evaluation.toy_protocol import HEIGHT, LAYOUT, NOISE, PEOPLE, WIDTH, Toy, comparison, evaluate
+
+Said = pytest.CaptureFixture[str]
+OUTPUTS = ("summary.json", "images.csv", "report.html")
+
+
+@pytest.fixture(autouse=True)
+def _log() -> None:
+    configure_logging()
+
+
+def test_tables_csv_and_page(tmp_path: Path, capsys: Said) -> None:
+    assert evaluate(tmp_path) == 0
+    out = capsys.readouterr().out
+    assert "12 pictures of 3 people" in out and "published, Table 1" in out and "\x1b" not in out
+    assert all(len(line) <= 100 for line in out.splitlines())
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    with (tmp_path / "images.csv").open() as stream:
+        table = list(csv.DictReader(stream))
+    assert len(table) == 24 and {row["method"] for row in table} == set(NOISE)
+    means = {m: np.mean([float(r["si_mse"]) for r in table if r["method"] == m]) for m in NOISE}
+    whole = summary["groups"][0]["metrics"]["si_mse"]
+    assert {m: whole[m]["mean"] for m in NOISE} == pytest.approx(means)
+    assert f"{means['good']:.5f}" in out and f"{means['good']:.5f}" in (tmp_path / "report.html").read_text()
+    assert table[0]["light_deg"] == "0.0" and table[0]["light_error_deg"] == "3"
+
+
+def test_an_evaluation_goes_on_where_it_was_cut_off(tmp_path: Path, capsys: Said) -> None:
+    notes, out = tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    (notes / "bea.broken").touch()
+    assert evaluate(out, Toy(notes=notes)) == 1
+    said = capsys.readouterr()
+    assert "bea: is broken" in said.err and "no summary is written" in said.err and not said.out
+    assert not any((out / name).exists() for name in OUTPUTS)
+    for note in notes.iterdir():
+        note.unlink()
+    assert evaluate(out, Toy(notes=notes)) == 0
+    assert [note.name for note in notes.iterdir()] == ["bea.asked"]
+    assert evaluate(tmp_path / "whole", Toy(notes=notes)) == 0
+    for name in OUTPUTS:
+        assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_items_evaluated_otherwise_are_refused(tmp_path: Path) -> None:
+    assert evaluate(tmp_path) == 0
+    for changed in ({"space": "display"}, {"toy": Toy(cases=3)}, {"keep_eyes": True}):
+        with pytest.raises(UsageError, match="--overwrite, or another folder"):
+            evaluate(tmp_path, **changed)  # type: ignore[arg-type]
+    assert evaluate(tmp_path, jobs=1, dry_run=True) == 0
+    assert (tmp_path / "summary.json").exists()
+    assert evaluate(tmp_path, Toy(cases=3), overwrite=True) == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["pictures"] == 9
+
+
+def test_another_file_of_the_same_name_is_another_image(tmp_path: Path) -> None:
+    path = tmp_path / "anna.png"
+    path.write_bytes(b"one")
+    key = item_key("run", path)
+    assert key == item_key("run", path) != item_key("other", path)
+    path.write_bytes(b"another")
+    assert key != item_key("run", path)
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    options = EvaluateOptions(tmp_path, compare=(theirs,))
+    before = evaluation_key("toy", Toy(), options, Settings())
+    (theirs / "a.png").write_bytes(b"one")
+    assert before != evaluation_key("toy", Toy(), options, Settings())
+
+
+def test_a_key_is_of_what_a_path_leads_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "theirs").mkdir()
+    Path("theirs/a.npz").write_bytes(b"one")
+
+    def key(folder: str) -> str:
+        photo = PhotoOptions(Settings(), face_model=f"{folder}/a.npz", landmarks=Path(folder))
+        couples = {Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a"): "ann"}
+        methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),))
+        options = EvaluateOptions(Path("out"), (), compare=(Path(folder),))
+        return evaluation_key("toy", _OfPhotos(methods, couples, False, False), options, Settings())
+
+    first = key("theirs")
+    assert first == key(str(tmp_path / "theirs")) == key("theirs/../theirs")
+    Path("theirs/a.npz").write_bytes(b"two, another model")
+    assert first != key("theirs")
+
+
+def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, capsys: Said) -> None:
+    theirs = tmp_path / "theirs"
+    for person in PEOPLE:
+        for number in range(4):
+            write_exr(theirs / f"{person}/{number:02d}.exr", comparison(person, number).truth)
+    options = {"compare": (theirs,)}
+    assert evaluate(tmp_path / "out", **options) == 0
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    assert summary["methods"] == [*NOISE, "theirs"]
+    assert summary["groups"][0]["metrics"]["si_mse"]["theirs"]["mean"] < 1e-6
+    (theirs / "anna/01.exr").unlink()
+    (theirs / "carl/00.exr").unlink()
+    write_exr(theirs / "carl/03.exr", np.zeros((WIDTH, HEIGHT, 3), np.float32))
+    capsys.readouterr()
+    assert evaluate(tmp_path / "out", overwrite=True, **options) == 1
+    said = capsys.readouterr().err
+    assert all(part in said for part in ("case anna/01", "case carl/00", "carl/03.exr: 36 x 48 pixels"))
+    assert not any((tmp_path / "out" / name).exists() for name in OUTPUTS)
+
+
+def test_a_method_that_lacks_a_image_is_an_error(tmp_path: Path, capsys: Said) -> None:
+    assert evaluate(tmp_path) == 0
+    path = tmp_path / "cases/bea.json"
+    figures = json.loads(path.read_text())
+    del figures["rows"][0]
+    path.write_text(json.dumps(figures))
+    with pytest.raises(InputError, match="1 predictions are missing"):
+        evaluate(tmp_path)
+    assert "bea/00 by good is missing" in capsys.readouterr().err
+    assert not (tmp_path / "summary.json").exists()
+    path.write_text("{}")
+    with pytest.raises(InputError, match="no figures of an evaluation"):
+        evaluate(tmp_path)
+
+
+def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -> None:
+    assert evaluate(tmp_path, images=True) == 0
+    kinds = {path.name for path in (tmp_path / "pictures").iterdir()}
+    assert kinds == {"source", "truth", "mask", *NOISE}
+    own = comparison("bea", 2)
+    truth = read_image(tmp_path / "pictures/truth/bea/02.exr")
+    np.testing.assert_allclose(truth.pixels, own.truth, rtol=1e-3, atol=1e-6)
+    assert read_image(tmp_path / "pictures/source/bea/02.exr").pixels.shape == own.source.shape
+    guess = read_image(tmp_path / "pictures/good/bea/02.exr")
+    assert guess.metadata["facerf:synthetic"] == 1 and "facerf:synthetic" not in truth.metadata
+    assert "facerf:face_model" not in guess.metadata  # these are made without one
+    # What was kept can be compared with itself.
+    assert evaluate(tmp_path / "again", compare=(tmp_path / "pictures/truth",)) == 0
+
+
+def test_images_and_summary_name_the_face_model(tmp_path: Path) -> None:
+    assert evaluate(tmp_path, photo=PhotoOptions(Settings()), images=True) == 0
+    licence = load_face_model().licence
+    guess = read_image(tmp_path / "pictures/good/bea/02.exr").metadata
+    assert (guess["facerf:face_model"], guess["facerf:face_model_licence"]) == ("builtin", licence)
+    assert "facerf:face_model" not in read_image(tmp_path / "pictures/truth/bea/02.exr").metadata
+    assert json.loads((tmp_path / "summary.json").read_text())["face model"] == f"builtin ({licence})"
+    strip = json.loads((tmp_path / "cases/bea.json").read_text())["strips"][0]["file"]
+    assert b'facerf:face_model="builtin"' in (tmp_path / strip).read_bytes()
+
+
+def test_strips_are_few_and_whole(tmp_path: Path) -> None:
+    assert evaluate(tmp_path, Toy(cases=40)) == 0
+    for person in PEOPLE:
+        strips = json.loads((tmp_path / f"cases/{person}.json").read_text())["strips"]
+        assert len(strips) <= 14 and {f"{person}/39", f"{person}/00"} <= {strip["case"] for strip in strips}
+        assert all((tmp_path / strip["file"]).read_bytes()[:2] == b"\xff\xd8" for strip in strips)
+    assert COMPOSITE_SOURCE_TYPE.encode() in (tmp_path / strips[0]["file"]).read_bytes()
+
+
+@pytest.mark.parametrize("lost", ["strips/bea/000.jpg", "pictures/good/bea/01.exr", "cases/bea.json"])
+def test_what_was_kept_and_is_gone_is_made_anew(tmp_path: Path, lost: str) -> None:
+    notes, out = tmp_path / "notes", tmp_path / "out"
+    notes.mkdir()
+    assert evaluate(out, Toy(notes=notes), images=True) == 0
+    for note in notes.iterdir():
+        note.unlink()
+    before = (out / lost).read_bytes()
+    (out / lost).unlink()
+    assert evaluate(out, Toy(notes=notes), images=True) == 0
+    assert [note.name for note in notes.iterdir()] == ["bea.asked"]
+    assert len((out / lost).read_bytes()) == len(before)
+    assert evaluate(out, Toy(notes=notes), images=True) == 0
+
+
+def test_names_that_lead_out_of_the_folder(tmp_path: Path) -> None:
+    from facerf_cli.cli.evaluation_run import keep_images
+
+    own = comparison("bea", 0)
+    for name in ("../x", "/etc/x", ""):
+        with pytest.raises(InputError, match="no name for a picture"):
+            keep_images(replace(own, case=replace(own.case, name=name)), tmp_path, Settings(), {})
+
+
+def test_two_methods_of_one_name(tmp_path: Path) -> None:
+    options = EvaluateOptions(tmp_path, against=(tmp_path / "field.safetensors",))
+    with pytest.raises(UsageError, match="two methods are called 'field'"):
+        options.check()
+    with pytest.raises(UsageError, match="nothing to evaluate"):
+        evaluation_run.run_protocol(LAYOUT, [], Toy(), EvaluateOptions(tmp_path, reflectance=()), Settings())
+
+
+def test_the_work_goes_to_other_processes() -> None:
+    work = evaluation_run._Measure("si_mse", Toy(), EvaluateOptions(Path("out")), Settings(), None, "key")
+    assert pickle.loads(pickle.dumps(work)) == work

@@ -1,0 +1,137 @@
+"""`facerf fit-geometry` from the command line: its files agree with each other and with the photo."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from skimage.metrics import peak_signal_noise_ratio
+
+from facerf_cli.face.fit import FaceFit, load_fit
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.main import main
+from facerf_cli.raster.texture import render_texture
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
+ENDINGS = {f"_{name}" for name in (*NAMES, "overlay.jpg", "fit.npz")}
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def landmarks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the photo's landmarks."""
+    folder = tmp_path_factory.mktemp("landmarks")
+    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(landmarks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("fitted")
+    assert main(["fit-geometry", str(PHOTO), "-o", str(output), "--landmarks", str(landmarks)]) == 0
+    return output
+
+
+def test_every_file_is_there_and_in_the_report(fitted: Path) -> None:
+    row = json.loads((fitted / "report.jsonl").read_text())
+    assert set(row["outputs"]) == {f"astronaut{ending}" for ending in ENDINGS}
+    assert all((fitted / name).is_file() for name in row["outputs"])
+    assert row["error_iod"] < 0.045 and row["quality"] == "good" and len(row["pose_deg"]) == 3
+
+
+def fit_of(fitted: Path) -> FaceFit:
+    return load_fit(fitted / "astronaut_fit.npz")
+
+
+def test_the_fit_says_whose_model_it_is_of(fitted: Path) -> None:
+    with np.load(fitted / "astronaut_fit.npz", allow_pickle=False) as file:
+        assert str(file["facerf:face_model"]) == str(file["model"]) == "builtin"
+        assert str(file["facerf:face_model_licence"]) == load_face_model().licence
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj"])
+def test_the_mesh_seen_by_the_fit_is_the_photo(fitted: Path, kind: str) -> None:
+    fit = fit_of(fitted)
+    mesh = trimesh.load(fitted / f"astronaut_mesh.{kind}", force="mesh", process=False)
+    vertices = torch.from_numpy(np.array(mesh.vertices)).float() @ fit.rotation.mT + fit.translation_m
+    uv = torch.from_numpy(np.array(mesh.visual.uv) * [1, -1] + [0, 1]).float()
+    texture = torch.from_numpy(read_image(fitted / "astronaut_texture.exr").pixels).permute(2, 0, 1)
+    faces = torch.from_numpy(np.array(mesh.faces)).long()
+    image, seen = render_texture(texture, vertices, faces, uv, fit.camera)
+    cropped = fit.crop.apply(read_image(PHOTO).pixels)
+    inside = seen.numpy() > 0
+    assert inside.mean() > 0.2
+    assert peak_signal_noise_ratio(cropped[inside], image.numpy()[inside], data_range=1) > 25
+    material_image = getattr(mesh.visual.material, "baseColorTexture", None) or mesh.visual.material.image
+    assert material_image.size == (256, 256)
+
+
+def test_texture_says_what_was_seen_and_normals_are_of_unit_length(fitted: Path) -> None:
+    import OpenImageIO as oiio
+
+    stream = oiio.ImageInput.open(str(fitted / "astronaut_texture.exr"))
+    names = list(stream.spec().channelnames)
+    visible = stream.read_image()[..., names.index("visible")]
+    stream.close()
+    assert visible.min() == 0 and visible.max() == 1
+    normals = read_image(fitted / "astronaut_normals.exr").pixels
+    assert np.allclose(np.linalg.norm(normals, axis=-1), 1, atol=2e-3)
+    assert normals[100:150, 20:60, 0].mean() < -0.3 < 0.3 < normals[100:150, 196:236, 0].mean()
+
+
+def test_the_overlay_is_the_photo_but_for_the_face(fitted: Path) -> None:
+    photo, overlay = (read_image(path).pixels for path in (PHOTO, fitted / "astronaut_overlay.jpg"))
+    assert overlay.shape == photo.shape
+    fit = fit_of(fitted)
+    x, y = fit.crop.to_photo(fit.landmarks_px[30].numpy()).round().astype(int)
+    nose = np.s_[y - 20 : y + 20, x - 20 : x + 20]
+    assert np.abs(overlay[nose] - photo[nose]).mean() > 0.05
+    corner = overlay[:60, -60:] / photo[:60, -60:]
+    assert np.percentile(corner, 90) < 1.1 * np.percentile(corner, 10)  # the same but for its exposure
+
+
+def test_two_faces_each_get_their_files(landmarks: Path, tmp_path: Path) -> None:
+    photo = read_image(PHOTO).pixels
+    write_display(tmp_path / "two.png", np.concatenate([photo[:, 60:400], photo[:, 60:400]], 1))
+    assert main(["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o"), "--face", "all"]) == 0
+    row = json.loads((tmp_path / "o" / "report.jsonl").read_text())
+    assert set(row["outputs"]) == {f"two_face{n}{ending}" for n in (0, 1) for ending in ENDINGS}
+    left, right = (load_fit(tmp_path / "o" / f"two_face{n}_fit.npz").crop.x0_px for n in (0, 1))
+    assert abs(right - left - 340) < 10 and len(row["faces"]) == 2
+    line = ["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o2"), "--face"]
+    assert main([*line, "1"]) == 0
+    assert load_fit(tmp_path / "o2" / "two_fit.npz").crop.x0_px == right
+    assert main([*line, "2", "--overwrite"]) == 1
+
+
+def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    line = ["fit-geometry", str(PHOTO), "-o", str(tmp_path / "o"), "--landmarks"]
+    outside = [[40 * number - 9000, 37 * (number % 9) - 9000] for number in range(68)]
+    for content, message in (
+        (None, "no astronaut.pts or .json"),
+        ("[]", "landmarks"),
+        ("{", "landmarks"),
+        (json.dumps([[5, 5]] * 68), "one spot"),
+        (json.dumps(outside), "outside the picture"),
+    ):
+        if content is not None:
+            (marks / "astronaut.json").write_text(content)
+        assert main([*line, str(marks)]) == 1
+        err = capsys.readouterr().err
+        assert "astronaut" in err and message in err and "Traceback" not in err and "unexpected" not in err
+    assert main([*line, str(tmp_path / "none")]) == 2
+    assert not [path for path in (tmp_path / "o").iterdir() if path.name != "report.jsonl"]
+
+
+def test_the_fit_is_of_the_named_face_model(fitted: Path) -> None:
+    fit = fit_of(fitted)
+    model = load_face_model("builtin")
+    assert fit.vertices_camera(model).shape == (len(model.mean), 3)

@@ -1,0 +1,125 @@
+"""`--shard` and `--ray` on the command line, and what shards leave: reports of their own, one summary."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from facerf_cli import main
+from facerf_cli.cli.batch import BatchOptions, Item, sums_up
+from facerf_cli.cli.options import JobsOption, Settings, Shard, settings_of, with_machines
+from facerf_cli.errors import UsageError
+from facerf_cli.logs import configure_logging
+from tests.cli.toy_batch import outputs_of, run
+
+FOLDER_VERBS = {
+    "relight", "estimate-light", "convert-light", "predict-olat", "fit-geometry", "synth-stage",
+    "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
+    "evaluate geometry", "evaluate yale-b", "evaluate pairs",
+}  # fmt: skip
+Call = Callable[..., tuple[int, Settings]]
+
+
+def test_every_verb_that_walks_folders_has_both() -> None:
+    command: Any = typer.main.get_command(main.app)
+    verbs = {name: verb for name, verb in command.commands.items() if not hasattr(verb, "commands")}
+    group = command.commands["evaluate"].commands
+    verbs |= {f"evaluate {name}": verb for name, verb in group.items()}
+    options = {name: {option for each in verb.params for option in each.opts} for name, verb in verbs.items()}
+    assert {name for name, has in options.items() if {"--shard", "--ray"} <= has} == FOLDER_VERBS
+    assert not [
+        name for name, has in options.items() if {"--shard", "--ray"} & has and name not in FOLDER_VERBS
+    ]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch) -> Call:
+    """Runs a line of a verb that walks nothing; gives its jobs and settings."""
+    seen: list[tuple[int, Settings]] = []
+
+    def walk(context: typer.Context, jobs: JobsOption = 1, dry_run: bool = False) -> None:
+        seen.append((jobs, settings_of(context)))
+
+    app = typer.Typer()
+    app.callback()(main._global_options)
+    app.command()(with_machines(walk))
+    return lambda *line: (app(args=["walk", *line], standalone_mode=False), seen.pop())[1]
+
+
+def test_they_reach_the_settings(call: Call) -> None:
+    assert call() == (1, Settings())
+    assert call("--shard", "3/8", "--jobs", "2") == (2, Settings(shard=Shard(3, 8)))
+    assert call("--ray", "local", "--jobs", "1") == (1, Settings(ray="local"))
+    assert call("--ray", "head:6379") == (0, Settings(ray="head:6379"))
+
+
+@pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
+def test_a_wrong_share(call: Call, text: str) -> None:
+    with pytest.raises(UsageError, match=r"--shard .*: give K/N with K from 1 to N"):
+        call(f"--shard={text}")
+
+
+@pytest.mark.parametrize("of", [1, 2, 3, 7])
+def test_shards_share_the_items_out(of: int) -> None:
+    shares = [Shard(number, of).share(range(5)) for number in range(1, of + 1)]
+    assert sorted(item for share in shares for item in share) == list(range(5))
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    configure_logging()
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for name in "abcde":
+        (folder / f"{name}.png").write_bytes(name.encode())
+    return folder
+
+
+def rows(report: Path) -> dict[str, dict]:
+    found = [json.loads(line) for line in report.read_text().splitlines()]
+    return {row["item"]: row for row in found}
+
+
+def test_shards_do_their_own_and_a_run_without_takes_their_rows(photos: Path, tmp_path: Path) -> None:
+    (photos / "b.png").write_bytes(b"bad")
+    out = tmp_path / "out"
+    assert run(photos, out, Shard(1, 2)) == 0 and run(photos, out, Shard(2, 2)) == 1
+    first, second = (rows(out / f"report-{number}-of-2.jsonl") for number in (1, 2))
+    assert set(first) == {"a", "c", "e"} and set(second) == {"b", "d"}
+    assert not (out / "report.jsonl").exists()
+    (photos / "b.png").write_bytes(b"good")
+    assert run(photos, out) == 0
+    whole = rows(out / "report.jsonl")
+    assert {name: whole[name] for name in "acde"} == first | {"d": second["d"]}
+    assert whole["b"]["status"] == "done"
+    assert (tmp_path / "written").read_text().split() == ["a", "c", "e", "d", "b"]
+
+
+def test_a_shard_beyond_the_items_has_nothing_to_do(photos: Path, tmp_path: Path) -> None:
+    assert run(photos, tmp_path / "out", Shard(6, 9)) == 0
+    assert rows(tmp_path / "out/report-6-of-9.jsonl") == {}
+
+
+def test_dry_run_of_a_shard(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert run(photos, tmp_path / "out", Shard(2, 2), dry_run=True) == 0
+    assert [Path(line.split(" -> ")[0]).name for line in capsys.readouterr().out.splitlines()] == [
+        "b.png",
+        "d.png",
+    ]
+
+
+def test_the_last_shard_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    configure_logging()
+    items = [Item(tmp_path / name, tmp_path / name, name) for name in "abc"]
+    shard, options = Settings(shard=Shard(2, 2)), BatchOptions(tmp_path)
+    assert sums_up(items, outputs_of, options, Settings())
+    for item in items:
+        assert not sums_up(items, outputs_of, options, shard)
+        outputs_of(item)[0].touch()
+    assert "nothing is summed up" in capsys.readouterr().err
+    assert sums_up(items, outputs_of, options, shard)
+    assert not sums_up(items, outputs_of, BatchOptions(tmp_path, overwrite=True), shard)

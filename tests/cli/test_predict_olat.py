@@ -1,0 +1,173 @@
+"""`facerf predict-olat` from the command line, with a network that is Lambert's law until it is trained."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.colour import luminance
+from facerf_cli.face.fit import fit_from_arrays
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_checkpoint, save_networks
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.raster.texture import normal_map
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+SIDES = "70,0;-70,0;0,80"
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a checkpoint and the photo's landmarks."""
+    folder = tmp_path_factory.mktemp("given")
+    torch.manual_seed(0)
+    settings = ReflectanceSettings(64, (4, 8, 8), (4, 8, 8), rig_lights=8)
+    network = ReflectanceNetwork(settings)
+    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
+    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
+    metadata = {"layout_version": LAYOUT_VERSION}
+    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
+    save_networks(folder / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
+    torn = metadata | {"networks": {"reflectance": network.as_metadata()}}
+    save_checkpoint(folder / "torn.safetensors", {}, torn)
+    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
+    return folder
+
+
+def predict(given: Path, output: Path, *line: str, photo: Path = PHOTO, checkpoint: str = "lambert") -> int:
+    head = ["--checkpoint", str(given / f"{checkpoint}.safetensors"), "predict-olat", str(photo)]
+    return main([*head, "-o", str(output), "--landmarks", str(given / "astronaut.json"), *line])
+
+
+def stack_of(given: Path, output: Path, *line: str) -> OlatStack:
+    assert predict(given, output, *line) == 0
+    return read_olat_stack(output / "astronaut_olat.exr")
+
+
+def side_of_light(stack: OlatStack, light: int) -> np.ndarray:
+    """Centre of an OLAT's light, less the centre of what it falls on; in shares of the side: right, down."""
+    seen = stack.header.seen
+    light_map = luminance(stack.olats[light].float().permute(1, 2, 0).numpy()) * seen
+    rows, columns = np.indices(seen.shape)
+    centres = [np.array([(m * axis).sum() / m.sum() for axis in (columns, rows)]) for m in (light_map, seen)]
+    return (centres[0] - centres[1]) / len(seen)
+
+
+@pytest.mark.parametrize("kind", ["--texture", "--image"])
+def test_lights_fall_from_where_the_stack_says(given: Path, tmp_path: Path, kind: str) -> None:
+    stack = stack_of(given, tmp_path, "--lights", SIDES, kind)
+    assert stack.header.kind == kind[2:]
+    expected = azel_to_direction(torch.tensor([70.0, -70, 0]), torch.tensor([0.0, 0, 80])).numpy()
+    assert np.abs(stack.header.directions - expected).max() < 1e-6
+    right, left, above = (side_of_light(stack, light) for light in range(3))
+    assert right[0] > 0.04 and left[0] < -0.04 and above[1] < -0.01
+    side = {"--texture": 256, "--image": 512}[kind]
+    assert stack.olats.shape == (3, 3, side, side) and (stack.olats >= 0).all()
+    sheet = read_image(tmp_path / "astronaut_olat.png").pixels
+    assert sheet.shape[0] in (128, 258) and sheet.max() > 0.5
+
+
+def test_the_stack_is_enough_to_render_the_face(given: Path, tmp_path: Path) -> None:
+    header = stack_of(given, tmp_path, "--lights", "2", "--pose", "30,-5,2").header
+    fit = fit_from_arrays(header.fit)
+    assert torch.allclose(torch.from_numpy(header.rotation).float(), pose_to_rotation(30, -5, 2), atol=1e-6)
+    assert fit.vertices_camera(load_face_model("builtin")).isfinite().all() and fit.quality == "good"
+    assert header.source.shape == (256, 256, 3) and header.layout_version == LAYOUT_VERSION
+    assert np.allclose(np.linalg.norm(header.normals, axis=-1), 1, atol=2e-3)
+    assert header.metadata["facerf:input"] == PHOTO.name and header.metadata["facerf:synthetic"] == 1
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert row["lights"] == 2 and row["quality"] == "good" and len(row["pose_deg"]) == 3
+
+
+def test_a_turned_head_keeps_its_lights(given: Path, tmp_path: Path) -> None:
+    straight = stack_of(given, tmp_path / "a", "--lights", SIDES, "--pose", "0,0,0").olats.float()
+    turned = stack_of(given, tmp_path / "b", "--lights", SIDES, "--pose", "40,0,0").olats.float()
+    right, left, _ = turned.mean((1, 2, 3)) / straight.mean((1, 2, 3))
+    assert right > 1.2 and left < 0.7  # a nose to the picture's right faces the light from there
+
+
+def test_memory_and_precision_change_little(given: Path, tmp_path: Path) -> None:
+    usual = stack_of(given, tmp_path / "a", "--lights", "7").olats.float()
+    frugal = stack_of(given, tmp_path / "b", "--lights", "7", "--memory", "0.1").olats.float()
+    coarse = stack_of(given, tmp_path / "c", "--lights", "7", "--precision", "bf16").olats.float()
+    assert torch.allclose(usual, frugal, atol=1e-3) and (usual - coarse).abs().max() < 0.05 * usual.max()
+
+
+def test_lights_from_a_file(given: Path, tmp_path: Path) -> None:
+    (tmp_path / "rig.txt").write_text("# az, el\n10, 20\n\n-30 5  # left\n")
+    stack = stack_of(given, tmp_path / "o", "--lights", str(tmp_path / "rig.txt"))
+    assert len(stack.header.directions) == 2 and stack.header.directions[1, 0] < 0
+
+
+def test_a_long_list_of_lights_is_no_file_name(given: Path, tmp_path: Path) -> None:
+    many = ";".join(f"{azimuth_deg},{azimuth_deg / 4}" for azimuth_deg in range(60))
+    assert len(many) > 256
+    assert predict(given, tmp_path, "--lights", many, "--dry-run") == 0
+
+
+def test_all_faces_get_a_number_and_finished_ones_are_skipped(given: Path, tmp_path: Path) -> None:
+    line = ["--lights", "1", "--face", "all"]
+    assert predict(given, tmp_path, *line) == 0
+    written = tmp_path / "astronaut_face0_olat.exr"
+    stamp = written.stat().st_mtime_ns
+    assert predict(given, tmp_path, *line) == 0
+    assert written.stat().st_mtime_ns == stamp
+
+
+@pytest.mark.parametrize(("line", "code", "message"), [
+    (["--lights", "0"], 2, "from 1 to"), (["--lights", "99999"], 2, "from 1 to"),
+    (["--lights", "few"], 2, "give a number"), (["--lights", "1,2;3"], 2, "numbers with commas"),
+    (["--lights", "1,nan"], 2, "numbers with commas"), (["--lights", "-3"], 2, "give a number"),
+    (["--pose", "10,20"], 2, "--pose"), (["--pose", "a,b,c"], 2, "--pose"),
+    (["--pose", "inf,0,0"], 2, "--pose"),
+    (["--texture-size", "300"], 2, "multiple of 256"), (["--texture-size", "0"], 2, "multiple of 256"),
+    (["--precision", "int8"], 2, "int8"), (["--memory", "0"], 2, "memory"), (["--face", "best"], 2, "--face"),
+    (["--input-colourspace", "nonsense"], 2, "unknown colour space"),
+    (["--face-model", "none.npz"], 1, "no such face model"),
+])  # fmt: skip
+def test_wrong_options_end_the_run(
+    given: Path, tmp_path: Path, capsys: Capture, line: list[str], code: int, message: str
+) -> None:
+    assert predict(given, tmp_path, *line) == code
+    out, err = capsys.readouterr()
+    assert out == "" and message in err and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "message"),
+    [("other", "another UV layout"), ("torn", "do not fit"), ("none", "no such checkpoint")],
+)
+def test_a_checkpoint_that_does_not_fit_ends_the_run(
+    given: Path, tmp_path: Path, capsys: Capture, checkpoint: str, message: str
+) -> None:
+    assert predict(given, tmp_path, checkpoint=checkpoint) == 1
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_bad_photos_leave_the_good_one_unharmed(given: Path, tmp_path: Path, capsys: Capture) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "good.jpg").write_bytes(PHOTO.read_bytes())
+    (photos / "cut.jpg").write_bytes(PHOTO.read_bytes()[:5000])
+    (photos / "text.exr").write_text("hello")
+    write_display(photos / "empty.png", np.full((90, 120, 3), 0.2, np.float32))
+    write_display(photos / "dot.png", np.full((1, 1, 3), 0.2, np.float32))
+    head = ["--checkpoint", str(given / "lambert.safetensors"), "predict-olat", str(photos)]
+    assert main([*head, "-o", str(tmp_path / "o"), "--lights", "1"]) == 1
+    err = capsys.readouterr().err
+    named = [name for name in ("good.jpg", "cut.jpg", "text.exr", "empty.png", "dot.png") if name in err]
+    assert named == ["cut.jpg", "text.exr", "empty.png", "dot.png"]
+    assert "4 of 5 failed" in err and "Traceback" not in err and err.count("\n") == 5
+    assert (tmp_path / "o" / "good_olat.exr").is_file()

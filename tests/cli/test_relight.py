@@ -1,0 +1,230 @@
+"""`facerf relight` from the command line, with a network that is Lambert's law until it is trained."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+import facerf_cli.baselines.field
+import facerf_cli.pipeline
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_networks
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.raster.texture import normal_map
+from facerf_cli.synth.sky.skies import kind_of
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+WIDTHS = (4, 8, 8)
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a checkpoint, the photo's landmarks and two maps."""
+    folder = tmp_path_factory.mktemp("given")
+    torch.manual_seed(0)
+    settings = ReflectanceSettings(64, WIDTHS, WIDTHS, rig_lights=8)
+    network = ReflectanceNetwork(settings)
+    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
+    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
+    metadata = {"layout_version": LAYOUT_VERSION}
+    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
+    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
+    (folder / "maps").mkdir()
+    grey = np.full((8, 16, 3), 0.3, np.float32)
+    right = grey.copy()
+    right[3:5, 3:5] = 9.0
+    write_exr(folder / "maps/grey.exr", grey)
+    write_exr(folder / "maps/right.0007.exr", right)
+    return folder
+
+
+def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:
+    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "--landmarks", str(given / "astronaut.json")]
+    return main([*fixed[:2], "relight", str(photo), "-o", str(output), "--lights", "12", *fixed[2:], *line])
+
+
+def made(output: Path) -> list[str]:
+    return sorted(path.name for path in output.rglob("*") if path.suffix in (".exr", ".png"))
+
+
+def face_sides(path: Path) -> tuple[float, float]:
+    """Mean light on the left and the right half of the face alone."""
+    image = read_image(path)
+    assert image.alpha is not None
+    columns = np.flatnonzero(image.alpha.max(0) > 0.5)
+    middle = (columns[0] + columns[-1]) // 2
+    left, right = (image.alpha.copy() for _ in range(2))
+    left[:, middle:], right[:, :middle] = 0, 0
+    return tuple(float((image.pixels.mean(-1) * side).sum() / side.sum()) for side in (left, right))
+
+
+def test_maps_rotations_and_lamps_from_one_prediction(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    predicted = []
+    predict = facerf_cli.pipeline.predict_olat
+    for module in (facerf_cli.pipeline, facerf_cli.baselines.field):
+        monkeypatch.setattr(
+            module,
+            "predict_olat",
+            lambda *given, **named: predicted.append("quotient" in named) or predict(*given, **named),
+        )
+    line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0", "--ball"]
+    assert relight(given, tmp_path, *line) == 0
+    assert predicted == [False, True]  # to estimate the photo's own light, and for all that is asked
+    names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
+    names.append("astronaut_light_40_10+-40_0_1_0_0")
+    images = sorted(name + suffix for name in names for suffix in (".exr", ".png"))
+    assert [name for name in made(tmp_path) if name.startswith("astronaut")] == images
+    assert "right.0007.0001.png" in made(tmp_path / "balls")
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert row["status"] == "done" and row["quality"] == "good" and len(row["exposure_ev"]) == 5
+    assert row["exposure_ev"][names[0]] == row["exposure_ev"][names[1]]  # a turning sky does not pump
+    assert len(capsys.readouterr().out.splitlines()) == 10
+    assert relight(given, tmp_path, *line) == 0
+    assert len(predicted) == 2  # finished already
+
+
+def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.cli.items.relight._HELD", 1 << 30)  # so that one frame fits
+    line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
+    assert relight(given, tmp_path, *line) == 0
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert len(row["exposure_ev"]) == 3 and len(set(row["exposure_ev"].values())) == 1
+
+
+def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "40,10") == 0
+    stream = oiio.ImageInput.open(str(tmp_path / "astronaut_light_40_10.exr"))
+    spec = stream.spec()
+    assert (spec.width, spec.height) == (512, 512)
+    for name in ("R", "face.A", "normal.Z", "position.Z", "uv.U"):
+        assert name in spec.channelnames
+    assert spec.get_string_attribute("facerf:checkpoint") == "lambert"
+    pixels = np.asarray(stream.read_image("float"))
+    stream.close()
+    mask, depth = (pixels[..., spec.channelnames.index(name)] for name in ("face.A", "position.Z"))
+    assert 0.01 < (mask > 0.5).mean() < 0.1 and (depth[mask > 0.5] < -0.3).all()
+
+
+def test_positive_azimuth_lights_the_images_right(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "70,0", "--light", "-70,0", "--envmap", str(given / "maps/right.0007.exr")]
+    assert relight(given, tmp_path, *line, "--composite", "face") == 0
+    left, right = face_sides(tmp_path / "astronaut_light_70_0.exr")
+    assert right > 2 * left
+    left, right = face_sides(tmp_path / "astronaut_light_-70_0.exr")
+    assert left > 2 * right
+    left, right = face_sides(tmp_path / "astronaut_right.0007.exr")
+    assert right > 1.5 * left
+
+
+def test_background_is_kept_bit_for_bit(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "40,10", "--keep-background") == 0
+    relit = read_image(tmp_path / "astronaut_light_40_10.exr").pixels
+    photo = read_image(PHOTO).pixels.astype(np.float16).astype(np.float32)
+    same = (relit == photo).all(-1)
+    assert 0.9 < same.mean() < 0.99  # the face is small
+    shown = read_image(tmp_path / "astronaut_light_40_10.png").pixels
+    np.testing.assert_allclose(shown[same], read_image(PHOTO).pixels[same], atol=2e-3)
+
+
+def test_pose_gives_the_face_alone(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "0,0", "--pose", "25,0,0") == 0
+    assert read_image(tmp_path / "astronaut_light_0_0.exr").alpha is not None
+    assert relight(given, tmp_path, "--light", "0,0", "--pose", "25,0,0", "--composite", "photo") == 2
+
+
+def test_a_matte_of_another_size(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_exr(tmp_path / "matte.exr", np.ones((20, 30, 3), np.float32))
+    assert relight(given, tmp_path / "out", "--light", "0,0", "--matte", str(tmp_path / "matte.exr")) == 1
+    assert "matte.exr: the matte is 30 x 20, the photo 512 x 512" in capsys.readouterr().err
+    assert relight(given, tmp_path / "out", "--light", "0,0", "--matte", str(tmp_path / "none.exr")) == 2
+    assert "--matte " in capsys.readouterr().err
+
+
+def test_a_stack_gives_what_its_photo_gives(given: Path, tmp_path: Path) -> None:
+    checkpoint = ["--checkpoint", str(given / "lambert.safetensors")]
+    landmarks = ["--landmarks", str(given / "astronaut.json")]
+    assert (
+        main(
+            [
+                *checkpoint,
+                "predict-olat",
+                str(PHOTO),
+                "-o",
+                str(tmp_path / "olat"),
+                "--lights",
+                "12",
+                *landmarks,
+            ]
+        )
+        == 0
+    )
+    stack = next((tmp_path / "olat").glob("*.exr"))
+    envmap = ["--envmap", str(given / "maps")]
+    assert relight(given, tmp_path / "a", *envmap, "--composite", "face") == 0
+    assert relight(given, tmp_path / "b", *envmap, photo=stack) == 0
+    direct = face_sides(tmp_path / "a/astronaut_right.0007.exr")
+    again = face_sides(next((tmp_path / "b").glob("*_right.0007.exr")))
+    assert again == pytest.approx(direct, rel=0.02)
+    assert relight(given, tmp_path / "c", *envmap, "--pose", "1,2,3", photo=stack) == 1
+
+
+def test_a_bad_map_harms_no_other(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_exr(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
+    (tmp_path / "text.exr").write_text("no picture")
+    missing = str(tmp_path / "missing.hdr")
+    bad = [str(tmp_path / "square.exr"), str(tmp_path / "text.exr"), missing]
+    assert relight(given, tmp_path / "out", "--envmap", str(given / "maps/grey.exr"), *bad) == 1
+    assert made(tmp_path / "out") == ["astronaut_grey.exr", "astronaut_grey.png"]
+    errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert len(errors) == 3 and "twice as wide" in "".join(errors)
+    assert relight(given, tmp_path / "none", "--envmap", missing) == 1
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        [],
+        ["--light", "1"],
+        ["--light", "0,0", "--rotate", "left"],
+        ["--light", "0,0", "--rotate", "0:360"],
+        ["--light", "0,0", "--pose", "1,2"],
+        ["--light", "0,0", "--exposure", "bright"],
+        ["--light", "0,0", "--lights", "0"],
+        ["--light", "0,0", "--texture-size", "100"],
+        ["--light", "0,0", "--envmap-sampling", "best"],
+    ],
+)
+def test_wrong_usage(
+    given: Path, tmp_path: Path, line: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path / "out", *line) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_folder_that_cannot_be(given: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert relight(given, tmp_path / "file/out", "--light", "0,0") == 2
+
+
+def test_procedural_maps_by_seed(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"astronaut_{index:05d}_{kind_of(index, 4)}" for index in range(2)]
+    assert relight(given, tmp_path, "--envmap", "procedural:2", "--seed", "4", "--composite", "face") == 0
+    assert made(tmp_path) == [name + suffix for name in names for suffix in (".exr", ".png")]
+    assert read_image(tmp_path / f"{names[0]}.exr").pixels.max() > 0
+    assert relight(given, tmp_path, "--envmap", "procedural:none") == 2
+    assert "write procedural:N" in capsys.readouterr().err

@@ -1,0 +1,147 @@
+"""`facerf relight-dataset` on a tiny dataset: the tree is the same however it came about."""
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.files.images import write_exr
+from facerf_cli.main import main
+from tests.dataset.dataset_fixture import write_small_dataset
+
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    write_small_dataset(folder, counts=(1, 1, 1), lights=12, crop_px=32)
+    return folder
+
+
+@pytest.fixture
+def dataset(small: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(small, tmp_path / "dataset"))
+
+
+def line(dataset: Path, *options: str, maps: str = "procedural:3", images: int = 4) -> list[str]:
+    return ["relight-dataset", str(dataset), "--envmaps", maps, "--per-subject", str(images), *options]
+
+
+def tree(dataset: Path) -> dict[str, str]:
+    files = [
+        path for path in (dataset / "relit").rglob("*") if path.is_file() and path.name != "report.jsonl"
+    ]
+    return {
+        str(path.relative_to(dataset)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(files)
+    }
+
+
+def test_jobs_lazy_and_the_order_of_runs_make_no_difference(
+    dataset: Path, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line(dataset, "--jobs", "2")) == 0
+    streams = capsys.readouterr()
+    assert len(streams.out.splitlines()) == 12
+    whole = tree(dataset)
+    assert len(whole) == 14 and "relit/0002/00003.exr" in whole
+    other = Path(shutil.copytree(small, tmp_path / "other"))
+    assert main(line(other, "--lazy")) == 0
+    assert capsys.readouterr().out == f"{other}/relit/pairs.jsonl\n"
+    lazy = tree(other)
+    assert len(lazy) == 2 and lazy.items() < whole.items()
+    assert main(line(other, images=2)) == 0  # fewer, then all
+    capsys.readouterr()
+    (other / "relit" / "0001" / "00001.exr").unlink()
+    assert main(line(other)) == 0
+    assert tree(other) == whole
+    rows = [json.loads(row) for row in (other / "relit" / "report.jsonl").read_text().splitlines()]
+    assert {row["item"]: row["made"] for row in rows} == {"0000": 2, "0001": 3, "0002": 2}
+    before = (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns
+    assert main(line(other)) == 0
+    assert (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns == before
+    assert main(line(other, "--overwrite", "--memory", "0.1")) == 0
+    assert tree(other) == whole and (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns != before
+
+
+def test_killed_at_any_moment_the_same_line_ends_in_the_same_tree(
+    dataset: Path, small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = 60
+    assert main(line(dataset, images=images)) == 0
+    killed = Path(shutil.copytree(small, tmp_path / "killed"))
+    command = [sys.executable, "-m", "facerf_cli", *line(killed, images=images)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=ENVIRONMENT, start_new_session=True)
+    deadline_s = time.monotonic() + 120
+    while len(list((killed / "relit").glob("*/*.exr"))) < 5 and time.monotonic() < deadline_s:
+        time.sleep(0.002)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert 5 <= len(list((killed / "relit").glob("*/*.exr"))) < 3 * images
+    assert main(line(killed, images=images)) == 0
+    assert tree(killed) == tree(dataset)
+
+
+def test_a_dry_run_writes_nothing(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(line(dataset, "--dry-run", images=2)) == 0
+    assert f"{dataset}/olat/0000 -> {dataset}/relit/0000/00001.exr" in capsys.readouterr().out
+    assert not (dataset / "relit").exists()
+
+
+def test_maps_of_a_folder(dataset: Path, tmp_path: Path) -> None:
+    for name, rows in (("b/one.exr", 5), ("two.exr", 8)):
+        write_exr(tmp_path / "maps" / name, np.ones((rows, 2 * rows, 3), np.float32))
+    write_exr(tmp_path / "maps" / ".hidden.exr", np.ones((3, 3, 3), np.float32))
+    assert main(line(dataset, maps=str(tmp_path / "maps"), images=8)) == 0
+    rows = [json.loads(row) for row in (dataset / "relit" / "pairs.jsonl").read_text().splitlines()]
+    assert {row["envmap"] for row in rows} == {
+        str(tmp_path / "maps" / name) for name in ("b/one.exr", "two.exr")
+    }
+
+
+def test_what_cannot_be_used_is_one_line(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def says(code: int, arguments: list[str]) -> str:
+        assert main(arguments) == code
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1, lines
+        return lines[0]
+
+    (tmp_path / "empty").mkdir()
+    assert "empty: no inputs found (looked for .exr .hdr)" in says(
+        2, line(dataset, maps=str(tmp_path / "empty"))
+    )
+    assert "write procedural:N" in says(2, line(dataset, maps="procedural:0"))
+    assert "1000000 are the most" in says(2, line(dataset, maps="procedural:999999999"))
+    assert "--memory inf: give a number" in says(2, line(dataset, "--memory", "inf"))
+    assert "dataset.json: no such file" in says(1, line(tmp_path / "empty"))
+    assert "--envmaps nowhere: no such folder" in says(2, line(dataset, maps="nowhere"))
+    assert main(line(dataset, images=1)) == 0
+    capsys.readouterr()
+    assert "--overwrite" in says(2, line(dataset, "--seed", "9", images=1))
+    stack = dataset / "olat" / "0001" / "C1.exr"
+    stack.unlink()
+    assert f"{stack}: missing from the dataset" in says(1, line(dataset))
+
+
+def test_a_damaged_stack_costs_its_own_subject(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for camera in ("C0", "C1"):
+        stack = dataset / "olat" / "0002" / f"{camera}.exr"
+        stack.write_bytes(stack.read_bytes()[:-2000])
+    code = main(line(dataset, images=1))
+    errors = capsys.readouterr().err
+    assert code == 1 and "0002/C" in errors and "Traceback" not in errors
+    if (dataset / "relit" / "pairs.jsonl").exists():
+        assert (dataset / "relit" / "0001" / "00000.exr").exists()

@@ -1,0 +1,97 @@
+"""`facerf relight --reflectance`: the baselines from the command line."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+
+from facerf_cli.baselines import prt
+from facerf_cli.baselines.base import DETAIL
+from facerf_cli.baselines.diffuse_sh import CHECKPOINT
+from facerf_cli.baselines.prt import TransferSettings
+from facerf_cli.cli.light_options import LIGHT_FEATURES
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.images import read_image
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_networks
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from tests.cli import test_relight as relighting
+
+given = relighting.given  # the fixture
+
+
+@pytest.fixture(autouse=True)
+def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coarse bake, and a cache of the test's own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    small = TransferSettings(order=4, side=32, lights=60, lamp_samples=1, bounce_samples=2)
+    monkeypatch.setattr(prt.explain_by_prt, "__defaults__", (prt.SETTINGS, small, DETAIL))
+
+
+def attribute(path: Path, name: str) -> str:
+    stream = oiio.ImageInput.open(str(path))
+    value = stream.spec().get_string_attribute(name)
+    stream.close()
+    return str(value)
+
+
+@pytest.mark.parametrize("kind", ["diffuse-sh", "specular-sh", "prt"])
+def test_a_face_is_lit_from_where_the_lamp_is(given: Path, tmp_path: Path, kind: str) -> None:
+    line = ["--light", "70,0", "--light", "-70,0", "--composite", "face", "--reflectance", kind]
+    assert relighting.relight(given, tmp_path / "out", *line) == 0
+    first = tmp_path / "out/astronaut_light_70_0.exr"
+    left, right = relighting.face_sides(first)
+    assert right > 1.5 * left
+    left, right = relighting.face_sides(tmp_path / "out/astronaut_light_-70_0.exr")
+    assert left > 1.5 * right
+    assert attribute(first, "facerf:reflectance") == kind
+    assert np.isfinite(read_image(first).pixels).all()
+
+
+def test_a_turned_head_and_its_cache(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "20,30", "--pose", "30,0,0", "--reflectance", "prt"]
+    assert relighting.relight(given, tmp_path / "out", *line) == 0
+    assert read_image(tmp_path / "out/astronaut_light_20_30.exr").pixels.max() > 0.01
+    assert len(list((tmp_path / "cache").rglob("*.npy"))) == 1
+
+
+def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    torch.manual_seed(0)
+    save_networks(
+        tmp_path / "mine.safetensors", {"diffuse_sh": DiffuseNetwork()}, {"layout_version": LAYOUT_VERSION}
+    )
+    fixed = ["--landmarks", str(given / "astronaut.json"), "--light", "70,0", "--composite", "face"]
+
+    def relight(name: str, checkpoint: Path, *more: str) -> int:
+        line = ["relight", str(relighting.PHOTO), "-o", str(tmp_path / name), *fixed, *more]
+        return main(["--checkpoint", str(checkpoint), *line])
+
+    for name, checkpoint in (("mine", tmp_path / "mine.safetensors"), ("shipped", CHECKPOINT)):
+        assert relight(name, checkpoint, "--reflectance", "diffuse-sh") == 0
+    mine, shipped = (tmp_path / name / "astronaut_light_70_0.exr" for name in ("mine", "shipped"))
+    assert not np.allclose(read_image(mine).pixels, read_image(shipped).pixels, rtol=0.1)
+    assert attribute(mine, "facerf:checkpoint") == "mine"
+    capsys.readouterr()
+    assert relight("field", tmp_path / "mine.safetensors") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "mine: a checkpoint without a Reflectance Network" in line
+    assert relight("other", LIGHT_FEATURES, "--reflectance", "diffuse-sh") == 1
+    assert "give one by `facerf train`" in capsys.readouterr().err
+
+
+def test_the_field_is_what_it_was(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "20,30", "--composite", "face"]
+    assert relighting.relight(given, tmp_path / "plain", *line) == 0
+    assert relighting.relight(given, tmp_path / "named", *line, "--reflectance", "field") == 0
+    plain, named = (tmp_path / name / "astronaut_light_20_30.exr" for name in ("plain", "named"))
+    assert np.array_equal(read_image(plain).pixels, read_image(named).pixels)
+    assert attribute(named, "facerf:reflectance") == ""
+
+
+def test_no_such_model(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert relighting.relight(given, tmp_path / "out", "--light", "0,0", "--reflectance", "wax") == 2
+    assert "specular-sh" in capsys.readouterr().err

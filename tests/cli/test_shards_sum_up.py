@@ -1,0 +1,76 @@
+"""Verbs that end with something of all items: shards leave what one run leaves; the last writes the sum."""
+
+import hashlib
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.evaluation_run import run_protocol
+from facerf_cli.cli.options import Settings, Shard
+from facerf_cli.logs import configure_logging
+from facerf_cli.main import main
+from tests.dataset.capture import write_capture
+from tests.dataset.dataset_fixture import write_small_dataset
+from tests.evaluation.toy_protocol import LAYOUT, Toy, evaluate, items
+
+Said = pytest.CaptureFixture[str]
+
+
+def tree(folder: Path) -> dict[str, str]:
+    """Every file but the reports, which hold times."""
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.startswith("report")
+    }
+
+
+def test_evaluate(tmp_path: Path) -> None:
+    configure_logging()
+    assert evaluate(tmp_path / "whole") == 0
+    options = EvaluateOptions(tmp_path / "shards", reflectance=())
+    for number in (2, 1):
+        assert not (options.output / "summary.json").exists()
+        settings = Settings(shard=Shard(number, 2))
+        assert run_protocol(LAYOUT, items(options.output), Toy(), options, settings) == 0
+    assert tree(options.output) == tree(tmp_path / "whole")
+    assert (options.output / "report.html").exists()
+
+
+def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:
+    for name in ("whole", "shards"):
+        write_small_dataset(tmp_path / name, counts=(1, 1, 1), lights=12, crop_px=32)
+    line = ["--envmaps", "procedural:2", "--per-subject", "3"]
+    whole = ["relight-dataset", str(tmp_path / "whole"), *line]
+    shards = ["relight-dataset", str(tmp_path / "shards"), *line]
+    assert main(whole) == 0
+    assert main([*shards, "--shard", "1/2"]) == 2
+    assert "give this line once with --lazy and no --shard" in capsys.readouterr().err
+    assert main([*shards, "--lazy"]) == 0
+    assert main([*shards, "--shard", "2/2"]) == 0 and main([*shards, "--shard", "1/2"]) == 0
+    assert tree(tmp_path / "shards/relit") == tree(tmp_path / "whole/relit")
+    before = tree(tmp_path / "shards")
+    assert main([*shards, "--shard", "1/2", "--overwrite"]) == 2, "it would take the other's away"
+    assert tree(tmp_path / "shards") == before
+
+
+@pytest.mark.slow
+def test_synth_stage(tmp_path: Path) -> None:
+    line = ["synth-stage", "--subjects", "2", "--size", "64", "--lights", "12", "-o"]
+    assert main([*line, str(tmp_path / "whole")]) == 0
+    for shard in ("2/2", "1/2"):
+        assert main([*line, str(tmp_path / "shards"), "--shard", shard]) == 0
+    assert tree(tmp_path / "shards") == tree(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_prepare_dataset(tmp_path: Path) -> None:
+    write_capture(tmp_path / "capture", subjects=2, lights=12)
+    line = ["prepare-dataset", str(tmp_path / "capture"), "--crop", "96", "--checks", "off", "-o"]
+    assert main([*line, str(tmp_path / "whole")]) == 0
+    for shard in ("2/2", "1/2"):
+        assert not (tmp_path / "shards" / "dataset.json").exists()
+        assert main([*line, str(tmp_path / "shards"), "--shard", shard]) == 0
+    assert tree(tmp_path / "shards") == tree(tmp_path / "whole")
+    assert (tmp_path / "whole" / "dataset.json").exists()

@@ -1,0 +1,113 @@
+"""`facerf synth-stage` from the command line: two built-in people, few lights, small pictures."""
+
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import load_file
+
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.files.images import read_image
+from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
+from facerf_cli.main import main
+
+LIGHTS = 6
+Said = pytest.CaptureFixture[str]
+
+
+def photograph(folder: Path, *line: str) -> int:
+    size = ["--size", "64", "--lights", str(LIGHTS)]
+    return main(["synth-stage", "-o", str(folder), *size, *line])
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("synth") / "capture"
+    assert photograph(folder, "--subjects", "1", "--transport") == 0
+    assert photograph(folder, "--subjects", "2", "--transport") == 0
+    return folder
+
+
+def tree(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "report.jsonl"
+    }
+
+
+def lit(folder: Path, subject: str, camera: int, light: int) -> np.ndarray:
+    return read_image(folder / subject / f"C{camera}" / f"L{light:03d}.exr").pixels
+
+
+def test_it_is_a_capture_like_any_other(capture: Path) -> None:
+    stage = read_capture(capture)
+    assert list(stage.subjects) == ["0000", "0001"] and len(stage.cameras) == 8
+    described = json.loads((capture / "stage.json").read_text())
+    assert described["provenance"]["synthetic"] and -90 < described["subjects"]["0001"]["ita_deg"] < 90
+    frames = np.stack([stage.frame("0001", "C3", light) for light in range(LIGHTS)])
+    assert np.isfinite(frames).all() and 0.02 < frames.mean() < 1
+    image = read_image(capture / "0001" / "C0" / "L000.exr")
+    assert image.pixels.shape == (64, 64, 3)
+    assert image.metadata["facerf:face_model"] == "builtin" and image.metadata["facerf:synthetic"] == 1
+    assert image.metadata["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
+
+
+def test_two_jobs_and_one_more_person_change_no_byte(capture: Path, tmp_path: Path) -> None:
+    assert photograph(tmp_path / "again", "--subjects", "2", "--transport", "--jobs", "2") == 0
+    assert tree(tmp_path / "again") == tree(capture)
+
+
+def test_lights_and_calibration_agree_with_the_images(capture: Path) -> None:
+    stage = read_capture(capture)
+    across = stage.directions_world[:, 0]
+    right = lit(capture, "0000", 0, int(across.argmax())).sum((0, 2))
+    left = lit(capture, "0000", 0, int(across.argmin())).sum((0, 2))
+    columns = np.arange(64)
+    assert (right * columns).sum() / right.sum() > (left * columns).sum() / left.sum() + 4
+    record = json.loads((capture / "0000" / "subject.json").read_text())
+    nose_world = torch.tensor(record["landmarks_world"][30])
+    nose_px = [stage.cameras[f"C{camera}"].project(nose_world).numpy() for camera in range(3)]
+    assert (np.abs(np.array(nose_px) - 32) < 16).all()
+    # The second camera stands on the first one's left; the nose, before the head's axis, is further right.
+    assert nose_px[1][0] > nose_px[0][0] + 2 > nose_px[2][0] + 4
+
+
+def test_the_bake_is_kept_in_the_chart(capture: Path) -> None:
+    bake = load_file(capture / "transport" / "0001.safetensors")
+    assert bake["visibility"].shape == bake["bounce"].shape == (LIGHTS, 128, 128)
+    front = bake["directions"][:, 2].argmax()
+    behind = bake["directions"][:, 2].argmin()
+    assert bake["visibility"][front, 40:90, 40:90].mean() > 180 > 20 > bake["visibility"][behind].mean()
+    assert np.abs(np.linalg.norm(bake["directions"], axis=-1) - 1).max() < 1e-5
+
+
+def test_other_settings_need_another_folder(capture: Path, capsys: Said) -> None:
+    before = tree(capture)
+    assert photograph(capture, "--subjects", "2", "--seed", "1") == 2
+    error = capsys.readouterr().err.strip()
+    assert "another -o" in error and error.count(os.linesep) == 0
+    assert photograph(capture, "--renderer", "mitsuba", "--transport") == 2
+    assert "--transport" in capsys.readouterr().err
+    assert photograph(capture, "--face-model", "nothing.npz") == 1
+    assert "no such face model" in capsys.readouterr().err
+    assert tree(capture) == before
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
+    assert photograph(tmp_path / "none", "--subjects", "3", "--dry-run") == 0
+    assert capsys.readouterr().out.count("->") == 3 and not (tmp_path / "none").exists()
+
+
+def test_a_missing_path_tracer_is_named_before_anything_is_written(
+    tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    assert photograph(tmp_path / "capture", "--renderer", "mitsuba") == 2
+    assert "pip install 'facerf[synth]'" in capsys.readouterr().err
+    assert not (tmp_path / "capture").exists()

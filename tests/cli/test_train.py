@@ -1,0 +1,187 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
+from facerf_cli.network.feature_networks import VggFeatures
+from tests.dataset.dataset_fixture import write_small_dataset
+
+
+@pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])
+def test_a_bad_time_is_refused(tmp_path: Path, time: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), f"--max-time={time}"]) == 2
+    assert capsys.readouterr().err.strip().splitlines() == [
+        f"facerf: error: --max-time {time}: write a number and s, m or h, such as 45m"
+    ]
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_face_model_is_named_before_anything_is_baked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "nobody.npz"]) == 1
+    assert "nobody.npz: no such face model" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_bad_start_is_named_before_baking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    start = tmp_path / "start.safetensors"
+    start.write_text("nothing")
+    assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
+    assert "not a facerf checkpoint" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start = tmp_path / "start.safetensors"
+    save_checkpoint(
+        start, {}, {"layout_version": LAYOUT_VERSION, "networks": {"reflectance": {"form": "default"}}}
+    )
+    assert main(["train", "-o", str(tmp_path / "run"), "--start-from", str(start)]) == 1
+    assert f"{start}: its weights do not fit" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (
+            ["--dataset", "d", "--heads", "20"],
+            "--heads is for synthetic heads, and --dataset takes",
+        ),
+        (["--dataset", "d", "--bank", "b"], "--bank is for synthetic heads, and --dataset takes their place"),
+        (["--dataset", "d", "--heads-from", "builtin"], "--heads-from is for synthetic heads"),
+        (["--dataset", "d", "--views", "2"], "--views is for synthetic heads"),
+        (["--texture-size", "64"], "--texture-size is for a prepared dataset; give --dataset"),
+        (["--preset", "paper"], "the stage joint learns from a prepared dataset; give --dataset"),
+        (["--stage", "joint", "--dataset", "d", "--heads", "20"], "--heads means nothing to the stage joint"),
+        (
+            ["--stage", "joint", "--dataset", "d", "--fit-with", "m"],
+            "--fit-with means nothing to the stage joint",
+        ),
+        (["--stage", "geometry", "--dataset", "d"], "--dataset means nothing to the stage geometry"),
+        (["--vgg-weights", "imagenet"], "--vgg-weights means nothing to the stage reflectance"),
+        (["--photos", "p"], "--photos means nothing to the stage reflectance"),
+        (
+            ["--stage", "light-features", "--mean-face"],
+            "--mean-face means nothing to the stage light",
+        ),
+        (
+            ["--stage", "diffuse-sh", "--without-normals"],
+            "--without-normals means nothing to the stage diffuse-sh",
+        ),
+        (["--dataset", "d", "--mean-face"], "--mean-face: a dataset was fitted already"),
+        (
+            ["--without-normals", "--start-from", "f"],
+            "--without-normals: the networks of --start-from",
+        ),
+        (["--max-time", "0s"], "--max-time 0s: write a number and s, m or h, such as 45m"),
+        (["--heads", "13"], "--heads 13: the mean face and 12 heads are held out; give more"),
+    ],
+)
+def test_what_makes_no_sense_together_is_refused_in_a_line(
+    tmp_path: Path, options: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), *options]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith(f"facerf: error: {words}")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--dataset", str(tmp_path), "-o", str(tmp_path / "run")]) == 1
+    assert f"{tmp_path}/dataset.json: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_papers_preset_says_what_it_wants(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = write_small_dataset(tmp_path / "dataset", counts=(1, 1, 0), cameras=1, lights=4, crop_px=32)
+    line = ["train", "--preset", "paper", "--dataset", str(dataset.folder), "-o", str(tmp_path / "run")]
+    assert main(line) == 2
+    assert "give --vgg-weights imagenet" in capsys.readouterr().err
+    vgg = tmp_path / "vgg.safetensors"
+    save_file(VggFeatures().state_dict(), vgg)
+    assert main([*line, "--vgg-weights", str(vgg)]) == 2
+    assert "give --light-features FILE" in capsys.readouterr().err
+
+
+TINY = ["--preset", "tiny", "--heads", "7", "--jobs", "1", "--validate-every", "3", "--device", "cpu"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of four steps on a bank of its own."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert main(["train", "-o", str(folder), *TINY, "--steps", "4", "--learning-rate", "0.002"]) == 0
+    return folder
+
+
+def steps_of(folder: Path) -> list[int]:
+    return [json.loads(line)["step"] for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_a_run_by_the_command(run: Path) -> None:
+    networks, metadata = load_networks(run / "best.safetensors", LAYOUT_VERSION)
+    assert list(networks) == ["reflectance"]
+    assert (
+        metadata["provenance"]["heads"] == "7 synthetic heads drawn from builtin (facerf's own (see LICENSE))"
+    )
+    assert steps_of(run) == [1, 2, 3, 4] and (run / "validation-0000003.png").exists()
+    assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.002
+
+
+def test_a_run_goes_on_by_the_command_and_is_not_written_over(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bank = ["--bank", str(run / "bank")]
+    line = ["train", "-o", str(tmp_path / "run"), *TINY, *bank]
+    assert main([*line, "--steps", "2"]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'run' / 'last.safetensors'}\n"
+    assert main([*line, "--steps", "3", "--resume"]) == 0
+    assert steps_of(tmp_path / "run") == [1, 2, 3]
+    capsys.readouterr()
+    assert main([*line, "--steps", "3"]) == 2
+    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert main([*line, "--steps", "4", "--resume", "--batch", "3"]) == 2
+    assert "this run was begun with batch 2" in capsys.readouterr().err
+    assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
+    assert "this run was begun on other data" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "stage", [pytest.param("geometry", marks=pytest.mark.slow), "light-features", "reflectance", "diffuse-sh"]
+)
+def test_a_stage_carries_over_the_networks_of_others(run: Path, tmp_path: Path, stage: str) -> None:
+    line = ["train", "-o", str(tmp_path / "run"), "--stage", stage, *TINY, "--bank", str(run / "bank")]
+    assert main([*line, "--steps", "1", "--start-from", str(run / "last.safetensors")]) == 0
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert set(networks) == {"reflectance", stage.replace("-", "_")}
+    assert [leg["steps_done"] for leg in metadata["training"]] == [4, 1]
+    before, _ = load_checkpoint(run / "last.safetensors")
+    after, _ = load_checkpoint(tmp_path / "run" / "last.safetensors")
+    same = all(torch.equal(after[name], tensor) for name, tensor in before.items())
+    assert same != (stage == "reflectance")
+
+
+def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, tmp_path: Path) -> None:
+    line = ["train", "-o", str(tmp_path / "run"), *TINY, "--bank", str(run / "bank"), "--steps", "1"]
+    assert main([*line, "--mean-face", "--without-normals"]) == 0
+    views = [load_file(run / "bank" / f"views-builtin{kind}" / "00002.safetensors") for kind in ("", "-mean")]
+    assert not torch.equal(views[0]["warp"], views[1]["warp"])
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert networks["reflectance"].settings.normals is False
+    assert metadata["provenance"]["fitted_with"].startswith("builtin-mean")
+
+
+def test_help_has_its_options_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "--help"]) == 0
+    text = capsys.readouterr().out
+    places = [text.index(group) for group in ("The run", "Data", "Length", "Losses and ablations", "Speed")]
+    assert places == sorted(places)

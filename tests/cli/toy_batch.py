@@ -1,0 +1,75 @@
+"""A verb that copies bytes, for other processes to import; what a file holds is what happens to it."""
+
+import fcntl
+import logging
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_batch
+from facerf_cli.cli.options import Settings, Shard
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.logs import LOGGER_NAME, configure_logging
+
+
+def outputs_of(item: Item) -> list[Path]:
+    return [item.output("_copy.bin")]
+
+
+@dataclass(frozen=True)
+class Copy:
+    """Copies; each write of an output leaves a line in NOTES/written."""
+
+    notes: Path
+
+    def __call__(self, item: Item) -> Outcome:
+        data = item.input_path.read_bytes()
+        logging.getLogger(LOGGER_NAME).warning("at %s", item.name)
+        if data == b"bad":
+            raise InputError(f"{item.input_path}: is bad")
+        if data == b"stop":
+            raise FacerfError("the checkpoint is broken")
+        if data == b"die":
+            self.note("died", item.name)
+            os.kill(os.getpid(), signal.SIGKILL)
+        (path,) = outputs_of(item)
+        with atomic_path(path) as temporary:
+            temporary.write_bytes(b"half")
+            if data == b"wait" and not (self.notes / "victim").exists():
+                self.note("victim", str(os.getpid()))
+                self.sleep()
+            temporary.write_bytes(data)
+        self.note("written", item.name)
+        if data == b"late" and not (self.notes / "late").exists():
+            self.note("late", item.name)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return Outcome([path], {"bytes": len(data)})
+
+    def note(self, name: str, line: str) -> None:
+        with (self.notes / name).open("a") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+            stream.write(line + "\n")
+
+    def sleep(self) -> None:
+        for _ in range(600):
+            time.sleep(0.1)
+
+
+def run(
+    photos: Path, output: Path, shard: Shard | None = None, ray: str | None = None, **options: object
+) -> int:
+    """Copy PHOTOS to OUTPUT; notes go to the folder above."""
+    settings = Settings(shard=shard or Shard(), ray=ray)
+    batch = BatchOptions(output, **options)  # type: ignore[arg-type]
+    return run_batch("copy", [str(photos)], Copy(output.parent), outputs_of, batch, settings)
+
+
+if __name__ == "__main__":
+    from tests.cli.toy_batch import run as run_importable
+
+    configure_logging()
+    run_importable(Path(sys.argv[1]), Path(sys.argv[2]), ray="local", jobs=2)

@@ -1,0 +1,119 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.dataset.crops import PairReader, mean_translation_m, open_pairs, spread_pairs
+from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path
+from facerf_cli.dataset.relight import relight_subject
+from facerf_cli.dataset.weights import load_pairs, name_maps, settle_pairs
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import load_fit
+from facerf_cli.files.olat_stack import read_olat_stack
+from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.synth.sky.skies import ProceduralMaps
+from tests.dataset.dataset_fixture import write_small_dataset
+
+CROP_PX = 48
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_small_dataset(tmp_path_factory.mktemp("dataset"), lights=20, crop_px=CROP_PX)
+
+
+@pytest.fixture(scope="module")
+def reader(dataset: Dataset) -> PairReader:
+    maps = name_maps(ProceduralMaps(3, 0, 32))
+    settle_pairs(dataset, draw_pairs(dataset, maps, 4, 0), overwrite=False)
+    for rows, weights in load_pairs(dataset).values():
+        relight_subject(dataset, rows, weights)
+    return open_pairs(dataset, "train", CROP_PX)
+
+
+def _face(dataset: Dataset, pair: Pair, camera: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A camera's stack [L, 3, S, S], where it sees the face [S, S], and its mean under a constant map."""
+    stack = read_olat_stack(dataset.stack_path(pair.subject, camera))
+    seen = torch.from_numpy(stack.header.seen) > 0.5
+    return stack.olats.float(), seen, torch.from_numpy(stack.header.source[seen.numpy()]).mean()
+
+
+def test_pairs_are_the_datasets_images_exposed(dataset: Dataset, reader: PairReader) -> None:
+    assert {pair.split for pair in reader.pairs} == {"train"} and len(reader.pairs) == 8
+    for pair in reader.pairs[:3]:
+        found = reader.read(pair)
+        weights = torch.from_numpy(np.array(load_pairs(dataset)[pair.subject][1][pair.index]))
+        olats, seen, _ = _face(dataset, pair, pair.source_camera)
+        source = torch.einsum("lc,lchw->chw", weights, olats)
+        expected = source / source[:, seen].mean() * MEAN_RADIANCE
+        assert torch.allclose(found.source[0], expected, rtol=5e-3, atol=1e-3)
+        olats, _, albedo = _face(dataset, pair, pair.target_camera)
+        expected = olats[pair.target_light] * MEAN_RADIANCE / albedo
+        assert torch.allclose(found.target[0], expected, rtol=1e-3, atol=1e-5)
+
+
+def test_light_is_in_the_targets_camera_space(dataset: Dataset, reader: PairReader) -> None:
+    """What it lights of a Lambertian face is what looks toward it."""
+    for pair in reader.pairs:
+        header = read_olat_stack(dataset.stack_path(pair.subject, pair.target_camera)).header
+        found = reader.read(pair)
+        cosine = torch.from_numpy(header.normals) @ found.light[0]
+        seen = torch.from_numpy(header.seen) > 0.5
+        lit = found.target[0].mean(0) > 1e-4
+        assert found.light.norm().item() == pytest.approx(1, abs=1e-5)
+        assert (lit == (cosine > 0))[seen].float().mean() > 0.97
+
+
+def test_landmarks_follow_the_crop(dataset: Dataset, reader: PairReader) -> None:
+    pair = next(pair for pair in reader.pairs if pair.source_camera != pair.target_camera)
+    larger = open_pairs(dataset, "train", 2 * CROP_PX).read(pair)
+    smaller = open_pairs(dataset, "train", CROP_PX // 2).read(pair)
+    for name, camera in (("source", pair.source_camera), ("target", pair.target_camera)):
+        expected = load_fit(dataset.fit_path(pair.subject, camera)).landmarks_px
+        for crops, scale in ((larger, 2), (smaller, 0.5)):
+            assert torch.allclose(getattr(crops, f"{name}_landmarks_px")[0], expected * scale, atol=1e-3)
+            assert getattr(crops, name).shape == (1, 3, CROP_PX * scale, CROP_PX * scale)
+    same = reader.read(pair)
+    assert torch.allclose(torch.nn.functional.avg_pool2d(same.target, 2), smaller.target, atol=1e-5)
+
+
+def test_sources_that_were_not_written_are_weighed(
+    dataset: Dataset, reader: PairReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pair = reader.pairs[5]
+    written = reader.read(pair)
+    path = image_path(dataset, *pair.key)
+    hidden = path.rename(path.with_suffix(".hidden"))
+    try:
+        assert torch.allclose(reader.read(pair).source, written.source, rtol=1e-3, atol=1e-4)
+    finally:
+        hidden.rename(path)
+
+
+def test_drawing_depends_on_the_generator_alone(reader: PairReader) -> None:
+    one, again, other = (reader.draw(torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    assert torch.equal(one.source, again.source) and torch.equal(one.target, again.target)
+    assert not torch.equal(one.target, other.target)
+
+
+def test_spread_is_over_subjects_and_always_the_same(reader: PairReader) -> None:
+    found = spread_pairs(reader, 4, lambda pair: True)
+    assert found == spread_pairs(reader, 4, lambda pair: True)
+    assert {pair.subject for pair in found} == {pair.subject for pair in reader.pairs}
+    assert spread_pairs(reader, 99, lambda pair: pair.index == 0) == [p for p in reader.pairs if p.index == 0]
+    assert spread_pairs(reader, 3, lambda pair: False) == []
+
+
+def test_a_split_without_pairs_is_named(tmp_path: Path) -> None:
+    dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
+    with pytest.raises(InputError, match="in the split train; make them with `facerf relight-"):
+        open_pairs(dataset, "train", 32)
+
+
+def test_heads_stand_where_their_fits_say(dataset: Dataset) -> None:
+    fits = [load_fit(dataset.fit_path(s, c)) for s in dataset.splits["train"] for c in dataset.cameras[s]]
+    expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
+    assert torch.allclose(torch.tensor(mean_translation_m(dataset)), expected, atol=1e-6)
+    assert expected[2] < -0.9

@@ -1,0 +1,123 @@
+"""Subjects whose stacks lack lights: maps are weighed over the lights that each has, pairs ask for those."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.dataset.crops import open_pairs
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import draw_pairs, pairs_path, read_pairs
+from facerf_cli.dataset.relight import relight_subject, render_source
+from facerf_cli.dataset.textures import open_captured
+from facerf_cli.dataset.weights import (
+    load_pairs,
+    map_directions,
+    name_maps,
+    pair_weights,
+    read_map,
+    settle_pairs,
+    weights_path,
+)
+from facerf_cli.files.images import write_exr
+from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.synth.sky.skies import ProceduralMaps
+from tests.dataset.dataset_fixture import write_small_dataset
+
+LIGHTS = 20
+LACKING = {"0000": (0, 7, 8), "0001": (19,)}
+MAPS = name_maps(ProceduralMaps(3, 7, 32))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("dataset")
+    return write_small_dataset(folder, lights=LIGHTS, crop_px=48, lacking=LACKING)
+
+
+def fresh(dataset: Dataset, folder: Path) -> Dataset:
+    """The same dataset without anything relit in it."""
+    for part in ("olat", "fits", "dataset.json"):
+        (folder / part).symlink_to(dataset.folder / part)
+    return replace(dataset, folder=folder)
+
+
+def test_each_subject_has_its_own_lights(dataset: Dataset) -> None:
+    assert dataset.lights_of("0000") == (*range(1, 7), *range(9, 20))
+    assert dataset.lights_of("0001") == tuple(range(19)) and dataset.lights_of("0002") == tuple(range(20))
+    for subject in dataset.subjects:
+        header = read_olat_header(dataset.stack_path(subject, "C1"))
+        world = dataset.directions_world[list(dataset.lights_of(subject))]
+        np.testing.assert_allclose(world @ header.rotation.T, header.directions, atol=1e-6)
+    assert read_dataset(dataset.folder).fewer_lights == dataset.fewer_lights
+
+
+def test_a_target_is_a_light_that_the_subject_has(dataset: Dataset) -> None:
+    pairs = draw_pairs(dataset, MAPS, 150, 5)
+    for subject in dataset.subjects:
+        asked = {pair.target_light for pair in pairs if pair.subject == subject}
+        assert asked == set(range(len(dataset.lights_of(subject))))
+
+
+def test_a_map_is_weighed_over_the_cells_of_the_lights_there_are(dataset: Dataset, tmp_path: Path) -> None:
+    here = fresh(dataset, tmp_path)
+    settled = settle_pairs(here, draw_pairs(here, MAPS, 4, 0), overwrite=False)
+    assert read_pairs(here) == settled
+    for subject, (pairs, weights) in load_pairs(here).items():
+        lights = list(here.lights_of(subject))
+        assert weights.shape == (4, len(lights), 3)
+        for pair, row in zip(pairs, weights, strict=True):
+            envmap, directions = read_map(pair.envmap), map_directions(here)
+            expected = envmap_weights(envmap, directions[lights], pair.rotate_deg) * 2.0**pair.exposure_ev
+            torch.testing.assert_close(torch.from_numpy(np.array(row)), expected)
+            torch.testing.assert_close(pair_weights(here, pair), expected)
+            everything = envmap_weights(envmap, directions, pair.rotate_deg).sum(0) * 2.0**pair.exposure_ev
+            torch.testing.assert_close(expected.sum(0), everything)  # no light of the map is lost
+    stored = np.load(weights_path(here))
+    assert stored.shape[1] == LIGHTS and (stored[:4, 17:] == 0).all() and (stored[8:, 17:] > 0).any()
+
+
+def test_a_constant_map_gives_the_fully_lit_image(dataset: Dataset, tmp_path: Path) -> None:
+    here = fresh(dataset, tmp_path)
+    write_exr(tmp_path / "white.exr", np.ones((5, 10, 3), np.float32))
+    pairs = settle_pairs(here, draw_pairs(here, [str(tmp_path / "white.exr")], 1, 0), overwrite=False)
+    for pair in pairs:
+        lit = read_olat_header(here.stack_path(pair.subject, pair.source_camera)).source
+        image = render_source(here, pair).permute(1, 2, 0).float().numpy()
+        np.testing.assert_allclose(image, lit, atol=0.01 * lit.max())
+
+
+def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) -> None:
+    """With pairs, with their pictures, and without any pairs; more lights than somebody has are not asked."""
+    here = fresh(dataset, tmp_path)
+    free = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
+    settle_pairs(here, draw_pairs(here, MAPS, 2, 0), overwrite=False)
+    lazy = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
+    heads = torch.tensor([0, 1, 2])
+    for captured in (free, lazy):
+        sample = captured.draw(heads, LIGHTS, torch.Generator().manual_seed(0))
+        assert sample.target.shape[:2] == (3, 17) and sample.source.isfinite().all()
+    expected = lazy.draw(heads, 3, torch.Generator().manual_seed(1))
+    for rows, weights in load_pairs(here).values():
+        relight_subject(here, rows, weights)
+    written = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
+    assert set(written.sources) == {"0000", "0001", "0002"}
+    sample = written.draw(heads, 3, torch.Generator().manual_seed(1))
+    torch.testing.assert_close(sample.target, expected.target)
+    assert (sample.source - expected.source).abs().mean() < 0.01
+    reader = open_pairs(here, "train", 48)
+    assert all(reader.read(pair).target.isfinite().all() for pair in reader.pairs)
+
+
+def test_a_pair_of_a_light_that_the_subject_lacks_is_none(dataset: Dataset, tmp_path: Path) -> None:
+    here = fresh(dataset, tmp_path)
+    pair = settle_pairs(here, draw_pairs(here, MAPS, 1, 0), overwrite=False)[0]
+    text = pairs_path(here).read_text()
+    wrong = text.replace(f'"target_light": {pair.target_light}', '"target_light": 17', 1)
+    assert wrong != text
+    pairs_path(here).write_text(wrong)
+    with pytest.raises(Exception, match="line 1 is no pair"):
+        read_pairs(here)

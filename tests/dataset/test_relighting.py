@@ -1,0 +1,348 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.pairs import draw_pair, draw_pairs, image_path, pairs_path, read_pairs
+from facerf_cli.dataset.prepare import constant_weights
+from facerf_cli.dataset.relight import multiply, relight_subject, relit_images, render_source
+from facerf_cli.dataset.weights import (
+    load_pairs,
+    map_directions,
+    name_maps,
+    pair_weights,
+    read_map,
+    settle_pairs,
+    weights_path,
+    world_to_map,
+)
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, read_olats, write_olat_stack
+from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.synth.sky.skies import ProceduralMaps
+from tests.dataset.dataset_fixture import write_small_dataset
+
+MAPS = name_maps(ProceduralMaps(4, 7, 32))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return write_small_dataset(tmp_path_factory.mktemp("dataset"), crop_px=48)
+
+
+@pytest.fixture
+def fresh(dataset: Dataset, tmp_path: Path) -> Dataset:
+    """The same dataset without anything relit in it."""
+    for part in ("olat", "fits", "dataset.json"):
+        (tmp_path / part).symlink_to(dataset.folder / part)
+    return replace(dataset, folder=tmp_path)
+
+
+def write_map(path: Path, pixels: np.ndarray) -> str:
+    write_exr(path, np.asarray(pixels, np.float32))
+    return str(path)
+
+
+def test_a_pair_depends_on_seed_subject_and_index_alone(dataset: Dataset) -> None:
+    some, more = draw_pairs(dataset, MAPS, 3, 5), draw_pairs(dataset, MAPS, 8, 5)
+    assert [pair for pair in more if pair.index < 3] == some
+    assert draw_pair(dataset, MAPS, 5, "0002", 7) == next(p for p in more if p.key == ("0002", 7))
+    assert more == sorted(more, key=lambda pair: pair.key)
+    assert {pair.split for pair in more} == {"train", "validation", "test"}
+    assert all(pair.split == dataset.split_of(pair.subject) for pair in more)
+    assert draw_pairs(dataset, MAPS, 3, 6) != some
+    many = draw_pairs(dataset, MAPS, 100, 5)
+    same = np.mean([pair.source_camera == pair.target_camera for pair in many])
+    assert 0.4 < same < 0.6
+    assert {pair.source_camera for pair in many} == {"C0", "C1"} and {p.envmap for p in many} == set(MAPS)
+    assert {pair.target_light for pair in many} == set(range(20))
+
+
+def test_written_sources_are_their_rows_bit_for_bit(fresh: Dataset) -> None:
+    pairs = settle_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
+    for subject, (rows, weights) in load_pairs(fresh).items():
+        assert relight_subject(fresh, rows, weights) == 3
+        assert relight_subject(fresh, rows, weights) == 0  # all there
+        assert {row.subject for row in rows} == {subject}
+    assert read_pairs(fresh) == pairs
+    for line in pairs_path(fresh).read_text().splitlines():
+        row = json.loads(line)
+        image = read_image(image_path(fresh, row["subject"], row["index"]))
+        again = render_source(fresh, row).permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(image.pixels.astype(np.float16).view(np.uint16), again.view(np.uint16))
+        assert image.metadata["facerf:envmap"] == row["envmap"] and image.pixels.max() > 0.02
+        of_stack = read_olat_header(fresh.stack_path(row["subject"], row["source_camera"])).metadata
+        assert image.metadata.items() >= of_stack.items() and image.metadata["facerf:face_model"]
+        assert image.metadata["facerf:synthetic"] == 1
+
+
+def test_weights_are_made_anew_where_they_are_missing(fresh: Dataset) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
+    kept = weights_path(fresh).read_bytes()
+    weights_path(fresh).unlink()
+    pairs_path(fresh).touch()  # what is in memory is forgotten
+    (rows, weights) = load_pairs(fresh)["0001"]
+    assert weights_path(fresh).read_bytes() == kept
+    np.testing.assert_array_equal(weights[1], pair_weights(fresh, rows[1]).numpy())
+
+
+def test_a_constant_map_gives_the_fully_lit_image(fresh: Dataset, tmp_path: Path) -> None:
+    maps = [write_map(tmp_path / "white.exr", np.full((5, 10, 3), 0.25))]
+    pairs = settle_pairs(fresh, draw_pairs(fresh, maps, 1, 0), overwrite=False)
+    assert {pair.exposure_ev for pair in pairs} == {2}  # 0.25 brought to 1
+    for pair in pairs:
+        lit = read_olat_header(fresh.stack_path(pair.subject, pair.source_camera)).source
+        image = render_source(fresh, pair).permute(1, 2, 0).float().numpy()
+        # Cells are cut anew in the crop's frame there and in the world's here.
+        np.testing.assert_allclose(image, lit, atol=0.01 * lit.max())
+
+
+def test_all_cameras_see_the_same_light_and_it_turns_about_the_vertical(
+    fresh: Dataset, tmp_path: Path
+) -> None:
+    sky = np.full((16, 32, 3), 0.01)
+    sky[7:9, 8] = 200.0  # u = 0.25 is +x, the picture's right
+    name = write_map(tmp_path / "lamp.exr", sky)
+    pair = draw_pair(fresh, [name], 0, "0000", 0)
+    directions = map_directions(fresh)
+    for rotate_deg, toward in ((0.0, [1.0, 0, 0]), (90.0, [0, 0, -1.0]), (270.0, [0, 0, 1.0])):
+        turned = replace(pair, rotate_deg=rotate_deg, exposure_ev=_ev(fresh, pair))
+        weights = pair_weights(fresh, turned).sum(-1)
+        brightest = directions[int(weights.argmax())]
+        assert float(brightest @ torch.tensor(toward, dtype=torch.float64)) > 0.8
+    for camera in fresh.cameras["0000"]:
+        header = read_olat_header(fresh.stack_path("0000", camera))
+        image = render_source(fresh, replace(turned, source_camera=camera))  # from where faces look
+        in_head = torch.from_numpy(header.normals) @ torch.from_numpy(header.rotation).float()
+        cosines = (in_head @ directions.float().T).clamp_min(0)  # the same lamps for each camera
+        lit, constant = (
+            header.source.mean(-1),
+            cosines @ torch.from_numpy(constant_weights(directions.numpy())),
+        )
+        expected = torch.from_numpy(lit) / constant.clamp_min(1e-3) * (cosines @ weights / 3)
+        torch.testing.assert_close(image.float().mean(0), expected, rtol=0.03, atol=0.02)
+        assert expected.max() > 0.5
+
+
+def _ev(dataset: Dataset, pair: object) -> int:
+    from facerf_cli.dataset.weights import MapWork, weigh_map
+
+    result = weigh_map(MapWork(pair.envmap, map_directions(dataset), ()))  # type: ignore[attr-defined]
+    assert not isinstance(result, str)
+    return result.exposure_ev
+
+
+def test_the_weights_are_those_of_the_turned_map_in_a_cameras_own_directions(
+    fresh: Dataset, tmp_path: Path
+) -> None:
+    pair = settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)[0]
+    envmap = read_map(pair.envmap)
+    expected = envmap_weights(envmap, map_directions(fresh), pair.rotate_deg) * 2.0**pair.exposure_ev
+    torch.testing.assert_close(pair_weights(fresh, pair), expected)
+    mean = float(pair_weights(fresh, pair).sum(0).mean()) / 4
+    assert 0.7 < mean < 1.42
+
+
+@pytest.mark.parametrize(
+    "world_to_capture",
+    [np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.eye(3)],
+)
+def test_the_vertical_is_found_whatever_the_capture_calls_it(
+    dataset: Dataset, world_to_capture: np.ndarray
+) -> None:
+    """A capture whose y points down, or whose z points up, lights its faces from the same sky."""
+    tilted = replace(dataset, directions_world=dataset.directions_world @ world_to_capture.T)
+    np.testing.assert_allclose(world_to_map(tilted), world_to_capture.T, atol=1e-12)
+    torch.testing.assert_close(map_directions(tilted), map_directions(dataset))
+
+
+def test_the_product_is_the_sum_whatever_the_parts(tmp_path: Path) -> None:
+    """Odd sizes and more pictures than a tile: the plain sum within a half, the same bits in any company."""
+    olats = torch.rand(7, 37, 150, 3).half().permute(0, 3, 1, 2)  # as a stack that was read
+    weights = torch.rand(131, 7, 3)
+    images = torch.empty(131, 3, 37, 150, dtype=torch.float16)
+    multiply(olats, weights, images)
+    truth = torch.einsum("mlc,lchw->mchw", weights.double(), olats.double())
+    torch.testing.assert_close(images.double(), truth, rtol=1e-3, atol=1e-4)
+    order = torch.randperm(131)
+    few = torch.empty(5, 3, 37, 150, dtype=torch.float16)
+    multiply(olats, weights[order[:5]], few)
+    assert torch.equal(few, images[order[:5]])  # a picture's bits do not depend on its neighbours
+
+
+def test_memory_bounds_what_is_held_and_changes_no_bit(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = dataset.stack_path("0000", "C0")
+    header = read_olat_header(source)
+    tall = {name: np.tile(getattr(header, name), (5, 5, 1)) for name in ("source", "normals")}
+    header = replace(header, **tall, seen=np.tile(header.seen, (5, 5)))
+    path = tmp_path / "large.exr"
+    write_olat_stack(path, header, [torch.tile(read_olat_stack(source).olats, (5, 5))])
+    weights = torch.rand(3, 20, 3)
+    whole = torch.stack(list(relit_images(path, weights)))
+    held: list[int] = []
+
+    def spy(*arguments: object, **named: object) -> Tensor:
+        part = read_olats(*arguments, **named)  # type: ignore[arg-type]
+        held.append(2 * part.numel())
+        return part
+
+    monkeypatch.setattr("facerf_cli.dataset.relight.read_olats", spy)
+    memory_bytes = 3 << 20  # of a stack of 7 MB
+    parts = torch.stack(list(relit_images(path, weights, memory_bytes)))
+    assert torch.equal(parts, whole)
+    assert len(held) > 3 and max(held) <= memory_bytes / 2
+    torch.testing.assert_close(
+        whole.double(), torch.einsum("mlc,lchw->mchw", weights, read_olat_stack(path).olats.float()).double(),
+        rtol=1e-3, atol=1e-3,
+    )  # fmt: skip
+
+
+def test_parts_of_a_stack(dataset: Dataset) -> None:
+    path = dataset.stack_path("0001", "C1")
+    stack = read_olat_stack(path)
+    assert torch.equal(read_olats(path), stack.olats)
+    assert torch.equal(read_olats(path, slice(3, 7), slice(5, 30)), stack.olats[3:7, :, 5:30])
+    header = read_olat_header(path)
+    np.testing.assert_array_equal(header.normals, stack.header.normals)
+    np.testing.assert_array_equal(header.directions, stack.header.directions)
+
+
+def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: Dataset) -> None:
+    drawn = draw_pairs(fresh, MAPS, 2, 0)
+    settle_pairs(fresh, drawn, overwrite=False)
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    before = weights_path(fresh)
+    with pytest.raises(UsageError, match=r"another seed, other maps, .* --overwrite"):
+        settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
+    assert image_path(fresh, "0000", 1).exists()
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
+    assert image_path(fresh, "0000", 1).exists() and not before.exists() and len(read_pairs(fresh)) == 16
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=True)
+    assert not image_path(fresh, "0000", 1).exists()
+    pairs_path(fresh).write_text("{}\n")
+    with pytest.raises(InputError, match="line 1 is no pair"):
+        settle_pairs(fresh, drawn, overwrite=False)
+    assert len(settle_pairs(fresh, drawn, overwrite=True)) == 8
+
+
+def test_fewer_pairs_leave_no_image_without_its_own(fresh: Dataset) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
+    few = settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)  # recipes alone may go
+    assert len(few) == 8
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    with pytest.raises(UsageError, match="more of each subject"):
+        settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    assert len(read_pairs(fresh)) == 8 and image_path(fresh, "0000", 1).exists()
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+    assert not image_path(fresh, "0000", 1).exists()
+
+
+def test_as_many_pairs_of_other_subjects_are_other_pairs(fresh: Dataset) -> None:
+    drawn = draw_pairs(fresh, MAPS, 2, 0)
+    settle_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
+    settled = settle_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
+    assert [pair.subject for pair in settled] == ["0000", "0001", "0002", "0003"] == list(load_pairs(fresh))
+
+
+def test_a_map_that_changed_is_another_map(fresh: Dataset, tmp_path: Path) -> None:
+    name = write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 1.0))
+    drawn = draw_pairs(fresh, [name], 1, 0)
+    settle_pairs(fresh, drawn, overwrite=False)
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 8.0))
+    with pytest.raises(UsageError, match="other maps"):
+        settle_pairs(fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
+    weights_path(fresh).unlink()
+    pairs_path(fresh).touch()
+    with pytest.raises(InputError, match="made with other maps than are there now"):
+        load_pairs(fresh)
+    assert settle_pairs(fresh, drawn, overwrite=True)[0].exposure_ev == -3
+
+
+def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: Path) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    rows, weights = load_pairs(fresh)["0000"]
+    relight_subject(fresh, rows, weights)
+    with pytest.raises(FacerfError, match="cannot be used"):
+        settle_pairs(fresh, draw_pairs(fresh, [str(tmp_path / "none.exr")], 1, 0), overwrite=True)
+    assert image_path(fresh, "0000", 0).exists() and len(read_pairs(fresh)) == 4
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"split": "test"},
+        {"subject": "9999"},
+        {"source_camera": "C7"},
+        {"target_light": 20},
+        {"index": -1},
+        {"index": 1},
+        {"rotate_deg": 90},
+    ],
+)
+def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, object]) -> None:
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
+    first, *others = pairs_path(fresh).read_text().splitlines()
+    changed = json.dumps(json.loads(first) | change)
+    pairs_path(fresh).write_text("\n".join([changed, *others]))
+    number = 2 if change == {"index": 1} else 1  # twice the same pair
+    with pytest.raises(InputError, match=f"line {number} is no pair"):
+        read_pairs(fresh)
+
+
+@pytest.mark.parametrize("name", ["procedural:0:0:99999999", "procedural:0:0:0", "procedural:0"])
+def test_a_row_cannot_ask_for_a_map_of_any_size(name: str) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        read_map(name)
+
+
+def test_one_camera_predicts_itself(tmp_path: Path) -> None:
+    dataset = write_small_dataset(tmp_path, (1, 0, 0), cameras=1, lights=6, crop_px=32)
+    (pair,) = settle_pairs(dataset, draw_pairs(dataset, MAPS, 1, 0), overwrite=False)
+    assert pair.source_camera == pair.target_camera == "C0"
+    assert render_source(dataset, pair).isfinite().all()
+
+
+def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -> None:
+    path = image_path(fresh, "0000", 0)
+    path.parent.mkdir(parents=True)
+    path.write_text("of an unknown light")
+    with pytest.raises(UsageError, match="--overwrite"):
+        settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+    assert not path.exists()
+
+
+def test_every_bad_map_is_named_and_nothing_is_written(
+    fresh: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    good = write_map(tmp_path / "good.exr", np.ones((4, 8, 3)))
+    square = write_map(tmp_path / "square.exr", np.ones((4, 4, 3)))
+    black = write_map(tmp_path / "black.exr", np.zeros((4, 8, 3)))
+    (tmp_path / "text.hdr").write_text("no map")
+    maps = [good, square, black, str(tmp_path / "text.hdr")]
+    with (
+        caplog.at_level("ERROR", "facerf"),
+        pytest.raises(FacerfError, match="3 of 4 maps cannot be used; mend them or take them out"),
+    ):
+        settle_pairs(fresh, draw_pairs(fresh, maps, 20, 0), overwrite=False)
+    assert not pairs_path(fresh).exists()
+
+
+def test_a_stack_of_another_rig_is_named(dataset: Dataset) -> None:
+    fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
+    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
+        world_to_map(fewer)
+    with pytest.raises(InputError, match="20 lights, not 12"):
+        list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))

@@ -1,0 +1,211 @@
+"""Folders are matched by name, whole: nothing is left out, and nothing of another size compared."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from facerf_cli.colour import srgb_to_linear
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.measure import Measures, measure
+from facerf_cli.evaluation.protocols.pairs import collect_pairs, compare_pair
+from facerf_cli.files.images import write_exr
+
+NAMES = ("anna/one", "anna/two", "bert/one")
+SHAPE = (6, 9, 3)
+
+
+def image(name: str) -> np.ndarray:
+    """A picture that is the name's own, exact in half floats and in 8 bits of linear light."""
+    return np.random.default_rng(len(name) + ord(name[0])).integers(0, 256, SHAPE).astype(np.float32) / 256
+
+
+def save(path: Path, pixels: np.ndarray, alpha: np.ndarray | None = None) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".exr":
+        write_exr(path, pixels, alpha)
+    elif path.suffix == ".npy":
+        np.save(path, pixels)
+    else:
+        Image.fromarray(pixels.astype(np.uint8)).save(path)
+
+
+@pytest.fixture
+def truths(tmp_path: Path) -> Path:
+    for name in NAMES:
+        save(tmp_path / f"truth/{name}.exr", image(name))
+    (tmp_path / "truth/notes.txt").write_text("no picture")
+    return tmp_path / "truth"
+
+
+@pytest.fixture
+def ours(tmp_path: Path) -> Path:
+    for name, suffix in zip(NAMES, (".npy", ".exr", ".png"), strict=True):
+        pixels = image(name)
+        save(tmp_path / f"ours/{name}{suffix}", pixels * 256 if suffix == ".png" else pixels)
+    return tmp_path / "ours"
+
+
+def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> None:
+    pairs = collect_pairs([ours], truths)
+    assert [(pair.name, pair.person) for pair in pairs] == list(
+        zip(NAMES, ("anna", "anna", "bert"), strict=True)
+    )
+    errors = [measure(compare_pair(pair), Measures())[0].values["mse"] for pair in pairs]
+    assert errors[:2] == [0, 0] and errors[2] > 0.01  # a PNG is encoded
+    decoded = compare_pair(pairs[2]).predictions["ours"]
+    np.testing.assert_allclose(decoded, srgb_to_linear(image(NAMES[2]) * 256 / 255), atol=1e-5)
+
+
+def test_several_methods_stand_side_by_side(truths: Path, ours: Path) -> None:
+    theirs = truths.parent / "theirs"
+    for name in NAMES:
+        save(theirs / f"{name}.npy", image(name)[..., 0])  # grey
+    comparison = compare_pair(collect_pairs([ours, theirs], truths)[0])
+    assert list(comparison.predictions) == ["ours", "theirs"]
+    assert comparison.predictions["theirs"].shape == SHAPE and comparison.mask.all()
+
+
+def test_folders_may_lie_in_the_truths(truths: Path, ours: Path) -> None:
+    ours.rename(truths / "ours")
+    assert [pair.name for pair in collect_pairs([truths / "ours"], truths)] == list(NAMES)
+
+
+def test_names_with_dots(tmp_path: Path) -> None:
+    save(tmp_path / "truth/a.v1.exr", image("a"))
+    save(tmp_path / "ours/a.v1.npy", image("a"))
+    (pair,) = collect_pairs([tmp_path / "ours"], tmp_path / "truth")
+    assert (pair.name, pair.person) == ("a.v1", "a.v1")
+
+
+def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: Path) -> None:
+    (ours / "anna/one.npy").unlink()
+    (ours / "anna/two.exr").unlink()
+    for number in range(5):
+        save(ours / f"carl/{number}.npy", image("c"))
+    with pytest.raises(InputError) as caught:
+        collect_pairs([ours], truths)
+    line = str(caught.value)
+    assert "2 of 3 missing (anna/one, anna/two)" in line and "\n" not in line
+    assert "5 without a truth (carl/0, carl/1, carl/2, ...)" in line
+
+
+def test_two_images_of_one_name_are_refused(truths: Path, ours: Path) -> None:
+    save(ours / "anna/one.exr", image("a"))
+    with pytest.raises(InputError, match=r"anna/one stands in one\.exr and one\.npy"):
+        collect_pairs([ours], truths)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr", ".png"])
+def test_another_size_is_refused_before_anything_is_read(truths: Path, ours: Path, suffix: str) -> None:
+    (ours / "anna/one.npy").unlink()
+    save(ours / f"anna/one{suffix}", np.zeros((6, 8, 3), np.float32))
+    with pytest.raises(
+        InputError, match=r"ours: 1 of 3 have another size .anna/one is 8 x 6, its truth 9 x 6"
+    ):
+        collect_pairs([ours], truths)
+
+
+def test_a_turned_photo_has_its_upright_size(tmp_path: Path) -> None:
+    upright = Image.fromarray((image("a") * 255).astype(np.uint8))  # 9 x 6
+    exif = Image.Exif()
+    exif[0x0112] = 6  # a quarter turn to be made when it is shown
+    (tmp_path / "ours").mkdir()
+    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "ours/a.jpg", exif=exif, quality=100)
+    save(tmp_path / "truth/a.exr", image("a"))
+    comparison = compare_pair(collect_pairs([tmp_path / "ours"], tmp_path / "truth")[0])
+    assert comparison.predictions["ours"].shape == comparison.truth.shape == SHAPE
+
+
+def test_masks_are_the_images_values_then_alpha_then_all(truths: Path, ours: Path) -> None:
+    alpha = np.full(SHAPE[:2], 0.25, np.float32)
+    save(truths / "anna/two.exr", image(NAMES[1]), alpha)
+    assert np.allclose(compare_pair(collect_pairs([ours], truths)[1]).mask, 0.25)
+    masks = truths.parent / "masks"
+    for name in NAMES:
+        save(masks / f"{name}.png", np.full(SHAPE[:2], 51))
+    with_masks = [compare_pair(pair).mask for pair in collect_pairs([ours], truths, masks)]
+    assert all(np.allclose(mask, 0.2) for mask in with_masks)
+    (masks / "anna/one.png").unlink()
+    with pytest.raises(InputError, match="masks: 1 of 3 missing"):
+        collect_pairs([ours], truths, masks)
+
+
+def test_facts_of_a_list(truths: Path, ours: Path) -> None:
+    path = truths.parent / "facts.csv"
+    path.write_text(
+        "\ufeffname, person, pose, angle\nanna/one, A, same, 5\nanna/two, A, other,\nbert/one,, same, 7.5\n"
+    )
+    pairs = collect_pairs([ours], truths, facts=path)
+    assert [pair.person for pair in pairs] == ["A", "A", "bert"]
+    assert [dict(pair.facts) for pair in pairs] == [
+        {"pose": "same", "angle": 5.0},
+        {"pose": "other"},
+        {"pose": "same", "angle": 7.5},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("person\nA\n", "no column 'name'"),
+        ("", "empty"),
+        ("name,person\nanna/one,A\n", "2 of 3 missing .anna/two, bert/one"),
+        ("name\nanna/one\nanna/one\n", "anna/one stands there twice"),
+        ("name,name\na,b\n", "two of one name"),
+        ("name,pose\nanna/one\n", "have not 2 cells"),
+        ("name\nanna/one\0\n", "1 without a truth|not CSV"),
+    ],
+)
+def test_lists_that_cannot_be_used(truths: Path, ours: Path, text: str, words: str) -> None:
+    path = truths.parent / "facts.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words):
+        collect_pairs([ours], truths, facts=path)
+
+
+@pytest.mark.parametrize("trouble", ["missing", "empty", "twice", "same name", "none"])
+def test_folders_that_are_none(truths: Path, ours: Path, trouble: str) -> None:
+    elsewhere = truths.parent / "b"
+    predictions, words = [ours], "no such folder"
+    if trouble == "missing":
+        predictions = [elsewhere]
+    elif trouble == "empty":
+        elsewhere.mkdir()
+        predictions, words = [elsewhere], "no pictures there"
+    elif trouble == "twice":
+        predictions, words = [truths], "given twice"
+    elif trouble == "same name":
+        save(elsewhere / "ours/anna/one.npy", image("a"))
+        predictions, words = [ours, elsewhere / "ours"], "two folders of predictions are called 'ours'"
+    else:
+        predictions, words = [], "no folder of predictions"
+    with pytest.raises(UsageError, match=words):
+        collect_pairs(predictions, truths)
+
+
+@pytest.mark.parametrize("trouble", ["pickle", "integers", "shape", "text", "nan", "no picture"])
+def test_files_that_hold_no_image(truths: Path, ours: Path, trouble: str) -> None:
+    path = ours / "anna/one.npy"
+    if trouble == "pickle":
+        np.save(path, np.array([Path("x")], object), allow_pickle=True)
+    elif trouble == "integers":
+        np.save(path, np.zeros(SHAPE, np.int64))
+    elif trouble == "shape":
+        np.save(path, np.zeros((2, *SHAPE), np.float32))
+    elif trouble == "nan":
+        np.save(path, np.full(SHAPE, np.nan, np.float32))
+    elif trouble == "text":
+        path.write_text("no array")
+    else:
+        path.unlink()
+        (ours / "anna/one.exr").write_text("no picture")
+    with pytest.raises(InputError, match=r"anna/one\.(npy|exr)"):
+        collect_pairs([ours], truths)
+
+
+def test_a_truth_without_a_face_has_no_face_distance(truths: Path, ours: Path) -> None:
+    pair = collect_pairs([ours], truths)[0]
+    with pytest.raises(InputError, match="no face found"):
+        compare_pair(pair, find_landmarks=True)

@@ -1,0 +1,211 @@
+"""Extended Yale B as a protocol: its cases, lights and pictures, against the benchmark that defines them."""
+
+import csv
+import importlib.util
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.case import Others
+from facerf_cli.evaluation.measure import Measures, measure
+from facerf_cli.evaluation.protocols import yale_b
+from facerf_cli.evaluation.protocols.yale_b import FIGURES, compare_sitter, fill_uncovered, layout, published
+from facerf_cli.evaluation.protocols.yale_b_cases import Sitter, environment_weights, face_mask
+from facerf_cli.face.morphable import load_face_model
+from tests.capture.yale_fixture import FLASHES, write_yale_b
+from tests.conftest import SHARED
+from tests.evaluation.toy_sitters import Lambert, Networks, someone
+
+BENCH = SHARED / "bench" / "yale_b"
+
+
+@pytest.fixture(scope="module")
+def reference() -> Iterator[tuple[ModuleType, ModuleType]]:
+    """The benchmark's yale.py and score.py."""
+    if not (BENCH / "yale.py").is_file():
+        pytest.skip(f"{BENCH} is not here (set FACERF_SHARED)")
+    modules = []
+    for name in ("yale", "score"):
+        spec = importlib.util.spec_from_file_location(name, BENCH / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        modules.append(sys.modules.setdefault(name, importlib.util.module_from_spec(spec)))
+        spec.loader.exec_module(modules[-1])
+    yield modules[0], modules[1]
+    for name in ("yale", "score"):
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture(scope="module")
+def databases(reference: tuple[ModuleType, ModuleType], shared_data: Path) -> tuple[YaleB, Any]:
+    """Ours and the benchmark's reading of the same folder."""
+    folder = shared_data / "extended_yale_b"
+    return read_yale_b(folder, read_shifts(BENCH / "shifts.csv")), reference[0].Yale(str(folder))
+
+
+def test_cases_are_the_benchmarks(databases: tuple[YaleB, Any]) -> None:
+    ours, theirs = databases
+    assert ours.subjects == theirs.subjects
+    tasks = {"frontal": "A", "soft": "A", "environment": "B"}
+    for subject in ours.subjects:
+        questions = Sitter(ours, subject).questions()
+        found = [(tasks[question.column], question.source, question.light) for question in questions]
+        assert found == theirs.cases(subject)
+
+
+@pytest.mark.parametrize("subject", ["yaleB02", "yaleB05", "yaleB13"])
+def test_images_are_the_benchmarks(databases: tuple[YaleB, Any], subject: str) -> None:
+    ours, theirs = databases
+    sitter = Sitter(ours, subject)
+    questions = list(sitter.questions())
+    for source in {question.source for question in questions}:
+        np.testing.assert_allclose(sitter.image(source), theirs.source(subject, source), atol=1e-6)
+    for light in {question.light for question in questions}:
+        np.testing.assert_allclose(sitter.image(light), theirs.target(subject, light), atol=1e-6)
+
+
+def test_lights_are_the_benchmarks(
+    databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType]
+) -> None:
+    flashes = databases[0].flashes("yaleB01")
+    named = [(flash.azimuth_deg, flash.elevation_deg) for flash in flashes]
+    theirs = np.stack([reference[0].light_dir(*angles) for angles in named])
+    np.testing.assert_allclose([flash.direction for flash in flashes], theirs, atol=1e-9)
+    for environment in reference[0].ENV:
+        weights = environment_weights(environment, tuple(flashes))
+        np.testing.assert_allclose(weights, reference[0].env_weights(environment, named), atol=1e-9)
+    np.testing.assert_array_equal(face_mask(), reference[0].MASK)
+
+
+def test_scores_are_the_benchmarks(
+    databases: tuple[YaleB, Any],
+    reference: tuple[ModuleType, ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
+    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    comparisons = list(compare_sitter(databases[0], "yaleB05", []))
+    assert len(comparisons) == len(databases[1].cases("yaleB05"))
+    for comparison in comparisons[::9]:
+        subject, _, light = comparison.case.name.split("/")
+        prediction = comparison.predictions["copy"][..., 0]
+        theirs = reference[1].measure(prediction, databases[1].target(subject, light))
+        (row,) = measure(comparison, Measures())
+        for ours, name in (("si_mse", "si_mse"), ("ssim", "ssim"), ("mse", "raw_mse")):
+            assert row.values[ours] == pytest.approx(theirs[name], abs=1e-6), (comparison.case.name, ours)
+
+
+def too_bright_sources(
+    sitter: Sitter, photo: np.ndarray, landmarks_px: np.ndarray, asked: list[Any], *_: Any
+) -> dict[str, np.ndarray]:
+    """In the place of methods: the source itself, twice as bright, so that scale and clipping count."""
+    assert landmarks_px.shape == (68, 2)
+    return {"copy": np.stack([2 * photo] * len(asked))}
+
+
+def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]) -> None:
+    lines = (BENCH / "README.md").read_text().splitlines()
+    table = [[cell.strip() for cell in line.split("|")[2:-1]] for line in lines if line.startswith("| ")][1:]
+    figures = [
+        [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
+    ]
+    assert sorted([*sum(columns, ()), *angles] for columns, angles in FIGURES.values()) == sorted(figures)
+    quotient = [row for row in published() if row.method == "quotient image"]
+    assert len(published()) == 11 * 4 and len(quotient) == 11
+    assert all(row.data == "same pictures, 21 people, told more" for row in quotient)
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> YaleB:
+    return read_yale_b(write_yale_b(tmp_path / "yale"))
+
+
+def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
+    fits = Counter[str]()
+    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    monkeypatch.setattr(yale_b, "see_head", lambda *_: fits.update(["seen"]))
+    models = Networks(load_face_model("builtin"))
+    methods: Any = [Lambert("a", models), Lambert("b", models)]
+    comparisons = list(compare_sitter(small, "yaleB07", methods))
+    columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
+    assert columns == {"frontal": 6, "soft": 4 * 7, "environment": 8} and fits["seen"] == 5  # one a source
+    for comparison in comparisons:
+        assert set(comparison.predictions) == {"a", "b"}
+        assert comparison.truth.shape == comparison.predictions["a"].shape == (192, 168, 3)
+        assert comparison.mask.shape == (192, 168) and comparison.case.person == "yaleB07"
+        assert comparison.grey_as_given
+    by_name = {comparison.case.name: comparison for comparison in comparisons}
+    side = by_name["yaleB07/frontal/A-070E+00"]
+    assert side.case.facts["angle"] == "60-80 deg" and side.case.facts["subjects"] == "test"
+    assert "angle" not in by_name["yaleB07/dome/A-070E+00"].case.facts
+    centre = side.predictions["a"][110, 84]
+    np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
+
+
+def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:
+    with pytest.raises(InputError, match=r"yaleB07: no face found"):
+        list(compare_sitter(small, "yaleB07", []))
+
+
+def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
+    folder = write_yale_b(tmp_path / "yale")
+    (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
+    with pytest.raises(InputError, match=r"yaleB07: has no sound picture under A\+000E\+00"):
+        list(compare_sitter(read_yale_b(folder), "yaleB07", []))
+
+
+def test_environments_come_from_their_side(small: YaleB) -> None:
+    flashes = tuple(sorted(FLASHES))
+    directions = np.stack([flash.direction for flash in flashes])
+    left, right = (environment_weights(name, flashes) @ directions for name in ("win_left", "win_right"))
+    assert (
+        left[0] < -0.2 and right[0] > 0.2 and environment_weights("overhead", flashes) @ directions[:, 1] > 0
+    )
+    assert environment_weights("dome", flashes).sum() == pytest.approx(1)
+
+
+def test_the_photo_goes_on_beyond_the_mesh() -> None:
+    covered = torch.zeros(8, 6)
+    covered[2:6, 1:5] = 1
+    photo = torch.rand(8, 6)
+    relit = 0.5 * (photo + 0.02) - 0.02  # half the light
+    filled = fill_uncovered(relit[None], photo * covered, photo, covered)[0]
+    torch.testing.assert_close(filled, torch.where(covered > 0, relit, relit.clamp_min(0)), atol=1e-5, rtol=0)
+
+
+def test_what_is_said_beside_the_figures(small: YaleB, tmp_path: Path) -> None:
+    plain = layout(small, ["yaleB05"])
+    assert any("without --shifts" in note for note in plain.notes)
+    assert any("chosen on yaleB05" in note for note in plain.notes)
+    assert any("1 known to be" in note for note in plain.notes)
+    with (tmp_path / "shifts.csv").open("w", newline="") as stream:
+        csv.writer(stream).writerows([("subject", "light", "dy", "dx"), ("yaleB07", "A+000E+00", 1, 0)])
+    moved = read_yale_b(small.folder, read_shifts(tmp_path / "shifts.csv"))
+    assert not any("without --shifts" in note for note in layout(moved, ["yaleB07"]).notes)
+    assert moved.shifts == {("yaleB07", Flash(0, 0)): (1, 0)}
+
+
+def test_predictions_in_files_are_read_as_the_benchmark_reads_them(
+    reference: tuple[ModuleType, ModuleType], tmp_path: Path
+) -> None:
+    values = np.random.default_rng(0).integers(0, 256, (192, 168, 3), np.uint8)
+    case = "yaleB05/frontal/A+035E-20"
+    grey, colours, array = (tmp_path / name for name in ("grey", "colours", "array"))
+    for folder in (grey, colours, array):
+        (folder / case).parent.mkdir(parents=True)
+    Image.fromarray(values[..., 0]).save(grey / f"{case}.png")
+    Image.fromarray(values).save(colours / f"{case}.png")
+    np.save(array / f"{case}.npy", values[..., 1] / np.float32(255))
+    found = Others((grey, colours, array), grey_as_given=True).predictions(case, (192, 168, 3))
+    for folder in (grey, colours, array):
+        theirs = reference[1].load(str(next(folder.rglob("A+035*"))))
+        np.testing.assert_allclose(found[folder.name], np.repeat(theirs[..., None], 3, -1), atol=1e-6)

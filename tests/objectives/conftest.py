@@ -1,3 +1,0 @@
-from tests.stage.conftest import bank, bank_folder
-
-__all__ = ["bank", "bank_folder"]

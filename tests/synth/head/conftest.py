@@ -1,0 +1,16 @@
+import pytest
+
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.synth.head.heads import build_head
+from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.heads_bank import mean_coefficients
+
+
+@pytest.fixture(scope="session")
+def model() -> MorphableModel:
+    return load_face_model()
+
+
+@pytest.fixture(scope="session")
+def head(model: MorphableModel) -> HeadMesh:
+    return build_head(model, *mean_coefficients(model))

@@ -1,0 +1,109 @@
+"""Hair grows on the scalp alone, and leaves the face to be seen."""
+
+import numpy as np
+import pytest
+
+from facerf_cli.face.topology import chart_uv
+from facerf_cli.synth.head.cranium import hull_of
+from facerf_cli.synth.head.hair import draw_hair, grow_hair
+from facerf_cli.synth.head.hair_styles import STYLES, HairStyle, draw_style
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, scalp_cover, scalp_margin_m
+
+Hairs = dict[str, tuple[HairStyle, HeadMesh]]
+HAIRY = tuple(name for name in STYLES if name != "bald")
+
+
+@pytest.fixture(scope="module")
+def hairs(head: HeadMesh) -> Hairs:
+    """Every style but none, grown once."""
+    return {name: grown(head, name) for name in HAIRY}
+
+
+def grown(head: HeadMesh, name: str, seed: int = 5) -> tuple[HairStyle, HeadMesh]:
+    random = np.random.default_rng(seed)
+    style = draw_style(random, name)
+    return style, grow_hair(head, style, random)
+
+
+@pytest.mark.parametrize("name", HAIRY)
+def test_every_style_is_a_sound_mesh_of_bounded_size(hairs: Hairs, name: str) -> None:
+    style, hair = hairs[name]
+    assert 50_000 < len(hair.vertices) <= 250_000 and len(hair.triangles) <= 250_000
+    assert hair.triangles.min() == 0 and hair.triangles.max() == len(hair.vertices) - 1
+    assert (hair.part == PARTS.index("hair")).all()
+    for field in (hair.vertices, hair.normals, hair.uv, hair.tangents):
+        assert np.isfinite(field).all() and field.dtype == np.float32
+    for field in (hair.normals, hair.tangents):
+        np.testing.assert_allclose(np.linalg.norm(field, axis=-1), 1, atol=1e-4)
+    assert hair.uv.min() == 0 and hair.uv.max() == 1
+    assert style.name == name
+
+
+@pytest.mark.parametrize("name", HAIRY)
+def test_hair_is_rooted_on_the_scalp_and_not_on_ears_face_or_neck(hairs: Hairs, name: str) -> None:
+    style, hair = hairs[name]
+    roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
+    assert (scalp_margin_m(roots, style) > -0.012).all()
+    azimuth = np.abs(np.degrees(np.arctan2(roots[:, 0], roots[:, 2])))
+    assert (roots[azimuth < 45, 1] > 0.075).all()  # the forehead
+    assert (roots[(azimuth > 75) & (azimuth < 97), 1] > 0.03).all()  # the ears
+    assert roots[:, 1].min() > -0.09  # the neck
+
+
+@pytest.mark.parametrize("name", HAIRY)
+def test_eyes_nose_and_mouth_are_seen_from_the_front(hairs: Hairs, name: str) -> None:
+    _, hair = hairs[name]
+    x, y, _ = hair.vertices.T
+    before = (np.abs(x) < 0.045) & (np.abs(y + 0.005) < 0.045) & (hair.vertices[:, 2] > 0)
+    assert not before.any()
+
+
+@pytest.mark.parametrize("name", HAIRY)
+def test_no_hair_passes_through_the_skin_or_floats_far_away(head: HeadMesh, hairs: Hairs, name: str) -> None:
+    style, hair = hairs[name]
+    free = hair.vertices[hair.uv[:, 1] > 0.5].astype(float)
+    height = hull_of(head).height(free)
+    assert np.quantile(height, 0.005) > -0.003
+    on_skull = free[:, 1] > 0.06
+    most = style.layer_mm + 12 if style.comb != "out" else style.top_mm + 15
+    assert np.quantile(height[on_skull], 0.995) < most / 1000
+
+
+def test_triangles_of_the_outer_layer_face_outward(hairs: Hairs) -> None:
+    _, hair = hairs["short"]
+    a, b, c = (hair.vertices[hair.triangles[:, k]] for k in range(3))
+    facet = np.cross(b - a, c - a)
+    outward = (facet * hair.normals[hair.triangles[:, 0]]).sum(-1) / np.linalg.norm(facet, axis=-1)
+    assert (outward > 0).mean() > 0.95
+
+
+def test_the_same_numbers_give_the_same_hair_and_others_another(head: HeadMesh) -> None:
+    first, second, other = (grown(head, "short", seed)[1] for seed in (3, 3, 4))
+    for name in ("vertices", "normals", "triangles", "uv", "tangents"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+    assert first.vertices.shape != other.vertices.shape or not np.array_equal(first.vertices, other.vertices)
+
+
+def test_the_bald_have_none_and_longer_cuts_reach_lower(head: HeadMesh, hairs: Hairs) -> None:
+    bald = draw_style(np.random.default_rng(0), "bald")
+    assert len(grow_hair(head, bald, np.random.default_rng(0)).vertices) == 0
+    lowest = [hairs[name][1].vertices[:, 1].min() for name in ("buzz", "bob", "long")]
+    assert lowest[0] > lowest[1] > lowest[2]
+
+
+def test_drawing_gives_hair_and_its_style_or_none_for_the_bald(head: HeadMesh) -> None:
+    drawn = [draw_style(np.random.default_rng(seed)).name for seed in range(200)]
+    assert set(drawn) == set(STYLES)
+    bald = drawn.index("bald")
+    assert draw_hair(head, np.random.default_rng(bald))[0] is None
+    hair, style = draw_hair(head, np.random.default_rng(drawn.index("buzz")))
+    assert hair is not None and style.name == "buzz"
+    with pytest.raises(ValueError, match="no hair style is called 'mullet'"):
+        draw_style(np.random.default_rng(0), "mullet")
+
+
+def test_the_cover_of_the_scalp_is_where_roots_are_and_not_on_the_face(hairs: Hairs) -> None:
+    style, hair = hairs["buzz"]
+    roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
+    assert scalp_cover(chart_uv(roots), style).mean() > 0.8
+    assert (scalp_cover(np.array([[0.5, 0.3], [0.3, 0.5], [0.5, 0.9]]), style) == 0).all()

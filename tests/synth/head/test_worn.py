@@ -1,0 +1,83 @@
+"""Glasses sit before the eyes and off the skin; clothes lie about the neck."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.synth.head import clothes, glasses
+from facerf_cli.synth.head.clothes import GARMENTS, draw_clothes
+from facerf_cli.synth.head.glasses import GLASSES, draw_glasses
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.heads_bank import mean_coefficients
+
+
+@pytest.fixture(scope="module")
+def landmarks(model: MorphableModel) -> np.ndarray:
+    alpha, beta = mean_coefficients(model)
+    return model.landmarks(model.vertices(alpha[None], beta[None]))[0].numpy()
+
+
+def require_sound(mesh: HeadMesh, part: str) -> None:
+    assert (mesh.part == PARTS.index(part)).all()
+    assert mesh.triangles.min() >= 0 and mesh.triangles.max() < len(mesh.vertices) < 10_000
+    for field in (mesh.vertices, mesh.normals, mesh.uv, mesh.tangents):
+        assert np.isfinite(field).all() and field.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=-1), 1, atol=1e-4)
+    a, b, c = (mesh.vertices[mesh.triangles[:, k]].astype(float) for k in range(3))
+    agree = (np.cross(b - a, c - a) * mesh.normals[mesh.triangles].mean(1)).sum(-1)
+    assert (agree > 0).mean() > 0.95
+
+
+@pytest.mark.parametrize("kind", GLASSES)
+def test_glasses_sit_before_the_eyes_and_not_in_the_skin(
+    head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(glasses, "GLASSES", (kind,))
+    frame = draw_glasses(head, landmarks, np.random.default_rng(2))
+    require_sound(frame, "frame")
+    front = frame.vertices[frame.vertices[:, 2] > 0.09]
+    eyes = landmarks[36:48]
+    assert front[:, 0].min() < eyes[:, 0].min() and front[:, 0].max() > eyes[:, 0].max()
+    assert front[:, 1].max() > eyes[:, 1].max()
+    if kind != "half-rim":
+        assert front[:, 1].min() < eyes[:, 1].min()
+    assert eyes[:, 2].max() < front[:, 2].max() < eyes[:, 2].max() + 0.04
+    assert frame.vertices[:, 2].min() < 0.02  # the temples reach the ears
+    skin = head.part[head.triangles[:, 0]] == PARTS.index("skin")
+    surface = trimesh.Trimesh(head.vertices, head.triangles[skin], process=False)
+    for points, away in (
+        (front[np.abs(front[:, 0]) < 0.05], np.array([0, 0, 1.0])),
+        (frame.vertices[frame.vertices[:, 0] > 0.06], np.array([1.0, 0, 0])),
+        (frame.vertices[frame.vertices[:, 0] < -0.06], np.array([-1.0, 0, 0])),
+    ):
+        covered = surface.ray.intersects_any(points, np.broadcast_to(away, points.shape))
+        assert covered.mean() < 0.01
+
+
+@pytest.mark.parametrize("kind", GARMENTS)
+def test_clothes_lie_outside_the_neck_and_reach_the_shoulders(
+    head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clothes, "GARMENTS", (kind,))
+    cloth = draw_clothes(head, np.random.default_rng(3))
+    require_sound(cloth, "cloth")
+    assert 0.38 < np.ptp(cloth.vertices[:, 0]) < 0.48
+    chin = -0.0755
+    assert abs(cloth.vertices[:, 1].min() - (chin - 0.16)) < 0.015
+    assert cloth.vertices[:, 1].max() < chin + 0.02
+    skin = head.vertices[head.part == PARTS.index("skin")].astype(float)
+    normals = head.normals[head.part == PARTS.index("skin")].astype(float)
+    low = skin[:, 1] < chin - 0.075
+    assert low.sum() > 100
+    shell = trimesh.Trimesh(cloth.vertices, cloth.triangles, process=False)
+    covered = shell.ray.intersects_any(skin[low] + 1e-4 * normals[low], normals[low])
+    assert covered.mean() > 0.99
+
+
+def test_the_same_numbers_give_the_same_things(head: HeadMesh, landmarks: np.ndarray) -> None:
+    for draw in (lambda r: draw_glasses(head, landmarks, r), lambda r: draw_clothes(head, r)):
+        first, second, other = (draw(np.random.default_rng(seed)) for seed in (1, 1, 2))
+        assert np.array_equal(first.vertices, second.vertices)
+        assert np.array_equal(first.triangles, second.triangles)
+        assert first.vertices.shape != other.vertices.shape or not np.allclose(first.vertices, other.vertices)

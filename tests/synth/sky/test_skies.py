@@ -1,0 +1,162 @@
+import numpy as np
+import pytest
+
+from facerf_cli.errors import UsageError
+from facerf_cli.synth.sky.daylight import (
+    SUN_RADIUS_DEG,
+    Rectangle,
+    around,
+    disc,
+    irradiance,
+    look_up,
+    make_grid,
+    noise_tile,
+    paint,
+    ring_noise,
+    toward,
+)
+from facerf_cli.synth.sky.interiors import Lights, draw_room
+from facerf_cli.synth.sky.landscape import Land, Skyline, stand_under, sun_is_seen
+from facerf_cli.synth.sky.skies import KINDS, MIX, Layer, cover, draw_sky, kind_of, parse_envmaps
+
+UP, NO_BEAM = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+
+
+@pytest.mark.parametrize("width_px", [16, 64, 256, 1024])
+@pytest.mark.parametrize("radius_deg", [SUN_RADIUS_DEG, 3.0, 20.0])
+@pytest.mark.parametrize("elevation_deg", [2.0, 41.3, 88.0])
+def test_a_disc_keeps_its_energy_and_place_at_any_size(
+    width_px: int, radius_deg: float, elevation_deg: float
+) -> None:
+    grid, centre = make_grid(width_px), toward(33.3, elevation_deg)
+    power = disc(grid, centre, radius_deg) * grid.solid_angles_sr
+    assert power.sum() == pytest.approx(2 * np.pi * (1 - np.cos(np.radians(radius_deg))), rel=1e-6)
+    mean = (power[..., None] * grid.directions).sum((0, 1))
+    angle = np.arccos(np.clip(mean @ centre / np.linalg.norm(mean), -1, 1))
+    assert angle < grid.pixel_rad
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_finite_not_negative_and_of_mean_one(kind: str) -> None:
+    for index in range(8):
+        pixels, name = draw_sky(index, 3, 64, (kind,))
+        assert name == kind and pixels.shape == (32, 64, 3) and pixels.dtype == np.float32
+        assert np.isfinite(pixels).all() and pixels.min() >= 0 and pixels.max() <= 60001
+        mean = (pixels.mean(-1) * make_grid(64).solid_angles_sr).sum() / (4 * np.pi)
+        assert mean == pytest.approx(1, rel=1e-4)
+
+
+def test_maps_depend_on_seed_and_index_alone() -> None:
+    later = draw_sky(5, 1, 32)[0]
+    draw_sky(0, 1, 32)
+    assert np.array_equal(later, draw_sky(5, 1, 32)[0])
+    assert not np.array_equal(later, draw_sky(5, 2, 32)[0])
+    assert not np.array_equal(later, draw_sky(6, 1, 32)[0])
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_a_sun_lights_alike_at_every_size(index: int) -> None:
+    """Radiance to the first order of harmonics, 64 against 512 pixels wide."""
+    moments = []
+    for width_px in (64, 512):
+        grid = make_grid(width_px)
+        power = KINDS["sun"](grid, np.random.default_rng(index)).sum(-1) * grid.solid_angles_sr
+        moments.append((power[..., None] * grid.directions).sum((0, 1)) / power.sum())
+    assert np.linalg.norm(moments[0] - moments[1]) < 0.04
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_size_changes_the_resolution_and_not_the_scene(kind: str) -> None:
+    """Irradiance from the six sides, 64 against 256 pixels wide."""
+    sides = np.concatenate([np.eye(3), -np.eye(3)])
+    small, large = (
+        irradiance(make_grid(width_px), draw_sky(4, 0, width_px, (kind,))[0], sides) for width_px in (64, 256)
+    )
+    assert np.abs(small - large).max() < 0.12 * large.max()
+
+
+def test_every_kind_is_drawn_in_its_share() -> None:
+    assert set(MIX) == set(KINDS)
+    drawn = [kind_of(index, 0) for index in range(1500)]
+    for kind in KINDS:
+        assert drawn.count(kind) / 1500 == pytest.approx(MIX.count(kind) / len(MIX), abs=0.03)
+
+
+def test_noise_is_periodic_and_of_deviation_one() -> None:
+    random = np.random.default_rng(0)
+    tile, ring = noise_tile(random), ring_noise(random, 1.0)
+    assert tile.std() == pytest.approx(1, abs=1e-3) and ring.std() == pytest.approx(1)
+    x = np.array([0.3, 1.3, -2.7])
+    assert np.ptp(look_up(tile, x, 0 * x)) < 1e-3
+    columns = around(make_grid(256), ring)
+    assert abs(columns[0] - columns[-1]) < 4 * np.abs(np.diff(columns)).max()
+
+
+def flat_land(grey: float, *skylines: Skyline) -> Land:
+    return Land(np.full((2, 3), grey), np.zeros((256, 256), np.float32), 10.0, 0.0, skylines)
+
+
+def test_ground_and_walls_reflect_what_falls_on_them() -> None:
+    grid = make_grid(64)
+    white = np.ones((32, 64, 3))
+    wall = Skyline(np.full(2048, 0.5), np.full((2048, 3), 0.4), 0.0, 0.0)
+    lit = stand_under(grid, white, flat_land(0.5, wall), UP, NO_BEAM)
+    np.testing.assert_allclose(lit[-8:], 0.5, rtol=0.01)  # under a sky of radiance 1
+    np.testing.assert_allclose(lit[:8], 1.0)
+    foot = 0.3 + 0.7 * float(grid.elevations_rad[13, 0]) / 0.5  # darker toward its foot
+    np.testing.assert_allclose(lit[13], 0.4 * 0.75 * foot, rtol=0.02)  # half sees sky, half the ground
+    sun = toward(0, 30).astype(float)
+    lit = stand_under(grid, 0 * white, flat_land(0.5, wall), sun, np.full(3, 2.0))
+    np.testing.assert_allclose(lit[-8:], 0.5 / np.pi * 2.0 * 0.5, rtol=0.01)
+    assert lit[13, 0, 0] > 3 * lit[13, 32, 0]  # what faces the sun, opposite to it
+
+
+def test_a_skyline_hides_the_sun() -> None:
+    tops = np.where(np.arange(2048) < 1024, 0.3, -0.01)  # azimuth 0 to 180 degrees
+    land = flat_land(0.2, Skyline(tops, np.zeros((2048, 3)), 0.0, 0.0))
+    assert not sun_is_seen(land, 90, 10) and sun_is_seen(land, 90, 30) and sun_is_seen(land, -90, 10)
+
+
+def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
+    grid, sun = make_grid(64), toward(0, 50)
+    sky, beam = np.full((32, 64, 3), 5.0) * [0.5, 1, 2], np.full(3, 80.0)
+    tile = np.zeros((256, 256), np.float32)
+    closed, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), -1.0, 3.0, 25.0)])
+    assert share == pytest.approx(np.exp(-3), rel=1e-3)
+    assert closed[2, 32, 2] / closed[2, 32, 0] < 2  # bluish sky, whiter cloud
+    none, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), 1.0, 3.0, 25.0)])
+    assert share == 1 and np.allclose(none, sky)
+
+
+def test_a_room_is_brightest_near_its_lamp() -> None:
+    grid, random = make_grid(64), np.random.default_rng(2)
+    room, lights = draw_room(grid, random, (0.4, 0.5)), Lights(grid)
+    centre = toward(70, 20)
+    lights.add(centre, paint(disc(grid, centre, 4), [100.0, 100, 100]), flat=False)
+    light = room.lit(lights).mean(-1) / room.albedo.mean(-1)
+    brightest = grid.directions.reshape(-1, 3)[light.argmax()]
+    assert brightest @ centre > 0.8
+    assert np.isfinite(light).all() and light.min() > 0
+
+
+def test_a_rectangle_covers_its_solid_angle() -> None:
+    grid = make_grid(512)
+    cover_sr = (
+        Rectangle(40, 10, 0.3, 0.5).cover(grid.directions, grid.pixel_rad) * grid.solid_angles_sr
+    ).sum()
+    exact = 4 * np.arcsin(0.3 * 0.5 / np.sqrt((1 + 0.09) * (1 + 0.25)))
+    assert cover_sr == pytest.approx(exact, rel=0.01)
+
+
+def test_procedural_maps_are_drawn_lazily() -> None:
+    maps = parse_envmaps("procedural:1000000", 7, 32)
+    assert len(maps) == 1000000
+    assert np.array_equal(maps[999999], draw_sky(999999, 7, 32)[0])
+    with pytest.raises(IndexError):
+        maps[1000000]
+
+
+@pytest.mark.parametrize("text", ["procedural:", "procedural:0", "procedural:-3", "procedural:1e3", "sky:3"])
+def test_a_bad_word_for_maps_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match="procedural:N"):
+        parse_envmaps(text, 0)

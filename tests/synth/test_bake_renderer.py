@@ -1,0 +1,223 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.stats import norm
+
+from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.raster.camera import Camera
+from facerf_cli.synth import bake_renderer
+from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.bake_renderer import RenderSettings, photograph, scattered_irradiance
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.synth.views import StageCamera
+
+DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
+POINT_LAMP = BakeSettings(lamp_radius_deg=0, bounce_samples=0)
+AHEAD = np.array([[0.0, 0, 1]], np.float32)
+
+
+def material(albedo: float = 0.5, specular: float = 0.04, relief: tuple = (0.0, 0.0)) -> Material:
+    def full(channels: int, value: float) -> torch.Tensor:
+        return torch.full((channels, 8, 8), value)
+
+    slopes = torch.tensor(relief).view(2, 1, 1).expand(2, 8, 8)
+    return Material(full(3, albedo), full(1, specular), full(1, 0.4), slopes)
+
+
+def appearance(one: Material, scattering_mm: tuple = (0.0, 0.0, 0.0)) -> Appearance:
+    return Appearance(dict.fromkeys(PARTS, one), torch.tensor(scattering_mm), {})
+
+
+def board(part: str = "skin", side_m: float = 0.1, count: int = 21, z: float = 0.0) -> HeadMesh:
+    """A square facing +z with u to the right and v down, tangents (of hair) down."""
+    v, u = np.meshgrid(*2 * [np.linspace(0, 1, count)], indexing="ij")
+    vertices = np.stack([(u - 0.5) * side_m, (0.5 - v) * side_m, 0 * u + z], -1).reshape(-1, 3)
+    cells = np.arange(count * count).reshape(count, count)[:-1, :-1].ravel()
+    first = np.stack([cells, cells + count, cells + count + 1], -1)
+    second = np.stack([cells, cells + count + 1, cells + 1], -1)
+    ahead, down = np.zeros((2, *vertices.shape), np.float32)
+    ahead[:, 2], down[:, 1] = 1, -1 if part == "hair" else 0
+    return HeadMesh(
+        vertices.astype(np.float32),
+        ahead,
+        np.concatenate([first, second]),
+        np.full(len(vertices), PARTS.index(part), np.uint8),
+        np.stack([u, v], -1).reshape(-1, 2).astype(np.float32),
+        down,
+    )
+
+
+def ball(radius_m: float = 0.05) -> HeadMesh:
+    sphere = trimesh.creation.icosphere(4, radius_m)
+    normals = np.array(sphere.vertices / radius_m, np.float32)
+    return HeadMesh(
+        np.array(sphere.vertices, np.float32),
+        normals,
+        np.array(sphere.faces, np.int64),
+        np.zeros(len(normals), np.uint8),
+        np.full((len(normals), 2), 0.5, np.float32),
+        np.zeros_like(normals),
+    )
+
+
+def camera(side_px: int = 64, field_m: float = 0.12, distance_m: float = 10.0) -> StageCamera:
+    lens = Camera(side_px * distance_m / field_m, side_px, side_px, side_px / 2, side_px / 2)
+    return StageCamera(lens, torch.eye(3), torch.tensor([0.0, 0, -distance_m]))
+
+
+def bake(head: HeadMesh, lamps: np.ndarray, settings: BakeSettings = POINT_LAMP) -> MeshTransport:
+    hair = head.part == PARTS.index("hair")
+    return bake_mesh(head.vertices, head.normals, head.triangles, lamps, settings, all_round=hair)
+
+
+def test_a_diffuse_ball_has_the_radiance_of_lambert_and_the_coverage_of_its_disc() -> None:
+    head, lamps = ball(), rig_directions(7).numpy()
+    images, coverage = photograph(head, appearance(material()), bake(head, lamps), camera(), DIFFUSE)
+    assert abs(float(coverage.sum()) - np.pi * (0.05 / 0.12 * 64) ** 2) < 0.01 * float(coverage.sum())
+    assert ((coverage > 0) & (coverage < 1)).sum() > 60  # antialiased
+    centre = (np.arange(64) + 0.5 - 32) / 64 * 0.12
+    x, y = np.meshgrid(centre, -centre)
+    z = np.sqrt(np.clip(0.05**2 - x**2 - y**2, 0, None))
+    normals = np.stack([x, y, z], -1) / 0.05
+    inside = np.hypot(x, y) < 0.045
+    for lamp, image in zip(lamps, images, strict=True):
+        expected = 0.5 * np.clip(normals @ lamp, 0, None)
+        assert np.abs(image[0].numpy() - expected)[inside].max() < 0.02
+        assert np.abs(image[0].numpy() - expected)[inside].mean() < 0.002
+    assert (images[:, :, coverage == 0] == 0).all()
+
+
+def test_each_channel_has_its_own_albedo() -> None:
+    head = board()
+    one = replace(material(), albedo=torch.tensor([0.8, 0.4, 0.1]).view(3, 1, 1).expand(3, 8, 8))
+    images, _ = photograph(head, appearance(one), bake(head, AHEAD), camera(), DIFFUSE)
+    assert torch.allclose(images[0, :, 32, 32], torch.tensor([0.8, 0.4, 0.1]), atol=1e-5)
+
+
+def test_pictures_do_not_depend_on_the_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    head, lamps = joined(ball(), board("hair", z=-0.01)), rig_directions(9).numpy()
+    transport, person = bake(head, lamps, BakeSettings()), appearance(material(), (2.0, 1.0, 0.5))
+    whole, _ = photograph(head, person, transport, camera(32))
+    monkeypatch.setattr(bake_renderer, "_CHUNK", 1)
+    irradiance = scattered_irradiance(head, person, transport)
+    parts, _ = photograph(head, person, transport, camera(32), irradiance=irradiance)
+    assert torch.allclose(whole, parts, atol=1e-6)
+
+
+def test_scattering_keeps_even_light_and_softens_an_edge_by_channel() -> None:
+    head = board(count=81)
+    transport = bake(head, AHEAD)
+    person = appearance(material(), (4.0, 2.0, 0.5))
+    settings = replace(DIFFUSE, scattering=True)
+    even = scattered_irradiance(head, person, transport, settings)
+    assert np.allclose(even, 1, atol=1e-4)
+    half = replace(transport, visibility=transport.visibility * (head.vertices[:, 0] > 0))
+    dark = np.flatnonzero(np.abs(head.vertices[:, 0] + 0.00125) < 1e-5)  # a column just beyond the edge
+    red, green, blue = scattered_irradiance(head, person, half, settings)[:, dark, 0].mean(1)
+    assert 0.5 > red > green > blue
+    at = head.vertices[:, 0], np.abs(head.vertices[:, 1]) < 0.02
+    profile = scattered_irradiance(head, person, half, settings)[0, :, 0]
+    slope = [float(profile[at[1] & (np.abs(at[0] - x) < 1e-5)].mean()) for x in (-0.005, -0.0025, 0.0, 0.005)]
+    expected = norm.cdf((np.array([-5, -2.5, 0, 5]) - 0.6) / 4)  # lit from half a cell on
+    assert np.abs(np.array(slope) - expected).max() < 0.05
+
+
+def test_scattering_stays_within_the_skin() -> None:
+    head = joined(board("cloth", z=1e-4), board("skin"))
+    transport = bake(head, AHEAD, POINT_LAMP)
+    person = appearance(material(), (6.0, 6.0, 6.0))
+    spread = scattered_irradiance(head, person, transport, replace(DIFFUSE, scattering=True))
+    skin = head.part == PARTS.index("skin")
+    assert (spread[:, skin] == 0).all() and (spread[:, ~skin] == 1).all()  # the cloth covers it
+
+
+def test_bounces_add_up() -> None:
+    floor = board(side_m=0.2)
+    wall = replace(
+        floor,
+        vertices=floor.vertices[:, [2, 1, 0]] + np.array([0.1, 0, 0.1], np.float32),  # mirrored: faces -x
+        normals=floor.normals[:, [2, 1, 0]] * np.float32(-1),
+    )
+    head = joined(floor, wall)
+    transport = bake_mesh(head.vertices, head.normals, head.triangles, AHEAD, BakeSettings(bounce_samples=64))
+    person = appearance(material(0.5))
+    levels = [
+        scattered_irradiance(head, person, transport, replace(DIFFUSE, bounces=bounces))[0, :, 0]
+        for bounces in range(3)
+    ]
+    on_wall = head.normals[:, 0] < -0.5
+    assert np.allclose(levels[0][on_wall], 0) and 0.05 < levels[1][on_wall].mean() < 0.25
+    on_floor = ~on_wall & (head.vertices[:, 0] < 0.09)
+    assert np.allclose(levels[1][on_floor], levels[0][on_floor])  # it sees the wall, which is dark
+    assert (levels[2][on_floor] - levels[1][on_floor]).mean() > 0.005
+
+
+def test_a_highlight_lies_at_the_mirrored_lamp_and_dark_skin_has_it_too() -> None:
+    head = ball()
+    lamp = np.array([[0.6, 0.0, 0.8]], np.float32)
+    transport = bake(head, lamp)
+    shine = []
+    for albedo in (0.6, 0.05):
+        person = appearance(material(albedo))
+        glossy, _ = photograph(head, person, transport, camera(), replace(DIFFUSE, gloss=True))
+        matte, _ = photograph(head, person, transport, camera(), DIFFUSE)
+        shine.append((glossy - matte)[0, 1])
+    assert torch.allclose(shine[0], shine[1], atol=1e-6)
+    peak = np.unravel_index(int(shine[0].argmax()), (64, 64))
+    half = np.array([0.6, 0, 1.8]) / np.linalg.norm([0.6, 0, 1.8])
+    expected = 32 + half[0] * 0.05 / 0.12 * 64
+    assert abs(peak[1] + 0.5 - expected) < 2 and abs(peak[0] + 0.5 - 32) < 2
+    assert shine[0].max() > 0.05
+
+
+def test_relief_turns_the_surface_as_its_slopes_say() -> None:
+    head = board()
+    lamps = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.6, 0.8], [0, -0.6, 0.8]], np.float32)
+    transport, settings = bake(head, lamps), replace(DIFFUSE, relief=True)
+
+    def at_centre(relief: tuple[float, float]) -> list[float]:
+        images, _ = photograph(head, appearance(material(relief=relief)), transport, camera(), settings)
+        return images[:, 0, 32, 32].tolist()
+
+    right, left, above, below = at_centre((0.3, 0.0))  # rises to the right, so it faces left
+    assert left > 1.1 * above and right < 0.9 * below and above == pytest.approx(below, rel=1e-3)
+    right, left, above, below = at_centre((0.0, 0.3))  # rises downward, so it faces up
+    assert above > 1.1 * left and below < 0.9 * right and left == pytest.approx(right, rel=1e-3)
+
+
+def test_hair_shines_across_its_strands_and_is_lit_from_behind() -> None:
+    head = board("hair")
+    lamps = np.array([[0, 0, 1], [0.8, 0, 0.6], [0, 0.8, 0.6], [0.6, 0, -0.8]], np.float32)
+    transport = bake(head, lamps)
+    images, _ = photograph(head, appearance(material(0.2)), transport, camera())
+    matte, _ = photograph(head, appearance(material(0.2)), transport, camera(), DIFFUSE)
+    shine = (images - matte)[:, 0, 32, 32]
+    assert shine[1] > 5 * shine[2]  # strands hang down: they mirror what comes from the side, not from above
+    assert shine[0] > 0.02
+    # Kajiya's sine, wrapped: toward the normal 1, and nothing is left at 0.25 + 0.75 n.l < 0.
+    assert matte[0, 0, 32, 32] == pytest.approx(0.2, abs=1e-4)
+    assert matte[1, 0, 32, 32] == pytest.approx(0.2 * 0.7, abs=1e-4)
+    assert matte[3, 0, 32, 32] == 0
+    grazing = np.array([[0.98, 0, -0.199]], np.float32)
+    behind, _ = photograph(head, appearance(material(0.2)), bake(head, grazing), camera(), DIFFUSE)
+    assert behind[0, 0, 32, 32] > 0.01
+
+
+def test_an_eye_keeps_its_highlight_in_a_coarse_image() -> None:
+    """Where a pixel holds a wide range of normals the lobe widens, and the light of all pixels stays."""
+    head = ball(0.012)
+    head = replace(head, part=np.full(len(head.part), PARTS.index("eye"), np.uint8))
+    lamp = np.array([[0.3, 0.3, 0.9]], np.float32)
+    lamp /= np.linalg.norm(lamp)
+    wet = replace(material(0.0), roughness=torch.full((1, 8, 8), 0.15))
+    transport = bake(head, lamp)
+    means = []
+    for side in (12, 256):
+        images, coverage = photograph(head, appearance(wet), transport, camera(side, 0.03))
+        means.append(float(images.sum() / coverage.sum()))
+    assert means[0] == pytest.approx(means[1], rel=0.35)

@@ -1,0 +1,77 @@
+import math
+
+import torch
+
+from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.shading import bend, diffuse_irradiance, highlights, scatter, unit
+
+
+def _skin(side: int = 4, specular: float = 0.04, roughness: float = 0.5) -> Skin:
+    def full(channels: int, value: float) -> torch.Tensor:
+        return torch.full((1, channels, side, side), value)
+
+    return Skin(full(3, 1.0), full(1, specular), full(1, roughness), full(2, 0.0), torch.ones(1, 3))
+
+
+def test_a_white_surface_facing_a_light_of_rgb_one_has_radiance_one() -> None:
+    facing = torch.ones(1, 4, 4)
+    irradiance = diffuse_irradiance(facing, 0 * facing, facing, torch.ones(3, 4, 4), torch.ones(1, 3))
+    assert torch.allclose(irradiance * _skin().albedo[0], torch.ones(3, 4, 4))
+
+
+def test_the_bounce_is_tinted_by_the_albedo() -> None:
+    albedo = torch.tensor([0.5, 0.25, 0.125]).view(3, 1, 1).expand(3, 4, 4)
+    dark = torch.zeros(1, 4, 4)
+    irradiance = diffuse_irradiance(dark, dark + 0.4, dark, albedo, torch.ones(1, 3))
+    assert torch.allclose(irradiance[:, 0, 0], torch.tensor([0.2, 0.1, 0.05]))
+
+
+def test_scattering_keeps_a_constant_and_the_sum_of_a_point() -> None:
+    sigma = torch.tensor([[0.5, 1.0, 2.0]])
+    constant = scatter(torch.full((1, 3, 20, 24 - 4), 0.7), sigma)
+    assert torch.allclose(constant, torch.full_like(constant, 0.7), atol=1e-6)
+    point = torch.zeros(1, 3, 31, 31)
+    point[..., 15, 15] = 1
+    spread = scatter(point, sigma)
+    assert torch.allclose(spread.sum((2, 3)), torch.ones(1, 3), atol=1e-5)
+    assert spread[0, 0, 15, 15] > spread[0, 1, 15, 15] > spread[0, 2, 15, 15]
+
+
+def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
+    # Directional albedo of the two lobes under a uniform dome: f pi cos over solid angle / pi.
+    count = 4000
+    index = torch.arange(count) + 0.5
+    z = index / count
+    turn = math.pi * (1 + 5**0.5) * index
+    radius = (1 - z * z).sqrt()
+    lights = torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1)[None]
+    normals = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1)
+    view = unit(torch.tensor([0.5, 0.0, 1.0]), 0).view(1, 3, 1, 1)
+    mirror = _skin(1, specular=1.0, roughness=0.4)
+    reflected = highlights(normals, view, lights, mirror).sum() * (2 * math.pi / count) / math.pi
+    assert 0.6 < reflected < 1.01
+    lamp = unit(torch.tensor([0.0, 0.6, 0.8]), 0)
+    there = highlights(normals, view, lamp.view(1, 1, 3), _skin(1))[0, 0, 0, 0] / 0.8
+    back = (
+        highlights(normals, lamp.view(1, 3, 1, 1), view.view(1, 1, 3), _skin(1))[0, 0, 0, 0]
+        / view[0, 2, 0, 0]
+    )
+    assert torch.allclose(there, back, rtol=1e-4)
+
+
+def test_flat_relief_leaves_normals_alone() -> None:
+    normals = unit(torch.randn(1, 3, 4, 4), 1)
+    assert torch.allclose(bend(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6)
+
+
+def test_skins_span_light_to_dark_and_repeat_with_their_seed() -> None:
+    first, second = (draw_skin(24, 48, torch.Generator().manual_seed(5)) for _ in "ab")
+    assert torch.equal(first.albedo, second.albedo)
+    cheek = first.albedo[:, :, 24:28, 10:14].mean((1, 2, 3))
+    assert cheek.min() < 0.15 and cheek.max() > 0.4
+    assert first.albedo.min() > 0 and first.albedo.max() < 1
+    assert first.roughness.min() > 0.1 and first.specular.min() >= 0
+    red_over_blue = first.albedo[:, 0, 24:28, 10:14].mean((1, 2)) / first.albedo[:, 2, 24:28, 10:14].mean(
+        (1, 2)
+    )
+    assert (red_over_blue > 1).float().mean() > 0.7  # skin is warm; a share wears random colours

@@ -1,0 +1,206 @@
+"""Composites on synthetic full frames: a Lambertian face of the built-in model before a noisy background."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.composite import (
+    CompositeSettings,
+    FaceView,
+    Surround,
+    change_of_light,
+    composite,
+    photo_camera,
+    view_face,
+)
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
+from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
+from facerf_cli.raster.camera import pose_to_rotation, project
+from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
+
+HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
+CROP = Crop(105.3, 60.7, 219.0, 160)
+RIG = rig_directions()
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A face's mesh and true OLAT textures, and the background behind it."""
+
+    vertices: Tensor
+    olats: Tensor  # [L, 3, T, T]
+    background: np.ndarray
+
+    def image(self, envmap: Tensor) -> np.ndarray:
+        camera = photo_camera(CROP, HEIGHT_PX, WIDTH_PX)
+        face, alpha = render_texture(self.lit(envmap), self.vertices, grid_triangles(), grid_uv(), camera)
+        return np.where(alpha.numpy()[..., None] > 0, face.numpy(), self.background)
+
+    def lit(self, envmap: Tensor) -> Tensor:
+        return torch.einsum("lc,lcij->cij", envmap_weights(envmap, RIG), self.olats)
+
+
+@cache
+def scene() -> Scene:
+    noise = torch.Generator().manual_seed(0)
+    model = load_face_model("builtin")
+    vertices = model.mean @ pose_to_rotation(14, 4, -3).T + torch.tensor([0.0, 0.01, -1.25])
+    coarse = 0.5 + 0.15 * torch.randn(1, 3, 48, 48, generator=noise)
+    pores = 1 + 0.06 * torch.randn(1, 1, TEXTURE, TEXTURE, generator=noise)
+    albedo = torch.nn.functional.interpolate(coarse, (TEXTURE, TEXTURE), mode="bilinear") * pores
+    cosine = torch.einsum("lc,cij->lij", RIG, normal_map(vertices, grid_triangles(), TEXTURE)).clamp(min=0)
+    background = torch.rand(HEIGHT_PX, WIDTH_PX, 3, generator=noise).numpy()
+    return Scene(vertices, cosine[:, None] * albedo[0].clamp(0.05, 1), background)
+
+
+def sky(azimuth_deg: float, sharpness: float, rgb: tuple[float, float, float]) -> Tensor:
+    """A map whose light comes mostly from one side."""
+    toward = latlong_directions(32, 64) @ azel_to_direction(azimuth_deg, 25.0)
+    return (0.15 + 2 * toward.clamp(min=0) ** sharpness)[..., None] * torch.tensor(rgb)
+
+
+OWN = sky(-30, 2, (1.0, 0.9, 0.8))
+OTHER = sky(60, 4, (0.7, 0.9, 1.3))
+
+
+@cache
+def unwrapped() -> tuple[np.ndarray, Tensor, Tensor]:
+    """The photo, its source texture and what of it was seen."""
+    photo = scene().image(OWN)
+    crop = torch.from_numpy(CROP.apply(photo)).permute(2, 0, 1).contiguous()
+    texture, seen = unwrap(crop, scene().vertices, grid_triangles(), CROP.camera, TEXTURE)
+    return photo, inpaint(texture, seen), seen
+
+
+def view() -> FaceView:
+    return view_face(scene().vertices, photo_camera(CROP, HEIGHT_PX, WIDTH_PX), CROP.side_px)
+
+
+def surround() -> Surround:
+    return Surround(scene().vertices, CROP, HEIGHT_PX, WIDTH_PX)
+
+
+def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """Over the pixels inside, with the truth's maximum there as the peak."""
+    error = ((result - truth)[mask] ** 2).mean()
+    return float(10 * np.log10(truth[mask].max() ** 2 / error))
+
+
+def inside_face() -> np.ndarray:
+    return view().full(view().mask) > 0.5
+
+
+def test_own_light_gives_the_photo_back() -> None:
+    photo, source, seen = unwrapped()
+    result = composite(photo, source, scene().lit(OWN), seen, view(), surround())
+    assert psnr_db(result, photo, inside_face()) > 30
+
+
+def test_relit_texture_equal_to_the_source_changes_nothing() -> None:
+    photo, source, seen = unwrapped()
+    result = composite(photo, source, source, seen, view(), surround())
+    np.testing.assert_allclose(result, photo, atol=2e-5)
+
+
+def test_other_light_comes_out_as_if_rendered() -> None:
+    photo, source, seen = unwrapped()
+    result = composite(photo, source, scene().lit(OTHER), seen, view(), None)
+    truth = scene().image(OTHER)
+    drawn = view().full(view().render(scene().lit(OTHER)))
+    assert psnr_db(result, truth, inside_face()) > 28
+    assert psnr_db(photo, truth, inside_face()) < 15  # or the test says nothing
+    assert np.isfinite(drawn).all()
+
+
+@pytest.mark.parametrize("gain", [0.01, 1.0, 300.0])
+def test_brightness_of_the_light_scales_the_image(gain: float) -> None:
+    photo, source, seen = unwrapped()
+    relit = scene().lit(OTHER)
+    once = composite(photo, source, relit, seen, view(), surround())
+    scaled = composite(photo, source, gain * relit, seen, view(), surround())
+    np.testing.assert_allclose(scaled, gain * once, rtol=2e-3, atol=1e-4 * gain)
+
+
+def test_without_surround_only_the_face_changes() -> None:
+    photo, source, seen = unwrapped()
+    result = composite(photo, source, scene().lit(OTHER), seen, view(), None)
+    outside = view().full(view().mask) == 0
+    assert outside.mean() > 0.5
+    np.testing.assert_array_equal(result[outside], photo[outside])
+    assert np.abs(result - photo)[~outside].max() > 0.1
+
+
+def test_a_matte_says_what_may_change() -> None:
+    photo, source, seen = unwrapped()
+    matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
+    matte[:, 200:] = 1
+    result = composite(photo, source, scene().lit(OTHER), seen, view(), surround(), matte)
+    whole = composite(photo, source, scene().lit(OTHER), seen, view(), surround())
+    np.testing.assert_array_equal(result[:, :200], photo[:, :200])
+    np.testing.assert_allclose(result[:, 200:], whole[:, 200:], atol=1e-5)
+
+
+def test_no_border_shows_where_the_surroundings_are_skin() -> None:
+    """A wall that goes on in the face's own colour: the change across the mask's border is smooth."""
+    _, source, seen = unwrapped()
+    flat = np.full((HEIGHT_PX, WIDTH_PX, 3), 0.5, np.float32)
+    grey = torch.full_like(source, 0.5)
+    cosine = torch.einsum(
+        "c,cij->ij", azel_to_direction(20.0, 15.0), normal_map(scene().vertices, grid_triangles(), TEXTURE)
+    )
+    relit = grey * cosine.clamp(min=0)
+    border = (view().full(view().mask) > 0.01) & (view().full(view().mask) < 0.5)
+
+    def steps(around: Surround | None) -> float:
+        result = composite(flat, grey, relit, seen, view(), around)[..., 1]
+        return float(np.percentile(np.hypot(*np.gradient(result))[border], 99))
+
+    assert steps(surround()) < 0.5 * steps(None)
+
+
+def test_dark_source_is_drawn_and_not_multiplied() -> None:
+    source, relit = torch.full((3, 32, 32), 0.4), torch.full((3, 32, 32), 0.3)
+    source[:, 16:19, 22:25] = 1e-6  # a cheek's
+    gain, offset = change_of_light(source, relit, torch.ones(32, 32))
+    assert float(gain.max()) < 1.1 / CompositeSettings().dark
+    torch.testing.assert_close(gain * source + offset, relit, atol=3e-4, rtol=0)  # the lips' are inpainted
+
+
+def test_eyes_keep_their_detail() -> None:
+    source = torch.full((3, 128, 128), 0.4)
+    eyes = region_mask("eyes", 128) > 0.99
+    source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
+    relit = torch.full((3, 128, 128), 0.2)
+    gain, offset = change_of_light(source, relit, torch.ones(128, 128))
+    torch.testing.assert_close(gain[:, eyes], torch.full_like(gain[:, eyes], 0.5), rtol=0.02, atol=0)
+    assert float(offset[:, eyes].abs().max()) < 1e-3
+
+
+def test_mask_lies_on_the_face_and_ends_softly() -> None:
+    mask = view().full(view().mask)
+    covered = view().full(view().coverage) > 0
+    assert (mask[~covered] == 0).all()
+    steps = np.hypot(*np.gradient(mask))
+    assert np.percentile(steps[mask > 0], 99.9) < 0.3 and steps.max() < 0.5
+
+
+def test_photo_camera_sees_what_the_crop_camera_sees() -> None:
+    camera = photo_camera(CROP, HEIGHT_PX, WIDTH_PX)
+    in_crop = project(scene().vertices, CROP.camera).numpy()
+    np.testing.assert_allclose(project(scene().vertices, camera).numpy(), CROP.to_photo(in_crop), atol=1e-2)
+
+
+def test_a_face_half_outside_its_photo() -> None:
+    crop = Crop(-100.0, -60.0, 219.0, 160)
+    face = view_face(scene().vertices, photo_camera(crop, 120, 90), crop.side_px)
+    photo = np.full((120, 90, 3), 0.5, np.float32)
+    _, source, seen = unwrapped()
+    around = Surround(scene().vertices, crop, 120, 90)
+    assert np.isfinite(composite(photo, source, scene().lit(OTHER), seen, face, around)).all()

@@ -1,0 +1,181 @@
+"""`--ray`: the contract of a folder verb, on two workers that are killed while they work."""
+
+import importlib.util
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli.options import Shard
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.logs import configure_logging
+from facerf_cli.ray_workers import connect
+from tests.cli.toy_batch import run
+
+pytestmark = pytest.mark.slow
+needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
+NAMES = tuple(f"{letter}.png" for letter in "abcdefgh")
+ITEMS = [f"x/{letter}" for letter in "abcdefgh"]
+
+
+@pytest.fixture(scope="module")
+def two_workers() -> Iterator[None]:
+    ray = connect("local", 2)
+    yield
+    ray.shutdown()
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    configure_logging()
+    folder = tmp_path / "photos"
+    for name in NAMES:
+        path = folder / "x" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return folder
+
+
+def rows(report: Path) -> dict[str, dict]:
+    found = [json.loads(line) for line in report.read_text().splitlines()]
+    table = {row["item"]: row | {"seconds": None} for row in found}
+    assert len(table) == len(found), "an item has two rows"
+    return table
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*.bin"))}
+
+
+def written(tmp_path: Path) -> list[str]:
+    return sorted((tmp_path / "written").read_text().split())
+
+
+@needs_ray
+@pytest.mark.parametrize("address", ["nowhere", "ray://head:10001", "127.0.0.1:1", "127.0.0.1:99999"])
+def test_a_wrong_address_is_one_line(photos: Path, tmp_path: Path, address: str) -> None:
+    with pytest.raises(UsageError, match=f"^--ray {address}: (give HOST:PORT|cannot be reached)"):
+        run(photos, tmp_path / "out", ray=address)
+
+
+@needs_ray
+def test_one_tree_however_it_is_made(photos: Path, tmp_path: Path, two_workers: None) -> None:
+    (photos / "x" / "c.png").write_bytes(b"bad")
+    ways = {"one": {}, "two": {"jobs": 2}, "ray": {"ray": "local", "jobs": 2}}
+    for name, options in ways.items():
+        assert run(photos, tmp_path / name, **options) == 1
+    assert run(photos, tmp_path / "shards", Shard(1, 2)) == 1
+    assert run(photos, tmp_path / "shards", Shard(2, 2), ray="local") == 0
+    assert len(rows(tmp_path / "shards/report-1-of-2.jsonl")) == 4
+    assert run(photos, tmp_path / "shards") == 1
+    for name in (*ways, "shards"):
+        assert tree(tmp_path / name) == tree(tmp_path / "one") and len(tree(tmp_path / name)) == 7
+        assert rows(tmp_path / name / "report.jsonl") == rows(tmp_path / "one/report.jsonl")
+        assert not list((tmp_path / name).rglob(".*"))
+
+
+@needs_ray
+def test_a_worker_is_killed_while_it_works(
+    photos: Path, tmp_path: Path, two_workers: None, capsys: pytest.CaptureFixture
+) -> None:
+    (photos / "x" / "b.png").write_bytes(b"wait")
+    killer = threading.Thread(target=kill_the_victim, args=(tmp_path,))
+    killer.start()
+    assert run(photos, tmp_path / "out", ray="local", jobs=2) == 0
+    killer.join()
+    assert written(tmp_path) == ITEMS
+    assert [row["status"] for row in rows(tmp_path / "out/report.jsonl").values()] == ["done"] * len(NAMES)
+    assert len(tree(tmp_path / "out")) == len(NAMES) and not list((tmp_path / "out").rglob(".*"))
+    said = capsys.readouterr()
+    assert [Path(line).name for line in said.out.splitlines()] == [f"{name[0]}_copy.bin" for name in NAMES]
+    assert said.err.count("a worker was lost; its item is tried again") == 1
+    assert said.err.count("warning: at ") == len(NAMES) and "Traceback" not in said.err
+
+
+def kill_the_victim(notes: Path) -> None:
+    deadline_s = time.monotonic() + 60
+    while not (notes / "victim").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    time.sleep(0.2)
+    os.kill(int((notes / "victim").read_text()), signal.SIGKILL)
+
+
+def ends(process: int) -> bool:
+    """Whether a process that nobody waits for is gone in a while."""
+    for _ in range(300):
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        time.sleep(0.1)
+    return False
+
+
+@needs_ray
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_worker_is_killed_when_it_has_written(
+    photos: Path, tmp_path: Path, two_workers: None, overwrite: bool
+) -> None:
+    (photos / "x" / "b.png").write_bytes(b"late")
+    assert run(photos, tmp_path / "out", ray="local", jobs=2, overwrite=overwrite) == 0
+    assert written(tmp_path).count("x/b") == (2 if overwrite else 1)
+    assert rows(tmp_path / "out/report.jsonl")["x/b"]["status"] == "done"
+
+
+@needs_ray
+def test_an_item_that_always_kills_its_worker_is_given_up(
+    photos: Path, tmp_path: Path, two_workers: None, capsys: pytest.CaptureFixture
+) -> None:
+    (photos / "x" / "b.png").write_bytes(b"die")
+    assert run(photos, tmp_path / "out", ray="local", jobs=2) == 1
+    assert (tmp_path / "died").read_text() == "x/b\n" * 3
+    assert written(tmp_path) == [name for name in ITEMS if name != "x/b"]
+    assert "b.png: its process died" in capsys.readouterr().err
+
+
+@needs_ray
+def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, two_workers: None) -> None:
+    (photos / "x" / "b.png").write_bytes(b"stop")
+    (photos / "x" / "c.png").write_bytes(b"wait")
+    start_s = time.monotonic()
+    with pytest.raises(FacerfError, match=r"^the checkpoint is broken$"):
+        run(photos, tmp_path / "out", ray="local", jobs=2)
+    assert time.monotonic() - start_s < 30 and not list((tmp_path / "out").rglob(".*"))
+
+
+@needs_ray
+def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
+    (photos / "x" / "a.png").write_bytes(b"wait")
+    root = Path(__file__).parents[1]
+    command = [sys.executable, "-m", "tests.cli.toy_batch", str(photos), str(tmp_path / "out")]
+    process = subprocess.Popen(command, cwd=root, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    deadline_s = time.monotonic() + 60
+    while not (tmp_path / "victim").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
+    assert process.communicate(timeout=40)[1].rstrip().endswith("KeyboardInterrupt")
+    assert process.returncode != 0 and not list((tmp_path / "out").rglob(".*"))
+    assert ends(int((tmp_path / "victim").read_text()))
+
+
+@needs_ray
+def test_what_answers_need_not_be_ray(tmp_path: Path) -> None:
+    code = "from facerf_cli.ray_workers import connect\nimport sys\nconnect(sys.argv[1])"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        command = [sys.executable, "-c", code, f"127.0.0.1:{server.getsockname()[1]}"]
+        result = subprocess.run(command, capture_output=True, text=True, timeout=90)
+    assert "UsageError: --ray 127.0.0.1:" in result.stderr.splitlines()[-1]
+
+
+def test_without_ray(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UsageError, match=r"^--ray: Ray is not installed; pip install 'facerf\[ray\]'$"):
+        run(photos, tmp_path / "out", ray="local")

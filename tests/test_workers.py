@@ -1,0 +1,85 @@
+"""Processes that work for `--jobs`: what one that dies costs, what they say, and how they end."""
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.errors import FacerfError
+from facerf_cli.logs import LOGGER_NAME, configure_logging
+from facerf_cli.workers import Workers, in_order, spread
+
+
+def work(item: str) -> str:
+    logging.getLogger(LOGGER_NAME).warning("at %s", item)
+    if item == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if item == "raise":
+        raise ValueError(item)
+    if item.startswith("slow"):
+        time.sleep(0.5)
+    if item.startswith("/"):
+        try:
+            Path(item).touch()
+            time.sleep(60)
+        finally:
+            Path(item).unlink()
+    return item.upper()
+
+
+def broken(item: str, error: Exception) -> str:
+    return f"{item}: {error}"
+
+
+def run(*items: str, jobs: int = 2) -> Generator[str]:
+    configure_logging()
+    return spread(work, items, Workers(jobs), broken)
+
+
+def test_a_process_that_dies_costs_its_own_item(capsys: pytest.CaptureFixture) -> None:
+    found = list(run("slow a", "die", "b", "die", "die", "c"))
+    dead = "die: killed by SIGKILL"
+    assert found == ["SLOW A", dead, "B", dead, dead, "C"]
+    err = capsys.readouterr().err
+    assert [f"facerf: warning: at {item}\n" in err for item in ("slow a", "b", "c")] == [True] * 3
+
+
+def test_every_one_dies() -> None:
+    assert list(run(*["die"] * 3)) == ["die: killed by SIGKILL"] * 3
+
+
+def test_what_the_work_raises_is_raised_here() -> None:
+    with pytest.raises(ValueError, match="raise"):
+        list(run("a", "raise", "slow b"))
+
+
+def test_who_stops_listening_ends_the_workers(tmp_path: Path) -> None:
+    results = run("a", str(tmp_path / "b"), jobs=2)
+    assert next(results) == "A"
+    while not (tmp_path / "b").exists():
+        time.sleep(0.01)
+    start_s = time.monotonic()
+    results.close()
+    assert not (tmp_path / "b").exists(), "SIGTERM unwinds"
+    assert time.monotonic() - start_s < 8
+
+
+def _refuse(pipe: object, level: int, threads: int) -> None:
+    raise SystemExit(3)
+
+
+def test_processes_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facerf_cli.workers._serve", _refuse)
+    with pytest.raises(FacerfError, match=r"could not start \(exit code 3\); try --jobs 1"):
+        list(run("a", "b"))
+
+
+def test_in_order() -> None:
+    def early() -> Generator[tuple[int, str]]:
+        yield from ((2, "c"), (0, "a"), (1, "b"), (3, "d"))
+
+    assert "".join(in_order(early())) == "abcd"

@@ -1,0 +1,97 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
+from facerf_cli.synth.heads_bank import Bank
+from facerf_cli.training.loop import train
+from facerf_cli.training.objective import concatenate, seeded
+from facerf_cli.training.settings import PRESETS
+from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
+from tests.toy_faces import ToyFaces, toy_objective
+
+NETWORK = ReflectanceSettings(
+    side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=20
+)
+
+
+def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> None:
+    settings = ChartSettings(lights=3, held_out_heads=2, held_out_draws=2)
+    objective = ChartObjective(bank, ReflectanceNetwork(NETWORK), settings=settings)
+    train(objective, tmp_path, replace(PRESETS["tiny"], steps=60))
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    losses = torch.tensor([row["loss"] for row in rows])
+    assert losses[-10:].mean() < 0.9 * losses[:10].mean()
+    assert rows[-1]["validation"]["si_mse"] < rows[9]["validation"]["si_mse"]
+
+
+def test_a_sample_does_not_depend_on_its_neighbours() -> None:
+    objective = toy_objective()
+    whole = objective.draw(4, lambda i: seeded(5, i), 1)
+    halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
+    joined = concatenate([half.sample for half in halves])
+    assert torch.equal(whole.sample.target, joined.target) and torch.equal(whole.sample.source, joined.source)
+    assert whole.heads.tolist() == [head for half in halves for head in half.heads.tolist()]
+    assert len(set(whole.heads.tolist())) > 1
+
+
+def test_the_loss_of_a_batch_is_the_mean_of_its_halves() -> None:
+    objective = toy_objective()
+    halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
+    whole = objective.draw(4, lambda i: seeded(5, i), 1)
+    mean = torch.stack([objective(half)["root"] for half in halves]).mean()
+    assert torch.allclose(objective(whole)["root"], mean, rtol=1e-6)
+
+
+def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apart(bank: Bank) -> None:
+    settings = ChartSettings(held_out_heads=2, held_out_draws=12)
+    objective = ChartObjective(bank, ReflectanceNetwork(NETWORK), settings=settings)
+    first, second = objective.validate(), objective.validate()
+    assert first.metrics == second.metrics
+    assert first.metrics.keys() == {"si_mse", "si_mse_same_pose", "si_mse_other_pose"}
+    assert first.sheet is not None and first.sheet.shape == (5 * 2 * 32, 7 * 32, 3)
+    assert np.isfinite(first.sheet).all() and first.sheet.max() > 0.1
+
+
+def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
+    torch.manual_seed(0)
+    light = LightNetwork(LightSettings(width=0.05, grid=4, hidden=8)).eval().requires_grad_(False)
+    settings = ChartSettings(lights=2, held_out_heads=3)
+    objective = ChartObjective(ToyFaces(), toy_objective().networks["reflectance"], light, settings)
+    batch = objective.draw(2, lambda i: seeded(1, i), 1)
+    terms = objective(batch)
+    assert terms.keys() == {"root", "light_features"} and float(terms["light_features"].detach()) > 0
+    terms["light_features"].backward()
+    assert all(parameter.grad is None for parameter in light.parameters())
+    gradients = [parameter.grad for parameter in objective.networks.parameters()]
+    assert any(gradient is not None and float(gradient.abs().max()) > 0 for gradient in gradients)
+    assert "light" not in objective.networks
+
+
+def test_the_papers_form_trains_in_the_chart(tmp_path: Path) -> None:
+    network = PaperReflectanceNetwork(PaperReflectanceSettings(16, (8, 8), 8))
+    objective = ChartObjective(ToyFaces(), network, settings=ChartSettings(lights=2, held_out_heads=3))
+    loss = objective(objective.draw(2, lambda i: seeded(1, i), 1))["root"]
+    loss.backward()
+    assert loss.isfinite() and all(p.grad is not None for p in network.parameters())
+
+
+@pytest.mark.parametrize("normals", [True, False])
+def test_without_normals_the_network_does_not_see_them(normals: bool) -> None:
+    torch.manual_seed(0)
+    settings = ReflectanceSettings(16, (8, 8), (8, 8), template_channels=1, rig_lights=8, normals=normals)
+    objective = ChartObjective(ToyFaces(), ReflectanceNetwork(settings))
+    sample = objective.draw(1, lambda i: seeded(1, i), 1).sample
+    network = objective.networks["reflectance"]
+    turned = sample.normals_source.flip(-1) * torch.tensor([-1.0, 1, 1]).view(3, 1, 1)
+    seen = []
+    for maps in (sample.normals_source, turned.roll(3, -1)):
+        encoded = network.encode(sample.source, maps, sample.visible)
+        seen.append(network.decode(encoded, maps, sample.lights))
+    assert torch.equal(seen[0], seen[1]) != normals

@@ -1,0 +1,68 @@
+import torch
+
+from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.reflectance import head_rotation
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.synth.heads_bank import Bank
+from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
+from facerf_cli.training.objective import seeded
+
+SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_views=3)
+
+
+def objective(bank: Bank) -> LightFeaturesObjective:
+    return LightFeaturesObjective(bank, LightNetwork(LightSettings(1 / 8, 4, 32)), SETTINGS)
+
+
+def test_training_lowers_the_loss_and_finds_lights_of_held_out_heads(bank: Bank) -> None:
+    stage = objective(bank)
+    before = stage.validate().metrics["angle_deg"]
+    optimizer = torch.optim.AdamW(stage.networks.parameters(), lr=2e-3)
+    losses = []
+    for step in range(60):
+        loss = sum(stage(stage.draw(2, lambda i, step=step: seeded(0, step, i), step)).values())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert sum(losses[-10:]) < 0.5 * sum(losses[:10])
+    after = stage.validate()
+    assert after.metrics["angle_deg"] < 50 < before  # one constant guess is off by 65
+    assert after.metrics == stage.validate().metrics
+    assert stage.chooses_by in after.metrics and set(stage.networks) == {"light_features"}
+    assert after.sheet is not None and after.sheet.shape == (2 * 3 * 3 * 32, 4 * 32, 3)
+
+
+def test_a_sample_does_not_depend_on_its_neighbours(bank: Bank) -> None:
+    stage = objective(bank)
+    whole = stage.draw(3, lambda i: seeded(1, i), 0)
+    part = stage.draw(1, lambda i: seeded(1, i + 2), 0)
+    assert torch.equal(whole.textures[2:], part.textures)
+    assert torch.equal(whole.lights_head[2:], part.lights_head)
+    terms = [stage(stage.draw(1, lambda i, k=k: seeded(1, k), 0))["light"] for k in range(3)]
+    assert torch.allclose(stage(whole)["light"], torch.stack(terms).mean())
+
+
+def test_textures_are_black_where_unseen_and_lit_from_the_lights_side(bank: Bank) -> None:
+    batch = objective(bank).draw(8, lambda i: seeded(2, i), 0)
+    assert (batch.textures.amax((1, 2)) == 0).any()
+    brightness = batch.textures.mean(2)
+    right_less_left = brightness[..., 16:].sum((2, 3)) - brightness[..., :16].sum((2, 3))
+    sideways = batch.lights_head[..., 0]
+    clear = sideways.abs() > 0.5
+    assert clear.sum() > 4
+    assert (right_less_left[clear].sign() == sideways[clear].sign()).float().mean() > 0.9
+
+
+def test_lights_of_a_real_direction_stay_unit_vectors(bank: Bank) -> None:
+    lights = objective(bank).draw(4, lambda i: seeded(3, i), 0).lights_head
+    assert torch.allclose(lights.norm(dim=-1), torch.ones(4, 4), atol=1e-5)
+
+
+def test_the_heads_turn_is_found_from_its_normals() -> None:
+    mean = torch.nn.functional.normalize(
+        torch.randn(3, 8, 8) + torch.tensor([0, 0, 2.0]).view(3, 1, 1), dim=0
+    )
+    turn = pose_to_rotation(30.0, -10.0, 5.0)
+    turned = torch.einsum("dc,cij->dij", turn, mean)
+    assert torch.allclose(head_rotation(mean, turned[None])[0], turn, atol=1e-5)

@@ -1,0 +1,117 @@
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.network.feature_networks import VggFeatures, feature_distance
+from facerf_cli.training.losses import (
+    PaperWeights,
+    Seen,
+    appearance_loss,
+    closest_points,
+    landmark_loss,
+    light_loss,
+    photometric_loss,
+    regularisation,
+    slid_contour,
+)
+
+
+def test_weights_are_the_papers() -> None:
+    weights = PaperWeights()
+    assert (weights.landmarks, weights.photometric, weights.regularisation, weights.features) == (25, 5, 1, 1)
+    assert (weights.alpha, weights.beta) == (0.4, 0.002)
+
+
+@pytest.mark.parametrize("side_px", [64, 512])
+def test_landmarks_are_in_half_sides(side_px: int) -> None:
+    found, detected = torch.rand(2, 66, 2) * side_px, torch.rand(2, 66, 2) * side_px
+    for face, value in enumerate(landmark_loss(found, detected, side_px).tolist()):
+        total = 0.0
+        for a, b in zip(found[face].tolist(), detected[face].tolist(), strict=True):
+            total += sum(((p - q) / (side_px / 2)) ** 2 for p, q in zip(a, b, strict=True))
+        assert value == pytest.approx(total / 66, rel=1e-4)
+
+
+def test_contour_slides_to_the_closest_candidates_and_pulls_only_them() -> None:
+    candidates = (torch.rand(2, 40, 2) * 100).requires_grad_()
+    detected = (torch.rand(2, 17, 2) * 100).requires_grad_()
+    ids = closest_points(candidates, detected)
+    for face in range(2):
+        for number, point in enumerate(detected[face].tolist()):
+            distances = [math.dist(point, other) for other in candidates[face].tolist()]
+            assert int(ids[face, number]) == distances.index(min(distances))
+    slid = slid_contour(candidates, detected)
+    assert torch.equal(slid, torch.stack([c[i] for c, i in zip(candidates, ids, strict=True)]))
+    landmark_loss(slid, detected.detach(), 100).sum().backward()
+    assert detected.grad is None  # which candidate it is has no gradient
+    assert candidates.grad is not None
+    moved = {(face, int(i)) for face, i, _ in candidates.grad.nonzero().tolist()}
+    assert moved == {(face, int(i)) for face in range(2) for i in ids[face]}
+
+
+def test_contour_moves_along_when_the_mesh_slides() -> None:
+    """A landmark that the mesh passes by finds another vertex, not the one that it had."""
+    line = torch.stack([torch.arange(20.0), torch.zeros(20)], -1)[None]
+    landmark = torch.tensor([[[7.2, 1.0]]])
+    assert closest_points(line, landmark).item() == 7
+    assert closest_points(line + torch.tensor([5.0, 0]), landmark).item() == 2
+
+
+def test_regularisation_is_the_weighed_mean_of_squares() -> None:
+    alpha, beta = torch.randn(3, 40), torch.randn(3, 29)
+    for face, value in enumerate(regularisation(alpha, beta).tolist()):
+        by_hand = 0.4 * sum(a * a for a in alpha[face].tolist()) / 40
+        by_hand += 0.002 * sum(b * b for b in beta[face].tolist()) / 29
+        assert value == pytest.approx(by_hand, rel=1e-5)
+
+
+def test_photometric_loss_is_a_mean_over_the_mask() -> None:
+    prediction, target = torch.rand(2, 3, 9, 9).requires_grad_(), torch.rand(2, 3, 9, 9)
+    mask = (torch.rand(2, 1, 9, 9) > 0.5).float()
+    loss, shown = photometric_loss(prediction, target, mask), prediction.detach()
+    for face in range(2):
+        inside = [(r, c) for r in range(9) for c in range(9) if mask[face, 0, r, c]]
+        differences = [
+            abs(shown[face, k, r, c] - target[face, k, r, c]).item() for r, c in inside for k in range(3)
+        ]
+        assert loss[face].item() == pytest.approx(sum(differences) / len(differences), rel=1e-4)
+    loss.sum().backward()
+    assert prediction.grad is not None and (prediction.grad[(mask == 0).expand_as(prediction)] == 0).all()
+    assert photometric_loss(prediction, target, mask * 0).sum().item() == 0
+
+
+@pytest.fixture(scope="module")
+def net() -> VggFeatures:
+    torch.manual_seed(0)
+    return VggFeatures(width=0.1).requires_grad_(False)
+
+
+def _seen(side: int) -> Seen:
+    mask = torch.zeros(2, 1, side, side)
+    mask[..., 2:-2] = 1
+    return Seen(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
+
+
+def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
+    image, texture = _seen(24), _seen(16)
+    expected: Tensor = torch.zeros(2)
+    for seen in (image, texture):
+        one, other = seen.prediction * seen.mask, seen.target * seen.mask
+        layers = zip(net.layers(one), net.layers(other), strict=True)
+        expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) for a, b in layers)
+    assert torch.allclose(appearance_loss(net, image, texture), expected, rtol=1e-4)
+    alone = feature_distance(net, texture.prediction * texture.mask, texture.target * texture.mask)
+    assert torch.allclose(light_loss(net, texture), alone)
+
+
+def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:
+    image, texture = _seen(24), _seen(16)
+    target = texture.target.requires_grad_()
+    appearance_loss(net, image, Seen(texture.prediction, target, texture.mask)).sum().backward()
+    assert target.grad is None
+    for seen in (image, texture):
+        grad = seen.prediction.grad
+        assert grad is not None and grad.abs().sum() > 0
+        assert (grad[(seen.mask == 0).expand_as(grad)] == 0).all()
