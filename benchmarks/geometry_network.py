@@ -23,7 +23,8 @@ from torch import Tensor
 
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FitSettings, FitStart, better_start, fit_batch, problem_of, started
+from facerf_cli.face.fit import FitSettings, fit_batch, fit_problem
+from facerf_cli.face.fit_start import FitStart, better_start, start_states
 from facerf_cli.face.gauss_newton import (
     FitState,
     Problem,
@@ -96,8 +97,8 @@ def report(name: str, network: GeometryNetwork, crops: Tensor, landmarks_px: Ten
         start = FitStart(*network(crops))
     model, camera = load_face_model(), crop_camera(crops.shape[-1])
     trust = torch.ones(landmarks_px.shape[:2], dtype=torch.float64)
-    problem, cold = problem_of(model, landmarks_px.double(), camera, FitSettings(), trust)
-    seen, laid = started(problem, start)
+    problem, cold = fit_problem(model, landmarks_px.double(), camera, FitSettings(), trust)
+    seen, laid = start_states(problem, start)
     percent = sliding_percent(problem, seen)
     print(f"{name}: {len(crops)} crops, sliding contour: all 68 {percent.mean():.2f} %, "
           f"inner 51 {percent[:, len(CONTOUR):].mean():.2f} %, "
@@ -107,7 +108,7 @@ def report(name: str, network: GeometryNetwork, crops: Tensor, landmarks_px: Ten
         problem,
         {
             "cold": cold,
-            "mean head laid on the landmarks": started(problem, mean_head)[1],
+            "mean head laid on the landmarks": start_states(problem, mean_head)[1],
             "network as it is": seen,
             "network's head laid on the landmarks": laid,
             "what the fit takes": better_start(problem, cold, start),

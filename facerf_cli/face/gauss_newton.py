@@ -1,9 +1,7 @@
-"""Damped Gauss-Newton on projected landmarks, batched over B faces in float64; `face/fit.py` sets it up.
+"""Damped Gauss-Newton on projected landmarks, for B faces at once in float64; `face/fit.py` sets it up.
 
-Contour landmarks slide: each is held to the closest point of the mesh's silhouette near the jaw, found
-anew at every step (paper, 'Landmark loss').
-
-The face's outline along the jaw, on which contour landmarks slide (paper, 'Landmark loss').
+Contour landmarks slide along the jaw: each one is compared with the closest point of the mesh's silhouette,
+which is found again at every step (paper, 'Landmark loss').
 """
 
 from collections.abc import Callable
@@ -15,24 +13,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import CONTOUR, GRID, LANDMARK_UV, LANDMARKS_M, locate
+from facerf_cli.face.silhouette import POINTS_PER_RAY, RAYS_PER_LANDMARK, band_uv, outermost
+from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, locate
 from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
 
 INNER_COUNT = 68 - len(CONTOUR)
-RAYS_PER_LANDMARK, POINTS_PER_RAY = 8, 10  # of the contour's band
-CONTOUR_RAYS = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
-_BAND = (0.6, 1.0)  # from the nose (0) to the jaw line (1): where the silhouette may wander
 _FIRST_DAMPING = 1e-3
-_SETTLED = 1e-7  # share of the cost by which the last step lowered it
-_STUCK = 1e3  # damping at which no step lowers the cost any more
-_WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides at most two landmarks' way along the jaw
+_SETTLED = 1e-7  # a face has settled when a step lowers its cost by less than this share
+_STUCK = 1e3  # or when no step lowers its cost at this damping
+_WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides by at most two landmarks along the jaw
 
 
 class _Batched:
     """Dataclasses of tensors whose first axis is the face."""
 
     def where(self, accept: Tensor, other: Self) -> Self:
-        """These faces where accept [B] holds, else the other's."""
+        """Select these faces where accept [B] is true, else the other's."""
         names = [field.name for field in fields(self)]  # type: ignore[arg-type]
         pairs = ((getattr(self, name), getattr(other, name)) for name in names)
         return type(self)(*(torch.where(accept.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in pairs))
@@ -40,10 +36,10 @@ class _Batched:
 
 @dataclass(frozen=True)
 class FitBasis:
-    """The model at the points that a fit may use: the inner landmarks first, then the contour's band by rays.
+    """The model at the N points that a fit uses: the inner landmarks, then the contour's band ray by ray.
 
-    The fit works in Q coordinates with standard normal priors, an orthonormal turn of the whitened
-    coefficients that leaves out what moves none of these points.
+    The fit works in Q coordinates with standard normal priors: the whitened coefficients in an orthonormal
+    basis, without the directions that move none of these points.
     """
 
     mean: Tensor  # [N, 3]
@@ -54,14 +50,8 @@ class FitBasis:
 
 @cache
 def fit_points() -> tuple[Tensor, Tensor]:
-    """Vertices [N, 3] and weights [N, 3] of the points of every model's FitBasis."""
-    along = np.arange(CONTOUR_RAYS) / RAYS_PER_LANDMARK
-    contour = LANDMARK_UV[list(CONTOUR)]
-    ends = np.stack([np.interp(along, CONTOUR, contour[:, axis]) for axis in (0, 1)], -1)
-    centre = np.array([0.5, LANDMARK_UV[[28, 33], 1].mean()])
-    share = np.linspace(*_BAND, POINTS_PER_RAY)[:, None]
-    band = centre + share * (ends - centre)[:, None]  # [rays, points, 2]
-    return locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band.reshape(-1, 2)]))
+    """Vertex ids [N, 3] and barycentric weights [N, 3] of the points of every model's FitBasis."""
+    return locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band_uv().reshape(-1, 2)]))
 
 
 @dataclass(frozen=True)
@@ -75,7 +65,7 @@ class FitState(_Batched):
 
 @dataclass(frozen=True)
 class Residuals(_Batched):
-    """Landmark differences in pixels, and the points of the basis that they are taken at."""
+    """Landmark differences in pixels, and the points of the basis where they are taken."""
 
     difference_px: Tensor  # [B, 68, 2]
     points_camera: Tensor  # [B, 68, 3]
@@ -84,7 +74,7 @@ class Residuals(_Batched):
 
 @dataclass(frozen=True)
 class Problem:
-    """What is minimised: Huber's cost of the weighed landmark differences, plus the squared coordinates."""
+    """A cost to minimise: Huber's cost of the weighted landmark differences, plus the squared coordinates."""
 
     basis: FitBasis
     target_px: Tensor  # [B, 68, 2]
@@ -93,26 +83,8 @@ class Problem:
     huber: float
 
 
-def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tuple[FitState, Tensor]:
-    """The mean's pose from a scaled orthographic fit to the inner landmarks, and its pixels per metre [B]."""
-    model = basis.mean[:INNER_COUNT]
-    image = target_px[:, len(CONTOUR) :] * torch.tensor([1.0, -1.0], dtype=torch.float64)  # y up
-    centred = model - model.mean(0)
-    middle = image.mean(1)
-    affine = torch.linalg.lstsq(centred.expand(len(image), -1, -1), image - middle[:, None]).solution.mT
-    u, stretch, vh = torch.linalg.svd(affine, full_matrices=False)  # affine [B, 2, 3]
-    scale = stretch.mean(-1)
-    rows = u @ vh
-    rotation = torch.cat([rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])], 1)
-    depth_m = camera.focal_px / scale
-    offset = (middle - torch.tensor([camera.cx_px, -camera.cy_px], dtype=torch.float64)) / scale[:, None]
-    translation = torch.cat([offset, -depth_m[:, None]], 1) - rotation @ model.mean(0)
-    coordinates = torch.zeros(len(image), basis.modes.shape[-1], dtype=torch.float64)
-    return FitState(rotation, translation, coordinates), scale
-
-
 def minimise(problem: Problem, state: FitState, steps: int) -> FitState:
-    """The state [B] after at most so many accepted steps."""
+    """The state [B] after at most `steps` steps."""
     return descend(
         lambda there: residuals(problem, there),
         lambda there, at: landmark_cost(problem, at) + prior_cost(there),
@@ -129,16 +101,17 @@ def descend(
     state: FitState,
     steps: int,
 ) -> FitState:
-    """Levenberg's damped Gauss-Newton; each face accepts a step only where its cost [B] falls.
+    """Run Levenberg's damped Gauss-Newton; each face accepts a step only if its cost [B] falls.
 
-    A face that has settled rests, so that it ends where it would have alone; when all have, so does this.
+    A settled face no longer changes, so its result does not depend on the other faces; the loop ends when all
+    faces have settled.
     """
     damping = torch.full((len(state.coordinates),), _FIRST_DAMPING, dtype=torch.float64)
     at = residuals_of(state)
     cost = cost_of(state, at)
     settled = torch.zeros_like(cost, dtype=torch.bool)
     for _ in range(steps):
-        trial = moved(state, step_of(state, at, damping))
+        trial = apply_step(state, step_of(state, at, damping))
         trial_at = residuals_of(trial)
         trial_cost = cost_of(trial, trial_at)
         accept = (trial_cost < cost) & ~settled  # False for NaN
@@ -151,8 +124,15 @@ def descend(
     return state
 
 
+def apply_step(state: FitState, step: Tensor) -> FitState:
+    """The state after a step [B, 6 + Q]: rotation exp(omega) R, translation shifted in units of its depth."""
+    omega, shift, change = step[:, :3], step[:, 3:6], step[:, 6:]
+    translation = state.translation_m - shift * state.translation_m[:, 2:]
+    return FitState(so3_exp(omega) @ state.rotation, translation, state.coordinates + change)
+
+
 def residuals(problem: Problem, state: FitState) -> Residuals:
-    """Where the 68 landmarks lie on the mesh now, the contour at the closest points of its silhouette."""
+    """Residuals of the 68 landmarks; contour landmarks use the closest points of the silhouette."""
     basis, batch = problem.basis, len(problem.target_px)
     head = basis.mean + (state.coordinates @ basis.modes.flatten(0, 1).mT).reshape(batch, -1, 3)
     in_camera = head @ state.rotation.mT + state.translation_m[:, None]
@@ -167,9 +147,8 @@ def _closest_edge(problem: Problem, state: FitState, band_px: Tensor) -> Tensor:
     """The band's points [B, 17] on the silhouette that lie closest to the contour landmarks."""
     outward = problem.basis.outward @ state.rotation.mT  # [B, rays, 3]
     rays = outward.shape[1]
-    by_ray = band_px.reshape(-1, rays, POINTS_PER_RAY, 2)
-    reach = by_ray[..., 0] * outward[..., None, 0] - by_ray[..., 1] * outward[..., None, 1]
-    edge = reach.argmax(-1) + torch.arange(rays) * POINTS_PER_RAY  # [B, rays]
+    furthest = outermost(band_px.reshape(-1, rays, POINTS_PER_RAY, 2), outward)
+    edge = furthest + torch.arange(rays) * POINTS_PER_RAY  # [B, rays]
     edge_px = band_px.gather(1, edge[..., None].expand(-1, -1, 2))
     near = torch.arange(len(CONTOUR))[:, None] * RAYS_PER_LANDMARK + torch.arange(-_WINDOW, _WINDOW + 1)
     near = near.clamp(0, rays - 1)  # [17, window]
@@ -178,15 +157,38 @@ def _closest_edge(problem: Problem, state: FitState, band_px: Tensor) -> Tensor:
     return edge.gather(1, closest)
 
 
+def total_cost(problem: Problem, state: FitState) -> Tensor:
+    """The minimised cost [B]."""
+    return landmark_cost(problem, residuals(problem, state)) + prior_cost(state)
+
+
+def landmark_cost(problem: Problem, at: Residuals) -> Tensor:
+    """Huber's cost of the landmarks [B]."""
+    distance, huber = at.difference_px.norm(dim=-1) * problem.inverse_noise, problem.huber
+    robust = torch.where(distance <= huber, distance**2, huber * (2 * distance - huber))
+    return robust.sum(1)
+
+
+def prior_cost(state: FitState) -> Tensor:
+    """The Gaussian priors' cost [B]."""
+    return (state.coordinates**2).sum(1)
+
+
+def _step(problem: Problem, state: FitState, at: Residuals, damping: Tensor) -> Tensor:
+    """The damped step [B, 6 + Q] of the iteratively reweighted least squares."""
+    normal, gradient = normal_equations(problem, jacobian(problem, state, at), at)
+    return damped_step(normal, gradient, state.coordinates, damping)
+
+
 def jacobian(problem: Problem, state: FitState, at: Residuals) -> Tensor:
-    """d(px) / d(omega, shift, coordinates) [B, 68, 2, 6 + Q] at fixed correspondences, see `moved`."""
+    """d(px) / d(omega, shift, coordinates) [B, 68, 2, 6 + Q] at fixed correspondences, see `apply_step`."""
     px_by_camera = pixels_by_points(at.points_camera, problem.camera)
     by_pose = pixels_by_pose(px_by_camera, at.points_camera, state.translation_m)
     px_by_head = px_by_camera @ state.rotation[:, None]
     contour, inner = px_by_head[:, : len(CONTOUR)], px_by_head[:, len(CONTOUR) :]
     modes = problem.basis.modes
     by_contour = contour @ modes[at.ids[:, : len(CONTOUR)]]
-    # the inner landmarks' modes are the same for all faces: one product a landmark, all faces at once
+    # All faces share the modes of the inner landmarks: one product for each landmark, all faces at once.
     by_inner = (inner.permute(1, 0, 2, 3).flatten(1, 2) @ modes[:INNER_COUNT]).reshape(
         INNER_COUNT, len(inner), 2, modes.shape[-1]
     )
@@ -211,38 +213,11 @@ def pixels_by_pose(px_by_camera: Tensor, points_camera: Tensor, translation_m: T
     return torch.cat([by_rotation, by_translation], -1)
 
 
-def moved(state: FitState, step: Tensor) -> FitState:
-    """The state after a step [B, 6 + Q]: rotation exp(omega) R, translation shifted in units of its depth."""
-    omega, shift, change = step[:, :3], step[:, 3:6], step[:, 6:]
-    translation = state.translation_m - shift * state.translation_m[:, 2:]
-    return FitState(so3_exp(omega) @ state.rotation, translation, state.coordinates + change)
-
-
-def total_cost(problem: Problem, state: FitState) -> Tensor:
-    """What is minimised [B]."""
-    return landmark_cost(problem, residuals(problem, state)) + prior_cost(state)
-
-
-def landmark_cost(problem: Problem, at: Residuals) -> Tensor:
-    """Huber's cost of the landmarks [B]."""
-    distance, huber = at.difference_px.norm(dim=-1) * problem.inverse_noise, problem.huber
-    robust = torch.where(distance <= huber, distance**2, huber * (2 * distance - huber))
-    return robust.sum(1)
-
-
-def prior_cost(state: FitState) -> Tensor:
-    """The Gaussian priors' cost [B]."""
-    return (state.coordinates**2).sum(1)
-
-
-def _step(problem: Problem, state: FitState, at: Residuals, damping: Tensor) -> Tensor:
-    """The damped step [B, 6 + Q] of the iteratively reweighted least squares."""
-    normal, gradient = normal_equations(problem, jacobian(problem, state, at), at)
-    return damped_step(normal, gradient, state.coordinates, damping)
-
-
 def normal_equations(problem: Problem, by_parameters: Tensor, at: Residuals) -> tuple[Tensor, Tensor]:
-    """The landmarks' part [B, P, P] and [B, P], reweighted, for a Jacobian [B, 68, 2, P]."""
+    """The landmarks' normal matrix [B, P, P] and gradient [B, P], reweighted.
+
+    by_parameters [B, 68, 2, P] is the Jacobian.
+    """
     distance = at.difference_px.norm(dim=-1) * problem.inverse_noise
     weight = problem.inverse_noise * (problem.huber / distance.clamp(min=problem.huber)).sqrt()  # [B, 68]
     weighted = (by_parameters * weight[..., None, None]).flatten(1, 2)
@@ -260,46 +235,3 @@ def damped_step(normal: Tensor, gradient: Tensor, coordinates: Tensor, damping: 
     diagonal = normal.diagonal(dim1=1, dim2=2)
     diagonal += prior + damping[:, None] * (diagonal + prior)
     return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky(normal))[..., 0]
-
-
-_NOSE = (28, 33)  # the rays to the jaw begin midway between these landmarks
-_RAYS_PER_LANDMARK, _POINTS_PER_RAY = 8, 10
-
-
-@cache
-def contour_rays() -> Tensor:
-    """Vertices of the grid [R, P] along rays across the jaw's band, outermost last, right ear to left ear."""
-    ends = _between_landmarks(LANDMARK_UV)
-    centre = np.array([0.5, LANDMARK_UV[list(_NOSE), 1].mean()])
-    share = np.linspace(*_BAND, _POINTS_PER_RAY)[:, None]
-    column_row = np.round((centre + share * (ends - centre)[:, None]) * (GRID - 1)).astype(np.int64)
-    column_row = column_row.clip(0, GRID - 1)
-    return torch.from_numpy(column_row[..., 1] * GRID + column_row[..., 0])
-
-
-@cache
-def _outward() -> Tensor:
-    """Unit directions [R, 3] in the head frame in which each ray leaves the face seen from before it."""
-    away = (_between_landmarks(LANDMARKS_M) - LANDMARKS_M[list(_NOSE)].mean(0)) * [1, 1, 0]
-    return torch.from_numpy(away / np.linalg.norm(away, axis=-1, keepdims=True)).float()
-
-
-def _between_landmarks(values: np.ndarray) -> np.ndarray:
-    """Contour landmarks' values [68, C] at the rays' outer ends [R, C], linear between landmarks."""
-    along = np.arange((len(CONTOUR) - 1) * _RAYS_PER_LANDMARK + 1) / _RAYS_PER_LANDMARK
-    contour = values[list(CONTOUR)]
-    return np.stack([np.interp(along, CONTOUR, column) for column in contour.T], -1)
-
-
-@torch.no_grad()
-def silhouette_ids(vertices_px: Tensor, head_to_camera: Tensor) -> Tensor:
-    """The vertices [B, R] of the outline: of each ray the one that reaches furthest out in the picture.
-
-    vertices_px [B, V, 2] are the mesh's pixels, head_to_camera [B, 3, 3] the poses. A constant: no gradient.
-    """
-    rays = contour_rays().to(vertices_px.device)
-    outward = _outward().to(head_to_camera) @ head_to_camera.mT  # [B, R, 3]
-    px = vertices_px[:, rays]  # [B, R, P, 2]
-    reach = px[..., 0] * outward[..., None, 0] - px[..., 1] * outward[..., None, 1]
-    furthest = reach.argmax(-1, keepdim=True)
-    return rays.expand(len(px), -1, -1).gather(2, furthest)[..., 0]

@@ -1,16 +1,15 @@
-"""One head fitted to the landmarks of several calibrated cameras; `crop_pose.py` takes it to their crops.
+"""One head fitted to the landmarks of several calibrated cameras, and that head in the crops of their images.
 
-Identity, expression and the head's place in the world are shared; each camera adds the residuals of its 68
-landmarks, whose contour slides along the silhouette that this camera sees (`gauss_newton.py`). Priors and
-noise are those of single fits (`fit.py`). The world is the calibration's own, in metres, right-handed.
+`fit_views`: the cameras share identity, expression and the head's place in the world; each camera adds the
+residuals of its 68 landmarks, whose contour slides along the silhouette in this camera (`gauss_newton.py`).
+Priors and noise are those of single fits (`fit.py`). The world is the calibration's, in metres, right-handed.
 
-A head in the world as the fixed camera of a crop sees it.
-
-That camera's focal length is 4 times the crop's side (`raster/camera.py`), so a face that fills the crop
-stands 0.9 to 1.05 m before it, wherever the true camera stood. No pose takes back the difference of
-perspective. Of the inter-ocular distance, the mean distance of vertices left at the best pose is 0.1 to 0.6 %
-for cameras at 0.8 to 1.1 m, up to 0.6 % at 1.3 m, 0.8 % at 1.5 m, 1.1 % at 2 m and 1.7 % far away (heads of
-tests/face/test_joint_fit.py). More steps change none of it, weights for the least mean distance a twentieth.
+`fit_in_crop`: the fixed camera of a crop has a focal length of 4 times the crop's side (`raster/camera.py`),
+so a face that fills the crop stands 0.9 to 1.05 m in front of it, wherever the true camera was. No pose
+removes this difference in perspective. At the best pose the mean distance of the vertices, as a share of the
+inter-ocular distance, is 0.1 to 0.6 % for cameras at 0.8 to 1.1 m, up to 0.6 % at 1.3 m, 0.8 % at 1.5 m,
+1.1 % at 2 m and 1.7 % far away (heads of tests/face/test_joint_fit.py). More steps do not lower it; weights
+that minimise the mean distance lower it by a twentieth.
 """
 
 from collections.abc import Sequence
@@ -23,33 +22,36 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
 from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
+from facerf_cli.face.fit_start import weak_perspective
 from facerf_cli.face.gauss_newton import (
     FitState,
     Problem,
     Residuals,
+    apply_step,
     damped_step,
     descend,
     jacobian,
     landmark_cost,
-    moved,
     normal_equations,
     pixels_by_points,
     pixels_by_pose,
     prior_cost,
     residuals,
-    weak_perspective,
 )
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS, grid_triangles
 from facerf_cli.raster.camera import Camera, pixel_rays, project
 from facerf_cli.raster.rasterize import front_facing
 
-_USUAL = FitSettings()
-LOST_IOD = 0.15  # landmarks that lie this far off in the mean belong to no face, or to another one
-_PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # all cameras' landmarks are taken to this one's picture
-# The last bits of linear algebra depend on where memory happens to lie. Results are rounded far above those
-# and far below what can be measured, so that the same input gives the same bytes.
+LOST_IOD = 0.15  # landmarks with a larger mean error belong to no face or to another one
+# The last bits of linear algebra depend on memory alignment. Results are rounded far above those bits and far
+# below what can be measured, so that the same input gives the same bytes.
 DECIMALS = 6
+_UNIT_CAMERA = Camera(1.0, 0, 0, 0.0, 0.0)  # the landmarks of all cameras are converted to its image
+_SETTINGS = FitSettings()
+_CROP_STEPS = 12
+_CROP_STRIDE = 5  # the pose in a crop is fitted to every fifth vertex
+_LEAST_FACING = 0.1  # share of the vertices that must face the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,13 +66,13 @@ class PosedCamera:
     translation_m: Tensor  # [3] world to camera
 
     def project(self, points_world: Tensor) -> Tensor:
-        """World points [..., 3] to the picture's pixels [..., 2], float64."""
+        """Project world points [..., 3] to the image's pixels [..., 2], float64."""
         points_camera = points_world.double() @ self.rotation.mT + self.translation_m
         focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
-        return project(points_camera, _PLANE) * focal + centre
+        return project(points_camera, _UNIT_CAMERA) * focal + centre
 
     def to_plane(self, px: Tensor) -> Tensor:
-        """Pixels [..., 2] to the picture of a camera of focal length 1, centred at 0."""
+        """Convert pixels [..., 2] to the image of a camera of focal length 1, centred at 0."""
         focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
         return (px - centre) / focal
 
@@ -83,11 +85,13 @@ class JointFit:
     translation_m: Tensor  # [3]
     alpha: Tensor  # [Ki]
     beta: Tensor  # [Ke]
-    error_iod: tuple[float | None, ...]  # of each camera's landmarks, see `fit_views`; None where it has none
+    error_iod: tuple[
+        float | None, ...
+    ]  # of each camera, see `fit_views`; None without landmarks
 
     @property
     def mean_error_iod(self) -> float:
-        """The mean over the cameras that have landmarks."""
+        """The mean error over the cameras that have landmarks."""
         errors = [error for error in self.error_iod if error is not None]
         return round(float(np.mean(errors)), DECIMALS)
 
@@ -99,13 +103,13 @@ class JointFit:
 
 @dataclass(frozen=True, eq=False)
 class _Joint:
-    """The problem of one head seen by W cameras, its pose sought in the space of one of them.
+    """The problem of one head in W cameras; the head's pose is in the space of a reference camera.
 
     States of the head are batches of one; the cameras' landmarks are the rows of `problem`.
     """
 
     problem: Problem
-    turn: Tensor  # [W, 3, 3], that camera's space to each one's
+    turn: Tensor  # [W, 3, 3], reference camera to each camera
     shift_m: Tensor  # [W, 3]
 
     @staticmethod
@@ -115,7 +119,7 @@ class _Joint:
         return _Joint(problem, turn, shift_m)
 
     def views(self, head: FitState) -> FitState:
-        """The head as each camera sees it [W]."""
+        """The head in the space of each camera [W]."""
         place = self.turn @ head.translation_m[0] + self.shift_m
         return FitState(self.turn @ head.rotation, place, head.coordinates.expand(len(place), -1))
 
@@ -128,7 +132,7 @@ class _Joint:
     def step(self, head: FitState, at: Residuals, damping: Tensor) -> Tensor:
         views = self.views(head)
         by_view = jacobian(self.problem, views, at)  # [W, 68, 2, 6 + Q]
-        depths = head.translation_m[0, 2] / views.translation_m[:, 2]  # `moved` shifts in units of depth
+        depths = head.translation_m[0, 2] / views.translation_m[:, 2]  # `apply_step` shifts in units of depth
         by_omega = by_view[..., :3] @ self.turn[:, None]
         by_shift = by_view[..., 3:6] @ (self.turn * depths[:, None, None])[:, None]
         by_head = torch.cat([by_omega, by_shift, by_view[..., 6:]], -1)
@@ -140,16 +144,17 @@ def fit_views(
     model: MorphableModel,
     cameras: Sequence[PosedCamera],
     landmarks_px: Sequence[np.ndarray | None],
-    settings: FitSettings = _USUAL,
+    settings: FitSettings = _SETTINGS,
 ) -> JointFit:
-    """Fit one head to landmarks [68, 2] in the pixels of each camera, None where it found no face.
+    """Fit one head to landmarks [68, 2] in the pixels of each camera; None for a camera without a face.
 
-    Landmarks that the other cameras contradict (`LOST_IOD`) are left out and become None in the result.
-    Errors are mean distances of trusted landmarks over the inter-ocular distance as seen square on.
+    Landmarks that the other cameras contradict (`LOST_IOD`) are left out; their error in the result is None.
+    An error is the mean distance of the trusted landmarks over the inter-ocular distance of a frontal face.
+    Raises InputError where no camera has landmarks.
     """
     views = [(index, cameras[index], px) for index, px in enumerate(landmarks_px) if px is not None]
     if not views:
-        raise InputError("no camera shows a face that can be found")
+        raise InputError("no camera shows a face; give frames from the front of the subject")
     while True:
         joint, errors = _fit_found(model, [view[1] for view in views], [view[2] for view in views], settings)
         limit = max(LOST_IOD, min(errors))
@@ -166,15 +171,15 @@ def _fit_found(
     landmarks_px: list[np.ndarray],
     settings: FitSettings,
 ) -> tuple[JointFit, list[float]]:
-    """The fit, its errors still empty, and the errors [W]."""
+    """Fit W cameras that all have landmarks: the fit without its errors, and the errors [W]."""
     basis = fit_basis(model, settings)
     pairs = list(zip(cameras, landmarks_px, strict=True))
     target = torch.stack([camera.to_plane(torch.from_numpy(check_landmarks(px))) for camera, px in pairs])
     trust = torch.from_numpy(np.stack([_trust(camera, px) for camera, px in pairs]))
-    alone, scale = weak_perspective(basis, target, _PLANE)
+    alone, scale = weak_perspective(basis, target, _UNIT_CAMERA)
     noise = landmark_noise(settings) * (IOD_M * scale)[:, None]
-    problem = Problem(basis, target, _PLANE, trust.sqrt() / noise, settings.huber)
-    # Each camera alone says where the head is; the one that all agree with best begins, in its own space.
+    problem = Problem(basis, target, _UNIT_CAMERA, trust.sqrt() / noise, settings.huber)
+    # Each camera alone gives a start, in its own space; the one of least cost over all cameras is taken.
     starts = [
         (_Joint.seen_from(camera, cameras, problem), _row(alone, i)) for i, camera in enumerate(cameras)
     ]
@@ -200,7 +205,7 @@ def _fit_found(
 
 
 def eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
-    """How far along the camera's axis the eyes are [...], for poses [..., 3, 3] and [..., 3]."""
+    """The depth of the eyes along the camera's axis [...] for poses [..., 3, 3] and [..., 3]."""
     eyes = torch.from_numpy(LANDMARKS_M[list(OUTER_EYE_CORNERS)].mean(0))
     return -(rotation @ eyes + translation_m)[..., 2]
 
@@ -215,11 +220,6 @@ def _trust(camera: PosedCamera, landmarks_px: np.ndarray) -> np.ndarray:
     return trust_inside(crop.to_crop(landmarks_px), crop, camera.height_px, camera.width_px)
 
 
-_STEPS = 12
-_STRIDE = 5  # every so many vertices hold the pose
-_LEAST_SHARE = 0.1  # of the vertices that must face the camera
-
-
 def fit_in_crop(
     model: MorphableModel,
     joint: JointFit,
@@ -228,20 +228,21 @@ def fit_in_crop(
     error_iod: float,
     crop_px: int,
 ) -> tuple[FaceFit, float]:
-    """The head in the fixed camera of its crop from a camera's picture, identity and expression unchanged.
+    """Pose the head in the fixed camera of its crop from a camera's image; keep identity and expression.
 
-    The crop goes by the fitted landmarks. The pose is the one under which the vertices that face the camera
-    lie where the true camera sees them; the mean distance that is left, over the inter-ocular distance, comes
-    second. `landmarks_px` None takes the fitted ones.
+    The crop follows the fitted landmarks. The pose brings the vertices that face the camera as close as
+    possible to their pixels in the true camera. The second result is the mean distance that remains, over the
+    inter-ocular distance. Without landmarks_px the fit stores the fitted landmarks. Raises InputError where
+    the camera sees the head from behind.
     """
     vertices_world = joint.vertices_world(model)
     fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
     crop = _rounded(from_landmarks(fitted_px, crop_px))
     in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
     facing = _facing(in_camera)
-    if len(facing) < _LEAST_SHARE * len(in_camera):
+    if len(facing) < _LEAST_FACING * len(in_camera):
         raise InputError("a camera sees the head from behind")
-    ids = facing[::_STRIDE]
+    ids = facing[::_CROP_STRIDE]
     target_px = torch.from_numpy(crop.to_crop(camera.project(vertices_world[ids]).numpy()))
     head = (vertices_world[ids] - joint.translation_m) @ joint.rotation
     rotation, translation_m = _pose_in_crop(head, target_px, camera.rotation @ joint.rotation, crop.camera)
@@ -275,16 +276,16 @@ def _facing(vertices_camera: Tensor) -> Tensor:
 def _pose_in_crop(head: Tensor, target_px: Tensor, rotation: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
     """Rotation [3, 3] and translation [3] that bring points [N, 3] closest to pixels [N, 2]; Gauss-Newton.
 
-    It begins with a rotation in a camera that looks elsewhere, and with the points where their mean is seen.
+    The rotation is a first guess; the first translation puts the points' mean on the pixels' mean.
     """
     ray = pixel_rays(target_px.mean(0), camera)
     spread_px = (target_px - target_px.mean(0)).norm(dim=-1).mean()
     spread_m = ((head - head.mean(0)) @ rotation.mT)[:, :2].norm(dim=-1).mean()
     place = ray * (camera.focal_px * spread_m / spread_px) - rotation @ head.mean(0)
     state = FitState(rotation[None], place[None], torch.zeros(1, 0, dtype=torch.float64))
-    for _ in range(_STEPS):
+    for _ in range(_CROP_STEPS):
         points = head @ state.rotation.mT + state.translation_m[:, None]
         by_pose = pixels_by_pose(pixels_by_points(points, camera), points, state.translation_m)[0]
         off_px = project(points, camera)[0] - target_px
-        state = moved(state, -torch.linalg.lstsq(by_pose.flatten(0, 1), off_px.flatten()).solution[None])
+        state = apply_step(state, -torch.linalg.lstsq(by_pose.flatten(0, 1), off_px.flatten()).solution[None])
     return state.rotation[0], state.translation_m[0]

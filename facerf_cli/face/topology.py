@@ -1,22 +1,18 @@
-"""The canonical topology that every face model is carried to.
+"""The canonical topology: one grid of vertices in UV space that every face model is resampled to.
 
-One bilaterally symmetric grid in a cylindrical chart. The head frame is right-handed, in metres: x to the
-picture's right, y up, z out of the face; its origin lies on the chart's vertical axis inside the head, at the
-height of the nose's underside. u runs to the picture's right over +-`HALF_ANGLE_DEG` of azimuth, v runs down
-from the forehead to below the chin. The 68 landmarks (Multi-PIE order) sit at the same (u, v) in every model,
-so a texture learned on one model fits all others. Changing anything here changes `LAYOUT_VERSION`.
+The grid is bilaterally symmetric and lies on a cylinder about a vertical axis inside the head. The head frame
+is right-handed, in metres: x to the image's right, y up, z out of the face; its origin lies on the cylinder's
+axis at the height of the underside of the nose. u runs to the image's right over +-`HALF_ANGLE_DEG` of
+azimuth, v runs down from the forehead to below the chin. The 68 landmarks (Multi-PIE order) have the same
+(u, v) in every model, so a texture network trained on one model fits all others. A change to the grid or the
+landmarks needs a new `LAYOUT_VERSION`.
 
-Named regions of the canonical chart, as soft masks in UV.
+Named regions are soft masks in UV space, bounded by smooth curves through landmarks. `eyes` (between the
+lids), `brows`, `lips` (with the slit of the mouth), `nostrils`, `neck` (below the jaw line) and `skin` sum to
+one everywhere; `mouth` (the slit alone) and `face` (inside jaw and forehead, for compositing) overlap them.
 
-Outlines are smooth arcs through landmarks of `LANDMARK_UV`; a mask falls from 1 to 0 across its outline over
-a width in millimetres on the mean face. `eyes` (between the lids), `brows`, `lips` (the mouth slit among
-them), `nostrils`, `neck` (below the jaw line) and `skin` sum to one everywhere; `mouth` (the slit) and `face`
-(inside jaw and forehead, for compositing) overlap them.
-
-The masked interior of the face M_t(omega_h), computed with the renderer (paper, 'Photometric loss').
-
-The region `face` of the chart without its soft rim: inside the jaw line and the forehead. Brows, eyes and the
-mouth are in it, for the paper leaves nothing out. Of the mesh only what looks at the camera counts.
+The interior of the face is the mask M_t(omega_h) of the paper's 'Photometric loss': the region `face` without
+its soft rim, where the mesh faces the camera. It includes brows, eyes and mouth, as in the paper.
 """
 
 from functools import cache
@@ -31,10 +27,22 @@ from facerf_cli.raster.texture import sample_texture
 
 LAYOUT_VERSION = 1
 GRID = 129  # vertices along each side of the grid; odd, so that one column lies on the midline
-HALF_ANGLE_DEG = 61.0
-TOP_M, BOTTOM_M = 0.092, -0.082
+HALF_ANGLE_DEG = 61.0  # just wide enough for the 68 landmarks of every model
+TOP_M, BOTTOM_M = 0.092, -0.082  # heights of v = 0 and v = 1
+UV_SIZE_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at radius 115 mm
 
-# Right half (picture's left) and midline of the anatomical mean: landmark, x, y, z in millimetres.
+CONTOUR = tuple(range(17))  # the landmarks along the jaw, from ear to ear
+INNER_MOUTH_CORNERS = (60, 64)  # the two that the paper's 66 landmarks leave out
+OUTER_EYE_CORNERS = (36, 45)  # their distance is the inter-ocular distance everywhere in facerf
+# The landmark that mirrors each one.
+MIRROR_68 = np.array(
+    [
+        *[*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)],
+        *[45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40],
+        *[*range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), 67, 66, 65],
+    ]
+)
+# Landmarks of the mean face on the midline and on the image's left: index, x, y, z in millimetres.
 _MEASURES_MM = """
  0 -73.5  37   46.5 |  1 -73   15   49.5 |  2 -69.5 -4.5 55.5 |  3 -65.5 -23.5 61.5 |  4 -57  -45   71.5
  5 -43   -62   83.5 |  6 -30.5 -69  97.5 |  7 -15.5 -72.5 112.5 | 8  0 -75.5 114.5 | 17 -58   52   89
@@ -45,19 +53,19 @@ _MEASURES_MM = """
 51   0   -25  128.5 | 57   0  -44  125.5 | 58 -10.5 -43 124   | 59 -18  -40.5 119   | 60 -22 -35 111.5
 61 -10   -32.4 121  | 62   0  -32.5 122.5 | 66  0   -34.6 122.5 | 67 -10.5 -34.5 120.5
 """
-MIRROR_68 = np.array(
-    [
-        *[*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)],
-        *[45, 44, 43, 42, 47, 46, 39, 38, 37, 36, 41, 40],
-        *[*range(54, 47, -1), *range(59, 54, -1), *range(64, 59, -1), 67, 66, 65],
-    ]
-)
-CONTOUR = tuple(range(17))
-INNER_MOUTH_CORNERS = (60, 64)  # the two that the paper's 66 landmarks leave out
-OUTER_EYE_CORNERS = (36, 45)  # their distance is the inter-ocular distance everywhere in facerf
+
+REGIONS = ("skin", "eyes", "brows", "lips", "mouth", "nostrils", "neck", "face")
+_NOT_SKIN = ("eyes", "brows", "lips", "nostrils", "neck")
+_PAIRED = ("eyes", "brows", "nostrils")  # outlined on the image's left, then mirrored
+# Width on the mean face over which a mask falls from 1 to 0 across its outline.
+_EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.5, "neck": 5.0, "face": 16.0}
+_BROW_ABOVE_MM, _BROW_BELOW_MM = (0.5, 1.5, 2.0, 2.0, 0.5), (1.0, 2.5, 4.0, 5.5, 5.0)  # of landmarks 17 to 21
+_NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4650, 0.5720), (4.2, 2.0), 14.0
+_FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04)]  # the image's right half
 
 
 def _landmarks_m() -> np.ndarray:
+    """The landmarks [68, 3] of the mean face in metres, head frame."""
     points = np.full((68, 3), np.nan)
     for cell in _MEASURES_MM.replace("\n", "|").split("|"):
         if cell.strip():
@@ -70,16 +78,16 @@ def _landmarks_m() -> np.ndarray:
 LANDMARKS_M = _landmarks_m()  # [68, 3]
 
 
-def chart_uv(points_m: np.ndarray) -> np.ndarray:
-    """Head-frame points [..., 3] to (u, v) [..., 2]: azimuth about the axis, and height."""
+def cylinder_uv(points_m: np.ndarray) -> np.ndarray:
+    """Map head-frame points [..., 3] in metres to (u, v) [..., 2] by azimuth and height."""
     azimuth_deg = np.degrees(np.arctan2(points_m[..., 0], points_m[..., 2]))
     u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
     v = (TOP_M - points_m[..., 1]) / (TOP_M - BOTTOM_M)
     return np.stack([u, v], -1)
 
 
-def chart_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions [..., 3] of the rays from outside the head to its axis through (u, v)."""
+def cylinder_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions [..., 3] of rays from outside the head through (u, v) to the axis."""
     azimuth = np.radians((uv[..., 0] - 0.5) * 2 * HALF_ANGLE_DEG)
     y = TOP_M - uv[..., 1] * (TOP_M - BOTTOM_M)
     outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], -1)
@@ -88,12 +96,12 @@ def chart_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np.nd
     return origins, -outward
 
 
-LANDMARK_UV = chart_uv(LANDMARKS_M)  # [68, 2]
+LANDMARK_UV = cylinder_uv(LANDMARKS_M)  # [68, 2]
 
 
 @cache
 def grid_uv() -> Tensor:
-    """(u, v) of every vertex [V, 2], row by row from the forehead down; V = GRID * GRID."""
+    """The (u, v) [V, 2] of every vertex, row by row from the forehead down; V = GRID * GRID."""
     side = torch.linspace(0, 1, GRID)
     v, u = torch.meshgrid(side, side, indexing="ij")
     return torch.stack([u, v], -1).reshape(-1, 2)
@@ -113,7 +121,7 @@ def grid_triangles() -> Tensor:
 
 
 def locate(uv: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Vertex ids [N, 3] and barycentric weights [N, 3] of the grid triangle that holds each (u, v) [N, 2]."""
+    """Vertex ids [N, 3] and barycentric weights [N, 3] of the grid triangle around each (u, v) [N, 2]."""
     position = np.clip(uv, 0, 1) * (GRID - 1)
     cell = np.minimum(position.astype(np.int64), GRID - 2)
     fraction = position - cell
@@ -136,30 +144,19 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @cache
 def landmark_weights() -> tuple[Tensor, Tensor]:
-    """Vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, the same for every model."""
+    """Vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, equal for all models."""
     return locate(LANDMARK_UV)
-
-
-REGIONS = ("skin", "eyes", "brows", "lips", "mouth", "nostrils", "neck", "face")
-_PARTS = ("eyes", "brows", "lips", "nostrils", "neck")  # what skin leaves out
-_PAIRED = ("eyes", "brows", "nostrils")  # outlined on the picture's left, then mirrored
-_EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.5, "neck": 5.0, "face": 16.0}
-
-CHART_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # where r = 115 mm
-_BROW_ABOVE_MM, _BROW_BELOW_MM = (0.5, 1.5, 2.0, 2.0, 0.5), (1.0, 2.5, 4.0, 5.5, 5.0)  # of landmarks 17 to 21
-_NOSTRIL_CENTRE_UV, _NOSTRIL_HALF_MM, _NOSTRIL_TILT_DEG = (0.4650, 0.5720), (4.2, 2.0), 14.0
-_FOREHEAD_UV = [(0.955, 0.17), (0.86, 0.075), (0.68, 0.045), (0.5, 0.04)]  # and mirrored
 
 
 @cache
 def region_mask(name: str, side: int) -> Tensor:
-    """The mask [T, T] in 0..1 of the region `name`, rows from the forehead down; symmetric in u."""
+    """The mask [T, T] in 0..1 of the region `name`; row 0 is the forehead; symmetric in u."""
     if name == "skin":
-        return (1 - torch.stack([region_mask(part, side) for part in _PARTS]).sum(0)).clamp(0, 1)
+        return (1 - torch.stack([region_mask(part, side) for part in _NOT_SKIN]).sum(0)).clamp(0, 1)
     centre = (np.arange(side) + 0.5) / side
     uv = np.stack(np.meshgrid(centre, centre), -1)
     distance_mm = inside_mm(name, uv)
-    edge_mm = max(_EDGE_MM[name], CHART_MM.max() / side)  # never sharper than a texel
+    edge_mm = max(_EDGE_MM[name], UV_SIZE_MM.max() / side)  # never sharper than a texel
     ramp = np.clip(distance_mm / edge_mm + 0.5, 0, 1)
     mask = ramp * ramp * (3 - 2 * ramp)
     mirrored = mask[:, ::-1]
@@ -168,16 +165,16 @@ def region_mask(name: str, side: int) -> Tensor:
 
 
 def inside_mm(name: str, uv: np.ndarray) -> np.ndarray:
-    """Distance [...] on the unrolled chart from (u, v) [..., 2] to the region's outline, positive inside.
+    """Distance [...] in mm from (u, v) [..., 2] to a region's outline, on the unrolled cylinder; > 0 inside.
 
-    Of paired regions only the one on the picture's left (u < 0.5) is measured.
+    For paired regions the distance is to the one on the image's left (u < 0.5).
     """
-    return _inside_outline(uv * CHART_MM, _outline_mm(name))
+    return _inside_outline(uv * UV_SIZE_MM, _outline_mm(name))
 
 
 def _outline_mm(name: str) -> np.ndarray:
-    """Closed outline [N, 2] on the unrolled chart, in millimetres."""
-    landmarks = LANDMARK_UV * CHART_MM
+    """The closed outline [N, 2] of a region on the unrolled cylinder, in millimetres."""
+    landmarks = LANDMARK_UV * UV_SIZE_MM
     if name == "eyes":
         arcs = [landmarks[[36, 37, 38, 39]], landmarks[[39, 40, 41, 36]]]
     elif name == "brows":
@@ -192,20 +189,20 @@ def _outline_mm(name: str) -> np.ndarray:
         turn, tilt = np.linspace(0, 2 * np.pi, 40), np.radians(_NOSTRIL_TILT_DEG)
         along, across = _NOSTRIL_HALF_MM[0] * np.cos(turn), _NOSTRIL_HALF_MM[1] * np.sin(turn)
         ellipse = [along * np.cos(tilt) + across * np.sin(tilt), across * np.cos(tilt) - along * np.sin(tilt)]
-        arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * CHART_MM]
+        arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * UV_SIZE_MM]
     elif name == "neck":
-        corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * CHART_MM
+        corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * UV_SIZE_MM
         return np.concatenate([_smooth(landmarks[:17]), corners])
     elif name == "face":
         forehead = [*_FOREHEAD_UV, *((1 - u, v) for u, v in _FOREHEAD_UV[-2::-1])]
-        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *forehead, LANDMARK_UV[0]]) * CHART_MM]
+        arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *forehead, LANDMARK_UV[0]]) * UV_SIZE_MM]
     else:
-        raise ValueError(f"no region is called {name!r}; there are {', '.join(REGIONS)}")
+        raise ValueError(f"{name!r}: not a region of the face; choose one of {', '.join(REGIONS)}")
     return np.concatenate([_smooth(arc) for arc in arcs])
 
 
 def _smooth(points: np.ndarray, steps: int = 6) -> np.ndarray:
-    """A cubic spline [N, 2] through `points`, by chord length."""
+    """Sample a cubic spline [N, 2] through `points`, parametrised by chord length."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
     knots = np.arange(len(points))
     at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
@@ -228,14 +225,17 @@ def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 @cache
 def interior_texture(side: int) -> Tensor:
-    """The interior in the chart [1, T, T]: 0 on the outline of the region `face`, 1 from 8 mm inside it."""
+    """The interior in UV space [1, T, T]: 0 on the outline of the region `face`, 1 from 8 mm inside it."""
     return (2 * region_mask("face", side) - 1).clamp_min(0)[None]
 
 
 @torch.no_grad()
 def interior_mask(vertices_camera: Tensor, fragments: Fragments, uv: Tensor, texture_side: int) -> Tensor:
-    """M_t [1, H, W] in 0..1 of a mesh [V, 3] whose fragments and (u, v) [H, W, 2] each pixel sees."""
+    """The interior M_t [1, H, W] in 0..1 of a rendered mesh.
+
+    vertices_camera [V, 3] is the mesh, fragments and uv [H, W, 2] what each pixel sees of it.
+    """
     front = front_facing(vertices_camera, grid_triangles().to(vertices_camera.device))
-    seen = fragments.covered & front[fragments.triangle]  # the triangle is -1 where nothing is seen
+    seen = fragments.covered & front[fragments.triangle]  # fragments.triangle is -1 off the mesh
     inside = sample_texture(interior_texture(texture_side).to(uv.device), uv)[..., 0]
     return (inside * seen)[None]

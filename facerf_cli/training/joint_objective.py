@@ -23,8 +23,8 @@ from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.photos import PhotoCrops, Photos
-from facerf_cli.dataset.textures import Captured, provenance_of
-from facerf_cli.face.gauss_newton import silhouette_ids
+from facerf_cli.dataset.samples import DatasetTextures, provenance_of
+from facerf_cli.face.silhouette import silhouette_ids
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import (
     CONTOUR,
@@ -34,9 +34,10 @@ from facerf_cli.face.topology import (
     grid_uv,
     interior_mask,
 )
-from facerf_cli.network.feature_networks import Layered
+from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.network.reflectance import ReflectanceNetwork, resize
+from facerf_cli.network.inputs import resize
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
@@ -207,9 +208,9 @@ class JointObjective(Objective):
         self._train = open_pairs(dataset, "train", settings.crop_px)
         self._held_out = open_pairs(dataset, "validation", settings.crop_px)
         self._validation: dict[str, list[CropPairs]] | None = None
-        if isinstance(reflectance, ReflectanceNetwork) and not reflectance.mean_normals.any():
+        if isinstance(reflectance, DefaultReflectanceNetwork) and not reflectance.mean_normals.any():
             rig_lights = reflectance.settings.rig_lights
-            reflectance.set_mean_face(*Captured(dataset, model, 0, {}, {}, rig_lights).mean_face())
+            reflectance.set_mean_face(*DatasetTextures(dataset, model, 0, {}, {}, rig_lights).mean_face())
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """The networks' own functions alone: shapes in the rasterizer depend on what is seen."""
@@ -295,7 +296,7 @@ class JointObjective(Objective):
                 terms["light_features"] = weights.features * light_loss(self._features("light"), texture)
         return terms
 
-    def _features(self, name: str) -> Layered:
+    def _features(self, name: str) -> FeatureNetwork:
         network: Any = self.feature_networks[name]
         return network
 

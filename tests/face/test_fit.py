@@ -20,7 +20,8 @@ from facerf_cli.face.fit import (
     save_fit,
     trust_inside,
 )
-from facerf_cli.face.gauss_newton import Problem, jacobian, minimise, moved, residuals, weak_perspective
+from facerf_cli.face.fit_start import weak_perspective
+from facerf_cli.face.gauss_newton import Problem, apply_step, jacobian, minimise, residuals
 from facerf_cli.face.landmarks import detect_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, grid_triangles
@@ -95,7 +96,7 @@ def test_the_jacobian_is_the_derivative(model):
     size = analytic.shape[-1]
 
     def landmarks_px(step):
-        there = moved(state, step)
+        there = apply_step(state, step)
         head = basis.mean[at.ids] + (basis.modes[at.ids] @ there.coordinates[:, None, :, None])[..., 0]
         return project(head @ there.rotation.mT + there.translation_m[:, None], CAMERA)
 

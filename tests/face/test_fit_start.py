@@ -6,15 +6,8 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import (
-    FitSettings,
-    FitStart,
-    better_start,
-    fit_batch,
-    fit_landmarks,
-    problem_of,
-    seeded_state,
-)
+from facerf_cli.face.fit import FitSettings, fit_batch, fit_landmarks, fit_problem
+from facerf_cli.face.fit_start import FitStart, better_start, seeded_state
 from facerf_cli.face.gauss_newton import fit_points, minimise, total_cost
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
@@ -65,13 +58,13 @@ def test_a_good_start_ends_where_the_cold_one_does(model, landmarks_px, cold):
 
 def test_a_good_start_saves_steps(model, landmarks_px, cold):
     trust = torch.ones(6, 68, dtype=torch.float64)
-    problem, begin = problem_of(model, landmarks_px.double(), CAMERA, SETTINGS, trust)
+    problem, begin = fit_problem(model, landmarks_px.double(), CAMERA, SETTINGS, trust)
     warm = better_start(problem, begin, start_at(cold))
     assert 2 * steps_needed(problem, warm).sum() <= steps_needed(problem, begin).sum()
 
 
 def test_the_built_in_model_is_seeded_with_the_start_itself(model, landmarks_px, cold):
-    problem, _ = problem_of(model, landmarks_px.double(), CAMERA, SETTINGS, torch.ones(6, 68).double())
+    problem, _ = fit_problem(model, landmarks_px.double(), CAMERA, SETTINGS, torch.ones(6, 68).double())
     state = seeded_state(problem.basis, start_at(cold))
     assert (state.rotation - cold.rotation).abs().max() < 0.01
     corners, weights = fit_points()
@@ -91,7 +84,7 @@ def test_another_model_is_seeded_by_least_squares(model, landmarks_px, cold):
         mean=1.05 * model.mean + torch.tensor([0.0, 0.01, -0.005]),
         identity=model.identity[:30].flip(0),
     )
-    problem, begin = problem_of(other, landmarks_px.double(), CAMERA, SETTINGS, torch.ones(6, 68).double())
+    problem, begin = fit_problem(other, landmarks_px.double(), CAMERA, SETTINGS, torch.ones(6, 68).double())
     seeded = seeded_state(problem.basis, start_at(cold))
     assert (total_cost(problem, seeded) < total_cost(problem, begin)).all()
 

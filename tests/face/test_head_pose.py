@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from facerf_cli.face.fit import pose_from_landmarks
+from facerf_cli.face.fit_start import pose_from_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
