@@ -26,8 +26,8 @@ from synthetic import held_out_bank
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.feature_networks import LightNetwork, VggFeatures
-from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 from facerf_cli.training.joint_objective import JointObjective
 from facerf_cli.training.loop import train
@@ -37,7 +37,7 @@ from facerf_cli.training.texture_objective import ChartObjective
 
 _HEADS = 40  # of the bank, besides the mean face: a step does not depend on how many there are
 _TINY_WIDTHS = (8, 12, 16)  # as `facerf train --preset tiny` has them
-TINY_NETWORK = ReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2)
+TINY_NETWORK = DefaultReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2)
 _NEVER = 1_000_000_000
 Times = np.ndarray  # [N, 2] seconds of steps: by the clock, and of the processor
 
@@ -132,7 +132,7 @@ def build(name: str, bank: Path | None, dataset: Path | None) -> Objective:
     if name == "paper":
         return _paper(_needed(dataset, "--dataset"))
     heads, _ = held_out_bank(_needed(bank, "--bank"), "builtin", _HEADS)
-    network = ReflectanceNetwork(TINY_NETWORK) if name == "tiny" else ReflectanceNetwork()
+    network = DefaultReflectanceNetwork(TINY_NETWORK) if name == "tiny" else DefaultReflectanceNetwork()
     return ChartObjective(heads, network)
 
 
@@ -145,7 +145,7 @@ def _needed(path: Path | None, option: str) -> Path:
 def _paper(folder: Path) -> Objective:
     """Both networks of the paper, V_f and S_f, without photos: their batches cost less."""
     dataset, model = read_dataset(folder), load_face_model()
-    geometry = GeometryNetwork(GeometrySettings("paper", len(model.identity), len(model.expression)))
+    geometry = GeometryNetwork(GeometryNetworkSettings("paper", len(model.identity), len(model.expression)))
     networks = PaperReflectanceNetwork(), geometry, VggFeatures(), LightNetwork()
     return JointObjective(dataset, model, *networks)
 

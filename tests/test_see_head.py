@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.pipeline import Models, crop_face, fit_face, load_models, see_head
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
@@ -31,7 +31,7 @@ def test_without_the_network_the_fit_starts_from_the_landmarks(models: Models) -
 
 def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: np.ndarray) -> None:
     torch.manual_seed(0)
-    seeing = replace(models, geometry=GeometryNetwork(GeometrySettings(identity=3, expression=2)).eval())
+    seeing = replace(models, geometry=GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval())
     crop, cropped = crop_face(PHOTO, landmarks_px, 128)
     start = see_head(seeing, cropped)
     assert start and start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)

@@ -7,12 +7,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
 
 SIDE, RIG = 16, 8
-NETWORK = ReflectanceSettings(
+NETWORK = DefaultReflectanceSettings(
     side=SIDE, encoder_widths=(4, 8), decoder_widths=(4, 8), template_channels=1, rig_lights=RIG
 )
 
@@ -57,4 +58,4 @@ def toy_objective(poison: int = -1) -> ChartObjective:
     """The same weights at every call."""
     torch.manual_seed(0)
     settings = ChartSettings(lights=2, held_out_heads=3, held_out_draws=1, held_out_lights=2)
-    return ChartObjective(ToyFaces(poison), ReflectanceNetwork(NETWORK), settings=settings)
+    return ChartObjective(ToyFaces(poison), DefaultReflectanceNetwork(NETWORK), settings=settings)

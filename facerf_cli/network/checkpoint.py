@@ -1,6 +1,7 @@
-"""Checkpoints: safetensors with their configuration, provenance and metrics as JSON metadata. No pickle.
+"""Checkpoints: safetensors files of networks, with configuration, provenance and metrics as JSON metadata.
 
-Networks in a checkpoint: tensors `<name>.<tensor>`, and the form and settings of each in the metadata.
+Tensors are named `<network>.<tensor>`; the metadata holds the form and the settings of each network. No
+pickle is loaded.
 """
 
 import json
@@ -18,21 +19,55 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
-from facerf_cli.network.reflectance import ReflectanceNetwork
-from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
+from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
 FORMAT = "facerf-checkpoint-1"
+_LARGEST_SIDE = 4096  # working side, in a checkpoint that is read
+
+# Classes by the name of a network in a checkpoint, and its form.
+_CLASSES: dict[tuple[str, str], type[Any]] = {
+    **{("reflectance", form): network for form, network in REFLECTANCE_FORMS.items()},
+    ("geometry", "default"): GeometryNetwork,
+    ("geometry", "paper"): GeometryNetwork,
+    ("light_features", "vgg"): LightNetwork,
+    ("diffuse_sh", "default"): DiffuseNetwork,
+}
+
+
+def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:
+    """Write networks by name, with their form and settings and further metadata."""
+    tensors = {f"{name}.{key}": t for name, net in networks.items() for key, t in net.state_dict().items()}
+    described = {name: network.as_metadata() for name, network in networks.items()}  # type: ignore[operator]
+    save_checkpoint(path, tensors, {"networks": described, **metadata})
+
+
+def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module], dict[str, Any]]:
+    """Read the networks of a checkpoint by name, on the CPU, and its metadata.
+
+    Raises InputError if it is not a checkpoint of this UV layout and of this version's networks.
+    """
+    tensors, metadata = load_checkpoint(path)
+    if metadata.get("layout_version") != layout_version:
+        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
+    try:
+        networks = {
+            name: _restore(name, described, _tensors_of(tensors, name))
+            for name, described in metadata["networks"].items()
+        }
+    except (LookupError, ArithmeticError, TypeError, RuntimeError, ValueError, AttributeError):
+        raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
+    return networks, metadata
 
 
 def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write tensors (floats in half precision) and metadata through a temporary name."""
+    """Write tensors (floats in half precision) and metadata; the file appears whole or not at all."""
     stored = {k: (t.half() if t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()}
     with atomic_path(path) as temporary:
         temporary.write_bytes(save(stored, {"format": FORMAT, "facerf": json.dumps(metadata)}))
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors (floats in single precision) and metadata of a checkpoint that `facerf train` wrote."""
+    """Read tensors (floats in single precision) and metadata; raises InputError for any other file."""
     if not path.is_file():
         raise InputError(f"{path}: no such checkpoint; give a .safetensors file that `facerf train` wrote")
     try:
@@ -41,7 +76,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
         metadata = json.loads(header["facerf"])
         if not isinstance(metadata, dict):
-            raise ValueError("its metadata is no JSON object")
+            raise ValueError("its metadata is not a JSON object")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
             raise ValueError("it holds values that are not finite")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
@@ -53,58 +88,27 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     return {k: (t.float() if t.dtype == torch.float16 else t) for k, t in tensors.items()}, metadata
 
 
-_LARGEST_SIDE = 4096
-FORMS: dict[tuple[str, str], type[Any]] = {  # by what a network is for, and its form
-    ("reflectance", "default"): ReflectanceNetwork,
-    ("reflectance", "paper"): PaperReflectanceNetwork,
-    ("geometry", "default"): GeometryNetwork,
-    ("geometry", "paper"): GeometryNetwork,
-    ("light_features", "vgg"): LightNetwork,
-    ("diffuse_sh", "default"): DiffuseNetwork,
-}
-
-
-def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:
-    """Write networks by name with their metadata, and what else there is to say."""
-    tensors = {f"{name}.{key}": t for name, net in networks.items() for key, t in net.state_dict().items()}
-    described = {name: network.as_metadata() for name, network in networks.items()}  # type: ignore[operator]
-    save_checkpoint(path, tensors, {"networks": described, **metadata})
-
-
-def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module], dict[str, Any]]:
-    """The networks of a checkpoint by name, on the CPU, and its metadata; InputError if they do not fit."""
-    tensors, metadata = load_checkpoint(path)
-    if metadata.get("layout_version") != layout_version:
-        raise InputError(f"{path}: trained for another UV layout; train it again with this version of facerf")
-    try:
-        networks = {
-            name: _built(name, described, _part(tensors, name))
-            for name, described in metadata["networks"].items()
-        }
-    except (LookupError, ArithmeticError, TypeError, RuntimeError, ValueError, AttributeError):
-        raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
-    return networks, metadata
-
-
-def _built(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
-    form = FORMS[name, described["form"]]
-    _require_sane(described)
-    with torch.device("meta"):  # takes no memory, whatever sizes the file asks for
-        expected = {key: tensor.shape for key, tensor in form.from_metadata(described).state_dict().items()}
+def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
+    """Make the network that metadata describe and load its tensors; raises ValueError if they do not fit."""
+    network_class = _CLASSES[name, described["form"]]
+    _require_bounded(described)
+    with torch.device("meta"):  # takes no memory, whatever sizes the file demands
+        shapes = network_class.from_metadata(described).state_dict().items()
+        expected = {key: tensor.shape for key, tensor in shapes}
     if expected != {key: tensor.shape for key, tensor in tensors.items()}:
         raise ValueError(f"{name}: the sizes of its tensors are not those of its settings")
-    network: nn.Module = form.from_metadata(described)
+    network: nn.Module = network_class.from_metadata(described)
     network.load_state_dict(tensors)
     return network
 
 
-def _require_sane(described: dict[str, Any]) -> None:
-    """Raise ValueError for settings that no tensor's shape would betray."""
+def _require_bounded(described: dict[str, Any]) -> None:
+    """Raise ValueError for bad values of the settings on which no tensor's shape depends."""
     side, normals = described.get("side", 128), described.get("normals", True)
     if type(side) is not int or not 8 <= side <= _LARGEST_SIDE or type(normals) is not bool:
         raise ValueError(f"a working side of {side}, normals {normals}")
 
 
-def _part(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+def _tensors_of(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     prefix = f"{name}."
     return {key.removeprefix(prefix): t for key, t in tensors.items() if key.startswith(prefix)}

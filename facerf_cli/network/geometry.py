@@ -1,10 +1,11 @@
-"""From a face's crop to pose, identity and expression (paper, 'Network Architecture').
+"""The Geometry Network: from the crop of a face to pose, identity and expression.
 
-Two forms. `paper`: the trunk of AlexNet (Krizhevsky et al., *ImageNet classification with deep convolutional
-neural networks*, 2012) with the layer sizes of its one-tower form (Krizhevsky, *One weird trick for
-parallelizing convolutional neural networks*, 2014), without dropout, for a regression needs none. `default`:
-a small residual trunk on a smaller crop. Rotations leave the network as two columns that are made orthonormal
-(Zhou et al., *On the continuity of rotation representations in neural networks*, 2019).
+See paper, 'Network Architecture'. It has two forms. `paper` is the trunk of AlexNet (Krizhevsky et al.,
+*ImageNet classification with deep convolutional neural networks*, 2012) with the layer sizes of its one-tower
+form (Krizhevsky, *One weird trick for parallelizing convolutional neural networks*, 2014), without dropout,
+since a regression does not need it. `default` is a small residual trunk on a smaller crop. Rotations leave
+the network as two columns that are then orthonormalised (Zhou et al., *On the continuity of rotation
+representations in neural networks*, 2019).
 """
 
 from dataclasses import asdict, dataclass
@@ -15,42 +16,39 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-Form = Literal["default", "paper"]
-_SIDES: dict[str, int] = {"default": 64, "paper": 224}
-_MAX_COEFFICIENTS = 500
-_SHIFT, _DEPTH = (
-    0.05,
-    0.2,
-)  # how much one unit of an output moves the head: a share of the depth, of log depth
-_ALPHA, _BETA = 0.3, 0.7  # and the coefficients, in deviations; as wide as the fit's priors
-_BRIGHTEST = 4.0  # deviations from the crop's mean that its square root may have
+GeometryForm = Literal["default", "paper"]
+_SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of the crop that each form reads
+_MAX_COEFFICIENTS = 500  # of identity or expression, in a checkpoint that is read
+_SHIFT, _DEPTH = 0.05, 0.2  # what one unit of an output shifts the head: a share of the depth, of log depth
+_ALPHA, _BETA = 0.3, 0.7  # and the coefficients, in standard deviations; as wide as the priors of the fit
+_BRIGHTEST = 4.0  # standard deviations from a crop's mean at which its square root is clamped
 
 
 @dataclass(frozen=True)
-class GeometrySettings:
-    """Form, numbers of coefficients, and the translation (m, camera space) that outputs of zero stand for."""
+class GeometryNetworkSettings:
+    """Form, numbers of coefficients, and the translation (m, camera space) at outputs of zero."""
 
-    form: Form = "default"
+    form: GeometryForm = "default"
     identity: int = 40
     expression: int = 29
     mean_translation_m: tuple[float, float, float] = (0.0, 0.0, -1.1)
 
 
 class GeometryEstimate(NamedTuple):
-    """Heads of B faces in the space of the crop camera: `raster.camera.crop_camera`."""
+    """Pose and shape of B heads, in the space of the crop's camera (`raster.camera.crop_camera`)."""
 
     rotation: Tensor  # [B, 3, 3] head_to_camera
     translation_m: Tensor  # [B, 3]
-    alpha: Tensor  # [B, Ki], coefficients of the built-in model, as beta
-    beta: Tensor  # [B, Ke]
+    alpha: Tensor  # [B, Ki] identity coefficients of the built-in face model
+    beta: Tensor  # [B, Ke] its expression coefficients
 
 
 class GeometryNetwork(nn.Module):
-    """Crops [B, 3, S, S], scene-linear at any exposure and side -> GeometryEstimate."""
+    """Estimate heads from crops [B, 3, S, S], scene-linear at any exposure and side."""
 
     mean_translation_m: Tensor
 
-    def __init__(self, settings: GeometrySettings = GeometrySettings()) -> None:
+    def __init__(self, settings: GeometryNetworkSettings = GeometryNetworkSettings()) -> None:
         super().__init__()
         self.settings = settings
         self.side = _SIDES[settings.form]
@@ -62,7 +60,7 @@ class GeometryNetwork(nn.Module):
         self.register_buffer("mean_translation_m", mean, persistent=False)
 
     def forward(self, crops: Tensor) -> GeometryEstimate:
-        """Estimate pose and shape; crops are normalised here, so that their exposure does not matter."""
+        """Estimate pose and shape; the crops' exposure does not matter."""
         raw = self.regress(self.trunk(self._normalised(crops))).float()
         columns, shift, alpha, beta = raw.split(
             (6, 3, self.settings.identity, self.settings.expression), dim=1
@@ -70,7 +68,7 @@ class GeometryNetwork(nn.Module):
         return GeometryEstimate(_rotation(columns), self._translation(shift), _ALPHA * alpha, _BETA * beta)
 
     def _normalised(self, crops: Tensor) -> Tensor:
-        """Square roots of the crops at the network's side, of zero mean and unit deviation each."""
+        """Square roots of the crops at the network's side, each of zero mean and unit deviation."""
         if crops.shape[-1] > self.side:
             crops = F.interpolate(crops, (self.side, self.side), mode="area")
         elif crops.shape[-1] < self.side:
@@ -92,7 +90,7 @@ class GeometryNetwork(nn.Module):
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """What `as_metadata` describes, untrained; ValueError, TypeError or KeyError if it is none."""
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
         form, counts = metadata["form"], (int(metadata["identity"]), int(metadata["expression"]))
         x, y, z = (float(value) for value in metadata["mean_translation_m"])
         if (
@@ -101,11 +99,11 @@ class GeometryNetwork(nn.Module):
             or not -100 < z < 0
         ):
             raise ValueError(f"no Geometry Network has the settings {metadata}")
-        return cls(GeometrySettings(form, *counts, (x, y, z)))
+        return cls(GeometryNetworkSettings(form, *counts, (x, y, z)))
 
 
 def _rotation(columns: Tensor) -> Tensor:
-    """Rotations [B, 3, 3] of their first two columns' differences [B, 6] from the identity's."""
+    """Rotations [B, 3, 3] from the differences [B, 6] of their first two columns to the identity's."""
     identity = columns.new_tensor([1.0, 0, 0, 0, 1.0, 0])
     first, second = (columns + identity).chunk(2, 1)
     x = F.normalize(first, dim=1)
@@ -114,7 +112,7 @@ def _rotation(columns: Tensor) -> Tensor:
 
 
 def _alexnet() -> tuple[nn.Module, int]:
-    """All of AlexNet but its last layer."""
+    """AlexNet without its last layer, and its number of outputs."""
 
     def convolution(channels: int, out: int, side: int, stride: int = 1, padding: int = 1) -> list[nn.Module]:
         return [nn.Conv2d(channels, out, side, stride, padding), nn.ReLU()]
@@ -140,7 +138,10 @@ def _alexnet() -> tuple[nn.Module, int]:
 
 
 def _small() -> tuple[nn.Module, int]:
-    """Five halvings, all but the first with a residual. The last cells keep their places: pose is in them."""
+    """Five halvings, residual except the first, and a number of outputs.
+
+    The last cells are not pooled, since their positions carry the pose.
+    """
     widths = (24, 48, 88, 144, 192)
     enter = (nn.Conv2d(3, widths[0], 3, stride=2, padding=1), nn.GroupNorm(8, widths[0]), nn.SiLU())
     stages = [*enter, *(_Stage(a, b) for a, b in pairwise(widths))]
@@ -148,7 +149,7 @@ def _small() -> tuple[nn.Module, int]:
 
 
 class _Stage(nn.Module):
-    """Halve the side, then a convolution around which the input goes on."""
+    """Halve the side, then apply a residual convolution."""
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__()

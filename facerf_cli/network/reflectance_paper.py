@@ -1,15 +1,15 @@
-"""The Reflectance Network as the paper has it ('Network Architecture'): form `paper`.
+"""The Reflectance Network of the paper ('Network Architecture'): form `paper`.
 
 A U-Net of 8 down and 8 up convolutions, 3 x 3, with skips, over the source texture T_s and its normals N_s at
 512 x 512; the light direction enters at its bottleneck of 2 x 2. Five convolutions of stride 1 follow, over
 its features and the target's normals N_t, and give the texture T_t. The down path runs once a face, the rest
 once a light.
 
-Where the paper is silent: channels are 64 to 512, as is usual for such nets; a down convolution has stride 2,
-an up convolution follows a doubling by nearest neighbours; each but the first and the last is followed by
-group normalisation and a leaky rectifier; a linear layer spreads the light's three numbers over as many
-channels as the bottleneck has; the source's exposure is taken out and given back, and the network sees and
-gives square roots, which keep shadows apart as pictures' encodings do.
+The paper leaves these open: channels are 64 to 512, as is usual for such networks; a down convolution has
+stride 2, an up convolution follows a doubling by nearest neighbours; each except the first and the last is
+followed by group normalisation and a leaky rectifier; a linear layer spreads the light's three numbers over
+as many channels as the bottleneck has; the source is divided by its exposure and the output multiplied by it;
+and the network reads and predicts square roots, which separate shadows as display encodings do.
 """
 
 from dataclasses import asdict, dataclass
@@ -19,12 +19,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.reflectance import exposure_of, resize
+from facerf_cli.network.inputs import exposure_of, resize, to_root
 
 _SLOPE = 0.2  # of the leaky rectifiers
-_GROUPS = 4
+_GROUPS = 4  # of the group normalisations
 _LIGHT_CONVOLUTIONS = 5  # over the U-Net's features and the target's normals
-_FIRST_ROOT = 0.3  # what an untrained network answers everywhere, about: the square root of its radiance
+_FIRST_ROOT = 0.3  # square root of the radiance that an untrained network predicts everywhere, about
+_DECODER_CHANNELS = 220  # bound of what the decoder holds at once for each light, at its working side
+_TEXTURE_CHANNELS = 16  # bound of what the output holds at once for each light, at the side of the texture
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class PaperReflectanceSettings:
 
 @dataclass(frozen=True)
 class PaperEncoded:
-    """The down path's features of B faces, from fine to coarse, and what the output needs."""
+    """B encoded faces: features of the down path from fine to coarse, and what the output needs."""
 
     features: list[Tensor]
     exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
@@ -50,7 +52,10 @@ class PaperEncoded:
 
 
 class PaperReflectanceNetwork(nn.Module):
-    """T_s, N_s, N_t, light directions -> OLAT textures, scene-linear and non-negative."""
+    """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
+
+    rig_lights = 0  # it needs no mean face,
+    has_mean_face = False  # so it never stores one
 
     def __init__(self, settings: PaperReflectanceSettings = PaperReflectanceSettings()) -> None:
         super().__init__()
@@ -61,20 +66,21 @@ class PaperReflectanceNetwork(nn.Module):
         maps = 3 if settings.normals else 0
         before = (3 + maps, *widths[:-1])
         self.down = nn.ModuleList(
-            _Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(before, widths, strict=True))
+            _DownConvolution(a, b, first=i == 0) for i, (a, b) in enumerate(zip(before, widths, strict=True))
         )
         self.light = nn.Linear(3, widths[-1])
-        # From fine to coarse, as the down path; the coarsest takes the light's code in the place of a skip.
+        # From fine to coarse, as the down path; the coarsest takes the light's code in place of a skip.
         after = (features, *widths[:-1])
-        self.up = nn.ModuleList(_Up(a, a, b) for a, b in zip(widths, after, strict=True))
+        self.up = nn.ModuleList(_UpConvolution(a, a, b) for a, b in zip(widths, after, strict=True))
         channels = (features + maps, *[features] * (_LIGHT_CONVOLUTIONS - 1))
         self.light_convolutions = nn.ModuleList(
             nn.Conv2d(c, features if i + 1 < _LIGHT_CONVOLUTIONS else 3, 3, padding=1)
             for i, c in enumerate(channels)
         )
-        self._begin_grey()
+        self._initialise_grey()
 
-    def _begin_grey(self) -> None:
+    def _initialise_grey(self) -> None:
+        """Set weights with which the network predicts about `_FIRST_ROOT` everywhere."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, a=_SLOPE)
@@ -88,18 +94,22 @@ class PaperReflectanceNetwork(nn.Module):
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """An untrained network of these; raises KeyError, TypeError or ValueError where they make none."""
-        settings: dict[str, Any] = {
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in metadata.items()
-            if key != "form"
-        }
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
+        given = {k: v for k, v in metadata.items() if k != "form"}
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
         return cls(PaperReflectanceSettings(**settings))
+
+    def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
+        """Do nothing: this form needs no mean face."""
+
+    def bytes_per_light(self, texels: int) -> int:
+        """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
+        return 4 * (_DECODER_CHANNELS * self.settings.side**2 + _TEXTURE_CHANNELS * texels)
 
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> PaperEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
         exposure = exposure_of(texture, visible)
-        root = (texture / exposure).clamp_min(0).add(1e-6).sqrt()  # a slope at black, too
+        root = (texture / exposure).clamp_min(0).add(1e-6).sqrt()  # the offset keeps a finite slope at black
         maps = [root, normals_source] if self.settings.normals else [root]
         x = torch.cat([resize(y, self.settings.side) for y in maps], 1)
         features = []
@@ -109,7 +119,7 @@ class PaperReflectanceNetwork(nn.Module):
         return PaperEncoded(features, exposure, texture.shape[-1])
 
     def decode(self, encoded: PaperEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
-        """OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3] and normals [B, 3, T, T]."""
+        """Decode OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3], normals [B, 3, T, T]."""
         faces, count, _ = lights.shape
         *skips, bottleneck = encoded.features
         x = bottleneck.repeat_interleave(count, 0)
@@ -127,8 +137,13 @@ class PaperReflectanceNetwork(nn.Module):
         texture = F.softplus(last(x).float()) ** 2 * encoded.exposure.repeat_interleave(count, 0)
         return resize(texture, encoded.texture_side).view(faces, count, 3, *[encoded.texture_side] * 2)
 
+    def decode_root(self, encoded: PaperEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """Decode `to_root` of the textures over the source's exposure [B, L, 3, T, T]."""
+        linear = self.decode(encoded, normals_target, lights)
+        return to_root(linear.float() / encoded.exposure[:, None])
 
-class _Down(nn.Module):
+
+class _DownConvolution(nn.Module):
     """Halve the side by a convolution of stride 2."""
 
     def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
@@ -140,8 +155,8 @@ class _Down(nn.Module):
         return F.leaky_relu(self.norm(self.convolution(x)), _SLOPE)
 
 
-class _Up(nn.Module):
-    """Double the side and convolve what comes from below [B L, ...] and the skip [B or B L, ...]."""
+class _UpConvolution(nn.Module):
+    """Double the side of coarser features [B L, ...] and a skip [B or B L, ...], and convolve both."""
 
     def __init__(self, channels_in: int, skip_channels: int, channels_out: int) -> None:
         super().__init__()
@@ -150,7 +165,7 @@ class _Up(nn.Module):
         self.norm = nn.GroupNorm(_GROUPS, channels_out)
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        # The convolution of both, one below the other: the skip's share of it is the same for all lights.
+        # A convolution of both, stacked, in two parts: the part of the skip is the same for all lights.
         weight = self.convolution.weight
         own = F.conv2d(_doubled(x), weight[:, : self.channels_in], padding=1)
         shared = F.conv2d(_doubled(skip), weight[:, self.channels_in :], self.convolution.bias, padding=1)

@@ -23,7 +23,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.raster.texture import inpaint
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, noise, places_mm, smooth

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from facerf_cli.face.fit import FitSettings
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
-from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometrySettings
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.image_samples import FaceCrops, RenderedFaces
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
@@ -52,7 +52,7 @@ class GeometryObjective(Objective):
         settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
     ) -> None:
         super().__init__()
-        network = network or GeometryNetwork(GeometrySettings(mean_translation_m=faces.mean_translation_m()))
+        network = network or GeometryNetwork(GeometryNetworkSettings(mean_translation_m=faces.mean_translation_m()))
         self.networks = nn.ModuleDict({"geometry": network})
         self.chooses_by = "landmarks_percent"
         self.provenance = faces.provenance

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.network.feature_networks import LightNetwork
-from facerf_cli.network.reflectance import head_rotation, resize
+from facerf_cli.network.inputs import head_rotation, resize
 from facerf_cli.synth.texture_samples import SampleSource
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 

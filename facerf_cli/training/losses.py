@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from facerf_cli.network.feature_networks import Layered, feature_distance
-from facerf_cli.network.reflectance import from_root, to_root
+from facerf_cli.network.feature_networks import FeatureNetwork, feature_distance
+from facerf_cli.network.inputs import from_root, to_root
 
 _SLOPE_WEIGHT = 0.6
 _RADIANCE_WEIGHT = 16.0  # of squared errors as Si-MSE has them, against L1 on roots
@@ -115,16 +115,16 @@ class Seen:
     target: Tensor
     mask: Tensor
 
-    def distance(self, net: Layered) -> Tensor:
+    def distance(self, net: FeatureNetwork) -> Tensor:
         """Of the features of both, masked alike [B]."""
         return feature_distance(net, self.prediction * self.mask, self.target * self.mask)
 
 
-def appearance_loss(net: Layered, image: Seen, texture: Seen) -> Tensor:
+def appearance_loss(net: FeatureNetwork, image: Seen, texture: Seen) -> Tensor:
     """L_I [B]: V_f of the masked picture and of the texture."""
     return image.distance(net) + texture.distance(net)
 
 
-def light_loss(net: Layered, texture: Seen) -> Tensor:
+def light_loss(net: FeatureNetwork, texture: Seen) -> Tensor:
     """L_L [B]: S_f, which knows where light comes from, of the texture."""
     return texture.distance(net)

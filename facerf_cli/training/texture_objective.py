@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.feature_networks import LightNetwork, feature_distance
-from facerf_cli.network.reflectance import ReflectanceNetwork, from_root, to_root
+from facerf_cli.network.inputs import from_root, to_root
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
 from facerf_cli.synth.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
@@ -56,8 +57,8 @@ class ChartObjective(Objective):
         settings: ChartSettings = ChartSettings(),
     ) -> None:
         super().__init__()
-        network = network or ReflectanceNetwork()
-        if isinstance(network, ReflectanceNetwork):
+        network = network or DefaultReflectanceNetwork()
+        if isinstance(network, DefaultReflectanceNetwork):
             _set_mean_face(network, source)
         self.networks = nn.ModuleDict({"reflectance": network})
         self.chooses_by = "si_mse"
@@ -131,7 +132,7 @@ class ChartObjective(Objective):
         return self.networks["reflectance"]
 
 
-def _set_mean_face(network: ReflectanceNetwork, source: SampleSource) -> None:
+def _set_mean_face(network: DefaultReflectanceNetwork, source: SampleSource) -> None:
     try:
         network.set_mean_face(*source.mean_face())
     except ValueError as error:
@@ -140,7 +141,7 @@ def _set_mean_face(network: ReflectanceNetwork, source: SampleSource) -> None:
 
 def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
     """Roots [B, L, 3, T, T] at the normalised exposure, of either form."""
-    if isinstance(network, ReflectanceNetwork):
+    if isinstance(network, DefaultReflectanceNetwork):
         return network.decode_root(encoded, sample.normals_target, sample.lights)
     linear: Tensor = network.decode(encoded, sample.normals_target, sample.lights)
     return to_root(linear.float() / encoded.exposure[:, None])

@@ -17,7 +17,7 @@ from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import normal_map
 
@@ -31,8 +31,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a checkpoint and the photo's landmarks."""
     folder = tmp_path_factory.mktemp("given")
     torch.manual_seed(0)
-    settings = ReflectanceSettings(64, (4, 8, 8), (4, 8, 8), rig_lights=8)
-    network = ReflectanceNetwork(settings)
+    settings = DefaultReflectanceSettings(64, (4, 8, 8), (4, 8, 8), rig_lights=8)
+    network = DefaultReflectanceNetwork(settings)
     normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
     network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
     metadata = {"layout_version": LAYOUT_VERSION}

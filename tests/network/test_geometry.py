@@ -7,9 +7,9 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 
-SMALL = GeometrySettings(identity=5, expression=3, mean_translation_m=(0.01, -0.02, -0.9))
+SMALL = GeometryNetworkSettings(identity=5, expression=3, mean_translation_m=(0.01, -0.02, -0.9))
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_the_default_form_is_small():
 
 
 def test_the_paper_form_has_all_of_alexnet():
-    network = GeometryNetwork(GeometrySettings("paper", 80, 29))
+    network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
     trunk = sum(p.numel() for p in network.trunk.parameters())
     assert trunk == 61_100_840 - (
         4096 * 1000 + 1000

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from facerf_cli.network.reflectance import colour_cast
+from facerf_cli.network.inputs import colour_cast
 
 SKIN = torch.tensor([0.5, 0.36, 0.28])
 

@@ -1,102 +1,78 @@
+"""Every form of the Reflectance Network fits the interface that the pipeline and training use."""
+
+from typing import Any
+
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor, nn
 
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings, head_rotation
-from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.errors import UsageError
+from facerf_cli.network.inputs import to_root
+from facerf_cli.network.reflectance import REFLECTANCE_FORMS, ReflectanceNetwork, make_reflectance_network
 
-SMALL = ReflectanceSettings(
-    side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=12
-)
-
-
-@pytest.fixture(scope="module")
-def network() -> ReflectanceNetwork:
-    torch.manual_seed(3)
-    network = ReflectanceNetwork(SMALL)
-    normals = F.normalize(
-        torch.randn(3, 16, 16).repeat_interleave(4, 1).repeat_interleave(4, 2) + _front(64), dim=0
-    )
-    network.set_mean_face(normals, torch.rand(12, 64, 64), F.normalize(torch.randn(12, 3), dim=-1))
-    with torch.no_grad():
-        network.head.weight.mul_(300)  # an untrained head would hide what comes before it
-    return network.eval()
+SMALL: dict[str, dict[str, Any]] = {
+    "default": {"side": 32, "encoder_widths": [8, 12], "decoder_widths": [8, 12], "rig_lights": 5},
+    "paper": {"side": 32, "widths": [8, 8, 12, 16], "features": 8},
+}
 
 
-def _front(side: int) -> torch.Tensor:
-    return torch.tensor([0.0, 0.0, 2.0]).view(3, 1, 1).expand(3, side, side)
+@pytest.fixture(params=SMALL)
+def network(request: pytest.FixtureRequest) -> Any:
+    torch.manual_seed(0)
+    return make_reflectance_network(request.param, **SMALL[request.param])
 
 
-def _face(side: int, faces: int = 1) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(side)
-    texture = torch.rand(faces, 3, side, side, generator=generator)
-    normals = F.normalize(torch.randn(faces, 3, side, side, generator=generator) + _front(side), dim=1)
-    return texture, normals, (torch.rand(faces, 1, side, side, generator=generator) > 0.2).float()
+def face(side: int = 24) -> tuple[Tensor, Tensor, Tensor]:
+    normals = F.normalize(torch.randn(2, 3, side, side), dim=1)
+    return torch.rand(2, 3, side, side) + 0.1, normals, torch.ones(2, 1, side, side)
 
 
-def _lights(count: int, faces: int = 1) -> torch.Tensor:
-    return F.normalize(torch.randn(faces, count, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+def test_every_form_is_tried_here() -> None:
+    assert SMALL.keys() == REFLECTANCE_FORMS.keys()
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("side", [32, 256, 512])
-def test_any_texture_side_comes_out_linear_and_non_negative(network: ReflectanceNetwork, side: int) -> None:
-    texture, normals, visible = _face(side)
-    olat = network.decode(network.encode(texture, normals, visible), normals, _lights(3))
-    assert olat.shape == (1, 3, 3, side, side)
-    assert olat.min() >= 0 and olat.isfinite().all()
-
-
-@torch.no_grad()
-def test_lights_do_not_depend_on_the_batch_they_come_in(network: ReflectanceNetwork) -> None:
-    texture, normals, visible = _face(64, faces=2)
-    lights = _lights(5, faces=2)
+def test_roots_are_those_of_the_textures_over_the_exposure(network: ReflectanceNetwork) -> None:
+    texture, normals, visible = face()
+    lights = F.normalize(torch.randn(2, 3, 3), dim=-1)
     encoded = network.encode(texture, normals, visible)
-    together = network.decode(encoded, normals, lights)
-    apart = torch.cat([network.decode(encoded, normals, light) for light in lights.split(1, 1)], 1)
-    assert torch.allclose(together, apart, atol=1e-5)
+    olats = network.decode(encoded, normals, lights)
+    roots = network.decode_root(encoded, normals, lights)
+    assert olats.shape == roots.shape == (2, 3, 3, 24, 24) and encoded.exposure.shape == (2, 1, 1, 1)
+    expected = to_root(olats / encoded.exposure[:, None])
+    assert torch.allclose(roots.clamp_min(0), expected, atol=1e-5)
 
 
-@torch.no_grad()
-def test_exposure_of_the_photo_passes_straight_through(network: ReflectanceNetwork) -> None:
-    texture, normals, visible = _face(64)
-    lights = _lights(2)
-    once = network.decode(network.encode(texture, normals, visible), normals, lights)
-    brighter = network.decode(network.encode(4 * texture, normals, visible), normals, lights)
-    assert torch.allclose(brighter, 4 * once, rtol=1e-3, atol=1e-4)
+def test_the_mean_face_is_stored_by_forms_that_need_it(network: ReflectanceNetwork) -> None:
+    lights, side = network.rig_lights, 64
+    normals = torch.tensor([0.0, 0, 1]).view(3, 1, 1).expand(3, side, side)
+    assert not network.has_mean_face
+    network.set_mean_face(normals, torch.ones(lights, side, side), torch.ones(lights, 3))
+    assert network.has_mean_face == (lights > 0)
 
 
-@torch.no_grad()
-def test_unseen_texels_do_not_set_the_exposure(network: ReflectanceNetwork) -> None:
-    texture, normals, visible = _face(64)
-    changed = torch.where(visible > 0, texture, 50.0)
-    first, second = (network.encode(x, normals, visible).exposure for x in (texture, changed))
-    assert torch.allclose(first, second)
+def test_memory_grows_with_the_texture_and_is_positive(network: ReflectanceNetwork) -> None:
+    small, large = network.bytes_per_light(64**2), network.bytes_per_light(512**2)
+    assert 0 < small < large
 
 
-@torch.no_grad()
-def test_head_rotation_is_read_off_the_normals(network: ReflectanceNetwork) -> None:
-    rotation = pose_to_rotation(31, -12, 8)
-    normals = torch.einsum("dc,cij->dij", rotation, network.mean_normals)[None]
-    assert torch.allclose(head_rotation(network.mean_normals, normals)[0], rotation, atol=1e-4)
+def test_memory_of_a_light_is_that_of_the_shipped_networks() -> None:
+    with torch.device("meta"):
+        default, paper = make_reflectance_network(), make_reflectance_network("paper")
+    assert default.bytes_per_light(256**2) == 4 * (220 * 128**2 + 16 * 256**2)
+    assert paper.bytes_per_light(256**2) == 4 * (220 * 512**2 + 16 * 256**2)
 
 
-def test_gradients_reach_every_weight_and_stay_finite_in_the_dark(network: ReflectanceNetwork) -> None:
-    texture, normals, visible = _face(64)
-    encoded = network.encode(texture * 0, normals, visible)
-    network.decode_root(encoded, normals, _lights(2)).square().mean().backward()
-    missing = [
-        name for name, p in network.named_parameters() if p.grad is None or not p.grad.isfinite().all()
-    ]
-    network.zero_grad()
-    assert not missing
+def test_a_form_by_its_name_is_its_class_with_its_settings(network: Any) -> None:
+    metadata = network.as_metadata()
+    assert type(network) is REFLECTANCE_FORMS[metadata["form"]] and isinstance(network, nn.Module)
+    assert metadata["side"] == 32
+    assert type(network).from_metadata(metadata).as_metadata() == metadata
 
 
-@torch.no_grad()
-def test_bf16_stays_near_float32(network: ReflectanceNetwork) -> None:
-    texture, normals, visible = _face(64)
-    lights = _lights(2)
-    exact = network.decode(network.encode(texture, normals, visible), normals, lights)
-    with torch.autocast("cpu", torch.bfloat16):
-        rough = network.decode(network.encode(texture, normals, visible), normals, lights)
-    assert (rough.float() - exact).abs().mean() < 0.03 * exact.abs().mean()
+def test_unknown_forms_and_settings_are_refused() -> None:
+    with pytest.raises(UsageError, match="form other: no such Reflectance Network; give default or paper"):
+        make_reflectance_network("other")
+    with pytest.raises(TypeError):
+        make_reflectance_network("paper", rig_lights=3)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.heads_bank import Bank
 from facerf_cli.training.loop import train
@@ -16,14 +16,14 @@ from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
 from tests.toy_faces import ToyFaces, toy_objective
 
-NETWORK = ReflectanceSettings(
+NETWORK = DefaultReflectanceSettings(
     side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=20
 )
 
 
 def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> None:
     settings = ChartSettings(lights=3, held_out_heads=2, held_out_draws=2)
-    objective = ChartObjective(bank, ReflectanceNetwork(NETWORK), settings=settings)
+    objective = ChartObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     train(objective, tmp_path, replace(PRESETS["tiny"], steps=60))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])
@@ -51,7 +51,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_halves() -> None:
 
 def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apart(bank: Bank) -> None:
     settings = ChartSettings(held_out_heads=2, held_out_draws=12)
-    objective = ChartObjective(bank, ReflectanceNetwork(NETWORK), settings=settings)
+    objective = ChartObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     first, second = objective.validate(), objective.validate()
     assert first.metrics == second.metrics
     assert first.metrics.keys() == {"si_mse", "si_mse_same_pose", "si_mse_other_pose"}
@@ -85,8 +85,8 @@ def test_the_papers_form_trains_in_the_chart(tmp_path: Path) -> None:
 @pytest.mark.parametrize("normals", [True, False])
 def test_without_normals_the_network_does_not_see_them(normals: bool) -> None:
     torch.manual_seed(0)
-    settings = ReflectanceSettings(16, (8, 8), (8, 8), template_channels=1, rig_lights=8, normals=normals)
-    objective = ChartObjective(ToyFaces(), ReflectanceNetwork(settings))
+    settings = DefaultReflectanceSettings(16, (8, 8), (8, 8), template_channels=1, rig_lights=8, normals=normals)
+    objective = ChartObjective(ToyFaces(), DefaultReflectanceNetwork(settings))
     sample = objective.draw(1, lambda i: seeded(1, i), 1).sample
     network = objective.networks["reflectance"]
     turned = sample.normals_source.flip(-1) * torch.tensor([-1.0, 1, 1]).view(3, 1, 1)

@@ -11,7 +11,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.downloads import Published
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.training import pretrained as feature_networks
 from facerf_cli.training.pretrained import VGG16, load_light_features, load_vgg
 
@@ -117,7 +117,7 @@ def test_light_features_come_back_frozen(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_without_light_features_is_refused(tmp_path: Path) -> None:
-    network = ReflectanceNetwork(ReflectanceSettings(32, (8, 8), (8, 8), 2, 4))
+    network = DefaultReflectanceNetwork(DefaultReflectanceSettings(32, (8, 8), (8, 8), 2, 4))
     path = tmp_path / "last.safetensors"
     save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
     with pytest.raises(InputError, match="holds no S_f; give one by `facerf train --stage light-features`"):

@@ -9,7 +9,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometrySettings
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.synth.image_samples import RenderedFaces, add_pictures
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
@@ -114,7 +114,7 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
 
 
 def test_the_paper_form_learns_from_the_same_crops(faces):
-    network = GeometryNetwork(GeometrySettings("paper", 80, 29))
+    network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
     objective = GeometryObjective(faces, network, FEW)
     sum(objective(draw(objective, 1)).values()).backward()
     assert network.trunk[0].weight.grad.abs().max() > 0

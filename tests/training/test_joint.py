@@ -11,12 +11,12 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import draw_pairs
 from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import load_pairs, name_maps, settle_pairs
+from facerf_cli.dataset.weights import load_pairs, envmap_names, write_pairs
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
-from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometrySettings
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.training.joint_objective import (
@@ -33,7 +33,7 @@ from tests.dataset.dataset_fixture import write_small_dataset
 CROP_PX, SIDE = 48, 32
 SETTINGS = JointSettings(crop_px=CROP_PX, texture_side=SIDE, validation_pairs=2)
 PAPER = PaperReflectanceSettings(side=SIDE, widths=(8, 8, 16, 16), features=8)
-DEFAULT = ReflectanceSettings(
+DEFAULT = DefaultReflectanceSettings(
     side=SIDE, encoder_widths=(8, 12), decoder_widths=(8, 12), template_channels=2, rig_lights=12
 )
 
@@ -43,7 +43,7 @@ class SmallGeometry(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        real = GeometryNetwork(GeometrySettings("default", 6, 4, (0.0, 0.0, -1.0)))
+        real = GeometryNetwork(GeometryNetworkSettings("default", 6, 4, (0.0, 0.0, -1.0)))
         self.settings, self.regress = real.settings, real.regress
         self.real = real
         self.trunk = nn.Linear(3, self.regress.in_features)
@@ -66,8 +66,8 @@ class FakePhotos:
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     dataset = write_small_dataset(tmp_path_factory.mktemp("dataset"), lights=20, crop_px=CROP_PX)
-    maps = name_maps(ProceduralMaps(3, 0, 32))
-    settle_pairs(dataset, draw_pairs(dataset, maps, 6, 0), overwrite=False)
+    maps = envmap_names(ProceduralMaps(3, 0, 32))
+    write_pairs(dataset, draw_pairs(dataset, maps, 6, 0), overwrite=False)
     for rows, weights in load_pairs(dataset).values():
         relight_subject(dataset, rows, weights)
     return dataset
@@ -198,7 +198,7 @@ def test_terms_of_a_known_head_are_small(dataset: Dataset) -> None:
 
 @pytest.mark.parametrize("form", ["paper", "default"])
 def test_the_loss_falls(dataset: Dataset, form: str) -> None:
-    reflectance = PaperReflectanceNetwork(PAPER) if form == "paper" else ReflectanceNetwork(DEFAULT)
+    reflectance = PaperReflectanceNetwork(PAPER) if form == "paper" else DefaultReflectanceNetwork(DEFAULT)
     objective = objective_of(dataset, reflectance)
     optimizer = torch.optim.Adam(objective.networks.parameters(), lr=3e-3)
     batch = batch_of(objective, photos=False)

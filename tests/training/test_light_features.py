@@ -1,7 +1,7 @@
 import torch
 
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
-from facerf_cli.network.reflectance import head_rotation
+from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.heads_bank import Bank
 from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings

@@ -1,6 +1,6 @@
 import torch
 
-from facerf_cli.network.reflectance import from_root, to_root
+from facerf_cli.network.inputs import from_root, to_root
 from facerf_cli.training.losses import clipped_si_mse, root_loss, si_mse
 
 

@@ -8,14 +8,14 @@ from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import load_networks, save_checkpoint
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
-from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
-from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceSettings
 
 DESCRIBED: dict[str, dict[str, Any]] = {
-    "reflectance": {"form": "default", **ReflectanceSettings().__dict__},
+    "reflectance": {"form": "default", **DefaultReflectanceSettings().__dict__},
     "paper": {"form": "paper", **PaperReflectanceSettings().__dict__},
-    "geometry": {"form": "default", **GeometrySettings().__dict__},
+    "geometry": {"form": "default", **GeometryNetworkSettings().__dict__},
     "light_features": LightNetwork().as_metadata(),
     "diffuse_sh": DiffuseNetwork().as_metadata(),
 }
@@ -59,8 +59,8 @@ def test_weights_of_other_sizes_are_refused_in_words(tmp_path: Path) -> None:
 def test_settings_that_no_tensor_betrays_are_refused_in_words(
     tmp_path: Path, setting: dict[str, Any]
 ) -> None:
-    network = ReflectanceNetwork(
-        ReflectanceSettings(side=16, encoder_widths=(8,), decoder_widths=(8,), rig_lights=4)
+    network = DefaultReflectanceNetwork(
+        DefaultReflectanceSettings(side=16, encoder_widths=(8,), decoder_widths=(8,), rig_lights=4)
     )
     path = tmp_path / "a.safetensors"
     tensors = {f"reflectance.{name}": tensor for name, tensor in network.state_dict().items()}

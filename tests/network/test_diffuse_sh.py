@@ -8,7 +8,7 @@ from torch import Tensor
 from facerf_cli.light.sh import irradiance, rig_coefficients, rotated
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings, shading
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.raster.camera import pose_to_rotation
 
 SETTINGS = DiffuseSettings(
@@ -83,7 +83,7 @@ def test_the_light_turns_with_the_head_that_it_was_read_in(network: DiffuseNetwo
     turn = pose_to_rotation(35.0, -15.0, 10.0)
     in_head = torch.randn(1, 9, 3)
     normals = torch.einsum("dc,cij->dij", turn, bump(64))[None]
-    turned = network._turned(in_head, normals)
+    turned = network._to_camera(in_head, normals)
     assert torch.allclose(turned[0], rotated(in_head[0], turn), atol=1e-4)
     assert torch.allclose(
         shading(normals, turned[:, None]), shading(bump(64)[None], in_head[:, None]), atol=1e-3

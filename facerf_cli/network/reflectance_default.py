@@ -1,0 +1,227 @@
+"""The Reflectance Network of this project: form `default`.
+
+It predicts a texture under any single light from one texture (paper, 'Network Architecture'). It departs from
+the paper's network in three ways that learn faster: the light also enters the decoder, as maps in UV space
+(cosine, half vector, the mean face's shadow) and as feature-wise modulation; the output is
+`source x gain + bias` in square-root space; and the network works at a fixed side, while gain and bias are
+applied at the side of the texture.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.inputs import exposure_of, from_root, head_rotation, resize
+
+_MAP_SIDE = 64  # of the stored normals and shadows of the mean face
+_DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
+_LIGHT_MAPS = 4  # cosine, gloss, shadow and base gain
+_LIGHT_FEATURES = 12  # numbers that describe a light: camera and head direction, products of the latter
+_CODE_CHANNELS = 96  # of the light's code, which modulates the decoder
+_KERNEL_SHARPNESS = 70.0  # of the interpolation between the shadow maps of neighbouring lights
+_DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
+_TEXTURE_CHANNELS = 16  # that the output holds at once for each light, at the side of the texture
+
+
+@dataclass(frozen=True)
+class DefaultReflectanceSettings:
+    """Channels of encoder and decoder at each halving of the working side (side, side / 2, ...), and more.
+
+    `rig_lights` is the number of lights whose shadows on the mean face are stored. `normals` False replaces
+    normal maps by zeros (paper, 'Ablative Study').
+    """
+
+    side: int = 128
+    encoder_widths: tuple[int, ...] = (32, 64, 128, 192, 224, 256)
+    decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
+    template_channels: int = 8
+    rig_lights: int = 150
+    normals: bool = True
+
+
+@dataclass(frozen=True)
+class DefaultEncoded:
+    """B encoded faces: skip features from fine to coarse, and what the output needs of the source."""
+
+    features: list[Tensor]
+    source_root: Tensor  # [B, 3, T, T] square root of the source over its exposure
+    exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
+
+
+class DefaultReflectanceNetwork(nn.Module):
+    """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
+
+    mean_normals: Tensor
+    mean_visibility: Tensor
+    rig: Tensor
+
+    def __init__(self, settings: DefaultReflectanceSettings = DefaultReflectanceSettings()) -> None:
+        super().__init__()
+        self.settings = settings
+        enc, dec, rig_lights = settings.encoder_widths, settings.decoder_widths, settings.rig_lights
+        self.template = nn.Parameter(0.1 * torch.randn(settings.template_channels, 32, 32))
+        widths = (7 + settings.template_channels, *enc)
+        self.down = nn.ModuleList(
+            Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(widths, enc, strict=False))
+        )
+        self.bottleneck = nn.Conv2d(enc[-1], dec[-1], 3, padding=1)
+        self.light_code = nn.Sequential(
+            nn.Linear(_LIGHT_FEATURES, _CODE_CHANNELS),
+            nn.SiLU(),
+            nn.Linear(_CODE_CHANNELS, _CODE_CHANNELS),
+            nn.SiLU(),
+        )
+        coarser = (*dec[1:], dec[-1])
+        self.up = nn.ModuleList(
+            _LitUp(coarser[i], dec[i], enc[i], coarsest=i == len(dec) - 1) for i in range(len(dec))
+        )
+        self.head = nn.Conv2d(dec[0], 6, 3, padding=1)
+        nn.init.normal_(self.head.weight, std=1e-3)
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+        self.register_buffer("mean_normals", torch.zeros(3, _MAP_SIDE, _MAP_SIDE))
+        self.register_buffer(
+            "mean_visibility", torch.zeros(rig_lights, _MAP_SIDE, _MAP_SIDE, dtype=torch.uint8)
+        )
+        self.register_buffer("rig", torch.zeros(rig_lights, 3))
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "default", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
+        given = {k: v for k, v in metadata.items() if k != "form"}
+        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
+        return cls(DefaultReflectanceSettings(**settings))
+
+    @property
+    def rig_lights(self) -> int:
+        """Number of lights whose shadows on the mean face are stored."""
+        return self.settings.rig_lights
+
+    @property
+    def has_mean_face(self) -> bool:
+        """True once `set_mean_face` has stored the mean face."""
+        return bool(self.mean_normals.any())
+
+    def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
+        """Store the mean face (head frame): normals [3, T, T], visibility [L, T, T], directions [L, 3].
+
+        Raises ValueError if L is not `rig_lights`.
+        """
+        if len(directions) != len(self.rig):
+            raise ValueError(
+                f"the network stores the shadows of {len(self.rig)} lights, not of {len(directions)}"
+            )
+        size = (_MAP_SIDE, _MAP_SIDE)
+        self.mean_normals.copy_(F.normalize(F.interpolate(normals[None], size, mode="area")[0], dim=0))
+        self.mean_visibility.copy_((F.interpolate(visibility[None], size, mode="area")[0] * 255).round())
+        self.rig.copy_(directions)
+
+    def bytes_per_light(self, texels: int) -> int:
+        """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
+        return 4 * (_DECODER_CHANNELS * self.settings.side**2 + _TEXTURE_CHANNELS * texels)
+
+    def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> DefaultEncoded:
+        """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
+        exposure = exposure_of(texture, visible)
+        source_root = (texture / exposure).clamp_min(_DARKEST).sqrt()
+        side = self.settings.side
+        small = [resize(x, side) for x in (source_root, visible, self._normals_used(normals_source))]
+        template = F.interpolate(self.template[None], (side, side), mode="bilinear", align_corners=False)
+        x = torch.cat([*small, template.expand(len(texture), -1, -1, -1)], 1)
+        features = []
+        for down in self.down:
+            x = down(x)
+            features.append(x)
+        return DefaultEncoded(features, source_root, exposure)
+
+    def decode(self, encoded: DefaultEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """Decode OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3], normals [B, 3, T, T]."""
+        root = self.decode_root(encoded, normals_target, lights)
+        return from_root(root) * encoded.exposure[:, None]
+
+    def decode_root(self, encoded: DefaultEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
+        """Decode `to_root` of the textures over the source's exposure [B, L, 3, T, T]; may be negative."""
+        faces, count, _ = lights.shape
+        maps, base, code = self._light_inputs(self._normals_used(normals_target), lights)
+        x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
+        for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
+            x = up(x, skip, maps, code, count)
+        gain, bias = (resize(y, encoded.source_root.shape[-1]) for y in self.head(x).float().chunk(2, 1))
+        gain = gain + resize(base, encoded.source_root.shape[-1])
+        root = encoded.source_root.repeat_interleave(count, 0) * gain + bias
+        return root.view(faces, count, *root.shape[1:])
+
+    def _normals_used(self, normals: Tensor) -> Tensor:
+        return normals if self.settings.normals else torch.zeros_like(normals)
+
+    def _light_inputs(self, normals_target: Tensor, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Light maps [B*L, 4, T', T'], Lambert's base gain [B*L, 1, T', T'], light codes [B*L, 96]."""
+        normals = resize(normals_target, self.settings.side)
+        head_to_camera = head_rotation(self.mean_normals, normals_target)
+        lights_head = lights @ head_to_camera  # row vectors: R^T w
+        half = F.normalize(lights + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
+        cosine = torch.einsum("blc,bcij->blij", lights, normals)
+        gloss = torch.einsum("blc,bcij->blij", half, normals).clamp_min(0) ** 8
+        shadow = resize(self._mean_shadow(lights_head), self.settings.side)
+        base = (cosine.clamp_min(0) * shadow + 1e-4).sqrt()
+        maps = torch.stack([cosine, gloss, shadow, base], 2).flatten(0, 1)
+        products = (lights_head[..., :, None] * lights_head[..., None, :]).flatten(-2)[
+            ..., [0, 1, 2, 4, 5, 8]
+        ]
+        features = torch.cat([lights, lights_head, products], -1).flatten(0, 1)
+        return maps, base.flatten(0, 1)[:, None], self.light_code(features)
+
+    def _mean_shadow(self, lights_head: Tensor) -> Tensor:
+        """Visibility of the mean face [B, L, T'', T''], interpolated between the stored directions."""
+        weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
+        flat = weights @ (self.mean_visibility.to(weights) / 255).flatten(1)
+        return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
+
+
+class Down(nn.Module):
+    """Halve the side (except in the first), then apply a residual convolution."""
+
+    def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
+        self.norm = nn.GroupNorm(4, channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
+        x = F.silu(self.norm(self.enter(x)))
+        result: Tensor = x + F.silu(self.inner(x))
+        return result
+
+
+class _LitUp(nn.Module):
+    """Double the side (except in the coarsest), add skip and light maps, modulate by the light's code."""
+
+    def __init__(self, channels_in: int, channels_out: int, skip_channels: int, coarsest: bool) -> None:
+        super().__init__()
+        self.scale = 1 if coarsest else 2
+        kernel, padding = (3, 1) if coarsest else (1, 0)
+        self.enter = nn.Conv2d(channels_in, channels_out, kernel, padding=padding)
+        self.skip = nn.Conv2d(skip_channels, channels_out, 1)
+        self.light = nn.Conv2d(_LIGHT_MAPS, channels_out, 3, padding=1)
+        self.modulation = nn.Linear(_CODE_CHANNELS, 2 * channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+        self.outer = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor, skip: Tensor, maps: Tensor, code: Tensor, lights: int) -> Tensor:
+        side = skip.shape[-1]
+        x = self.enter(x)
+        if self.scale == 2:
+            x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        x = x + self.skip(skip).repeat_interleave(lights, 0) + self.light(resize(maps, side))
+        scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
+        x = F.silu(x * (1 + scale) + shift)
+        x = x + F.silu(self.inner(x))
+        result: Tensor = x + F.silu(self.outer(x))
+        return result
