@@ -1,165 +1,34 @@
-"""A furnished room and what its lamps make of it, for the procedural maps indoors.
+"""Kinds of procedural envmaps indoors: windows, hall, studio, stage.
 
-A room is a box that its lights illuminate by distance and angle, and its own walls once more evenly.
-
-Kinds of maps between walls: windows, hall, studio, stage; for the units see `synth/sky/daylight.py`.
+The sky outside a window has a radiance of about 1 before exposure; `skies.py` normalises the finished map.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from facerf_cli.synth.sky.daylight import (
+from facerf_cli.synth.sky.painting import (
     Grid,
     Random,
     Rectangle,
-    around,
     disc,
-    look_up,
-    noise_tile,
+    draw_white,
     paint,
     ring_noise,
+    sample_ring,
     toward,
-    warmth,
 )
+from facerf_cli.synth.sky.rooms import Lights, Room, draw_room
 
-_CLOSEST_M = 0.5  # lamps are no points
-_FLOORS = np.array(
-    [[0.35, 0.2, 0.1], [0.5, 0.34, 0.2], [0.16, 0.09, 0.05], [0.25, 0.25, 0.26], [0.5, 0.48, 0.45]]
-)
-
-
-@dataclass(frozen=True)
-class Box:
-    """A room [m] about the head; turned, so that its walls face anywhere."""
-
-    low: np.ndarray  # [3] the corner below, behind
-    high: np.ndarray  # [3] the corner opposite
-    turn: np.ndarray  # [3, 3] to the box's axes
-
-    def hits(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance [...] to the walls, and which axis they cut, of rays in the box's axes [..., 3]."""
-        safe = np.where(np.abs(directions) < 1e-6, 1e-6, directions)
-        distances = (np.where(safe > 0, self.high, self.low) - origins) / safe
-        return distances.min(-1), distances.argmin(-1)
-
-
-@dataclass
-class Lights:
-    """What shines by itself: its picture, and where it shines from."""
-
-    grid: Grid
-    image: np.ndarray = field(init=False)  # [H, W, 3]
-    lamps: list[tuple[np.ndarray, np.ndarray, bool]] = field(default_factory=list)  # centre, power, is flat
-
-    def __post_init__(self) -> None:
-        self.image = np.zeros(self.grid.directions.shape)
-
-    def add(self, centre: np.ndarray, radiance: np.ndarray, flat: bool) -> None:
-        """Radiance [H, W, 3] around a direction; a flat light shines by the cosine, others all round."""
-        self.image += radiance
-        self.lamps.append((centre, (radiance * self.grid.solid_angles_sr[..., None]).sum((0, 1)), flat))
-
-
-@dataclass(frozen=True)
-class Room:
-    """A box with what its pixels show."""
-
-    box: Box
-    points: np.ndarray  # [H, W, 3] m, in the box's axes
-    normals: np.ndarray  # [H, W, 3], inward
-    albedo: np.ndarray  # [H, W, 3]
-    crease: np.ndarray  # [H, W] 0.5 in corners to 1: ambient light that reaches
-
-    def lit(self, lights: Lights) -> np.ndarray:
-        """Radiance [H, W, 3] of the walls under lights."""
-        direct = np.zeros(self.points.shape)
-        for centre, power, flat in lights.lamps:
-            direct += self._from_lamp(centre, flat)[..., None] * power
-        share = (lights.grid.solid_angles_sr / (4 * np.pi))[..., None]
-        grey = (self.albedo * share).sum((0, 1))
-        even = (direct * self.albedo * share).sum((0, 1)) / (1 - np.minimum(grey, 0.85))
-        return np.asarray(self.albedo / np.pi * (direct + even * self.crease[..., None]))
-
-    def _from_lamp(self, centre: np.ndarray, flat: bool) -> np.ndarray:
-        """Irradiance [H, W] from a lamp of radiance times solid angle 1 as seen from the head."""
-        ahead = (self.box.turn @ centre).astype(np.float32)
-        distance_m = float(self.box.hits(np.zeros(3, np.float32), ahead)[0]) * 0.93
-        away = self.points - distance_m * ahead
-        square = np.maximum((away * away).sum(-1), _CLOSEST_M**2)
-        length = np.sqrt(square)
-        cosine = np.clip(-(away * self.normals).sum(-1) / length, 0, None)
-        if flat:
-            cosine = cosine * np.clip(-(away @ ahead) / length, 0, None)
-        return np.asarray(cosine * distance_m**2 / square)
-
-
-def draw_room(grid: Grid, random: Random, wall: tuple[float, float], largest_m: float = 5.0) -> Room:
-    """A furnished room with walls of albedo within `wall`."""
-    wide, long = (np.exp(random.uniform(np.log(1.5), np.log(largest_m), 2)) for _ in range(2))
-    eye, above = random.uniform(1.1, 1.7), random.uniform(0.9, 0.3 * largest_m + 0.7)
-    angle = np.radians(random.uniform(0, 90))
-    c, s = np.cos(angle), np.sin(angle)
-    box = Box(
-        np.array([-wide[0], -eye, -long[0]], np.float32),
-        np.array([wide[1], above, long[1]], np.float32),
-        np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32),
-    )
-    directions = grid.directions @ box.turn.T
-    distance, axis = box.hits(np.zeros(3, np.float32), directions)
-    points = directions * distance[..., None]
-    normals = -np.sign(directions) * (axis[..., None] == np.arange(3))
-    albedo = _surfaces(grid, random, points, normals, wall, eye)
-    gaps = np.sort(np.minimum(points - box.low, box.high - points), -1)[..., 1]
-    return Room(box, points, normals.astype(np.float32), albedo, 1 - 0.45 * np.exp(-gaps / 0.35))
-
-
-def _surfaces(
-    grid: Grid, random: Random, points: np.ndarray, normals: np.ndarray, wall: tuple[float, float], eye: float
-) -> np.ndarray:
-    """Albedo [H, W, 3]: walls (one may be coloured), a bright ceiling, a floor, furniture before it."""
-    grey = float(np.exp(random.uniform(*np.log(wall))))
-    walls = grey * np.array([1.0, 0.96, 0.9]) ** random.uniform(0, 2)
-    accent = np.clip(walls * np.exp(random.normal(0, 0.45, 3)), 0, 0.85) if random.random() < 0.4 else walls
-    floor = np.minimum(_FLOORS[random.integers(len(_FLOORS))] * grey * random.uniform(0.9, 2.2), 0.75)
-    ceiling = np.full(3, min(1.25 * grey, 0.85))
-    albedo = np.where(normals[..., :1] > 0.5, accent, walls)
-    albedo = np.where(normals[..., 1:2] < -0.5, ceiling, albedo)
-    boards = np.exp(0.12 * look_up(noise_tile(random, 1.2, 2), points[..., 0] / 4, points[..., 2] / 0.7))
-    albedo = np.where(normals[..., 1:2] > 0.5, floor * boards[..., None], albedo)
-    stuff = grey * np.exp(random.normal(-0.8, 0.8, (24, 1)) + random.normal(0, 0.2, (24, 3)))
-    stuff = np.clip(stuff, 0.002, 0.7)
-    return _furnish(grid, random, points, albedo, stuff, eye)
-
-
-def _furnish(
-    grid: Grid, random: Random, points: np.ndarray, albedo: np.ndarray, stuff: np.ndarray, eye: float
-) -> np.ndarray:
-    """A band of things of unlike height along the walls, as seen from the head."""
-    edges = np.sort(random.uniform(0, 2048, len(stuff)))
-    index = np.searchsorted(edges, np.arange(2048)) % len(stuff)
-    tall_m = np.where(random.random(len(stuff)) < 0.3, 0.0, random.choice([0.45, 0.75, 0.9, 1.9], len(stuff)))
-    nearer = random.uniform(0.6, 0.85)  # it stands this share of the way to the wall
-    reach = np.hypot(points[..., 0], points[..., 2])
-    tops = (around(grid, tall_m[index]) - eye) / nearer
-    bottom = -eye / nearer
-    slope = points[..., 1] / np.maximum(reach, 1e-3)  # tangent of the elevation
-    ring_reach = np.median(reach[len(reach) // 2 - 1 : len(reach) // 2 + 1], axis=0)
-    soft = grid.pixel_rad * 2
-    share = np.clip((tops / ring_reach - slope) / soft + 0.5, 0, 1)
-    share = share * np.clip((slope - bottom / ring_reach) / soft + 0.5, 0, 1)
-    share = share * (around(grid, tall_m[index]) > 0)
-    foot = np.clip((slope - bottom / ring_reach) / np.maximum((tops - bottom) / ring_reach, 1e-3), 0, 1)
-    shaded = around(grid, stuff[index]) * (0.25 + 0.75 * np.sqrt(foot))[..., None]
-    return np.asarray(albedo + share[..., None] * (shaded - albedo))
+_MAX_HALL_LIGHTS = 12  # ceiling lights that illuminate the room; the image shows all
 
 
 def windows(grid: Grid, random: Random) -> np.ndarray:
-    """One to four windows along the walls of a room, showing sky and land; at times sun or a lamp."""
+    """Draw a room with one to four windows on sky and land; some have direct sun or a ceiling light."""
     room, lights = draw_room(grid, random, (0.35, 0.75)), Lights(grid)
     azimuth_deg = random.uniform(-180, 180)
     wide, high = random.uniform(0.12, 0.45), random.uniform(0.25, 0.7)
-    day = warmth(random, 0, 0.3) * np.exp(random.uniform(1.2, 4))
+    day = draw_white(random, 0, 0.3) * np.exp(random.uniform(1.2, 4))
     view = _outside(grid, random) * day
     panes = [
         Rectangle(azimuth_deg + random.uniform(50, 75) * index, random.uniform(0, 10), wide, high)
@@ -172,15 +41,19 @@ def windows(grid: Grid, random: Random) -> np.ndarray:
         lights.image += _sunlit(grid, room, panes[0], random)[..., None] * room.albedo / np.pi * beam
     if random.random() < 0.5:
         centre = toward(random.uniform(-180, 180), random.uniform(10, 70))
-        lamp = disc(grid, centre, random.uniform(1.5, 5))
-        lights.add(centre, paint(lamp, warmth(random, 0.6, 1) * np.exp(random.uniform(2.5, 5.5))), flat=False)
+        bulb = disc(grid, centre, random.uniform(1.5, 5))
+        lights.add(
+            centre, paint(bulb, draw_white(random, 0.6, 1) * np.exp(random.uniform(2.5, 5.5))), flat=False
+        )
     return lights.image + room.lit(lights) * _opaque(grid, panes)
 
 
 def _outside(grid: Grid, random: Random) -> np.ndarray:
-    """What windows show, sky about 1 [H, W, 3]."""
+    """Draw the view through a window [H, W, 3]: land and a sky of radiance about 1."""
     elevation = grid.elevations_rad
-    tops = np.radians(random.uniform(-2, 14)) * (0.6 + 0.3 * around(grid, ring_noise(random, 0.8, 2, 300)))
+    tops = np.radians(random.uniform(-2, 14)) * (
+        0.6 + 0.3 * sample_ring(grid, ring_noise(random, 0.8, 2, 300))
+    )
     land = np.array([0.12, 0.16, 0.07]) * random.uniform(0.5, 1.6)
     share = np.clip((tops - elevation) / grid.pixel_rad + 0.5, 0, 1)
     share = np.maximum(share, np.clip(0.5 - elevation / grid.pixel_rad, 0, 1))[..., None]
@@ -189,18 +62,18 @@ def _outside(grid: Grid, random: Random) -> np.ndarray:
 
 
 def _pane(grid: Grid, pane: Rectangle) -> np.ndarray:
-    """Coverage [H, W] of a window's glass: its pane less the bars that cross it."""
+    """Coverage [H, W] of the glass of a window: the pane without its glazing bars."""
     x, y, _ = pane.place(grid.directions)
     bars = np.maximum(
         np.clip((0.05 - np.abs(x)) * pane.wide / grid.pixel_rad + 0.5, 0, 1),
         np.clip((0.03 - np.abs(y - 0.35)) * pane.high / grid.pixel_rad + 0.5, 0, 1),
     )
-    thin = min(1.0, 0.1 * pane.wide / grid.pixel_rad)  # bars below a pixel are a veil
+    thin = min(1.0, 0.1 * pane.wide / grid.pixel_rad)  # bars thinner than a pixel darken it in part
     return np.asarray(pane.cover(grid.directions, grid.pixel_rad) * (1 - thin * bars))
 
 
 def _opaque(grid: Grid, panes: list[Rectangle]) -> np.ndarray:
-    """Where the room's walls are seen [H, W, 1]: not through a window's glass."""
+    """Share of each pixel [H, W, 1] that shows the room and not the glass of a window."""
     clear = np.ones(grid.directions.shape[:2])
     for pane in panes:
         clear = clear * (1 - _pane(grid, pane))
@@ -208,7 +81,7 @@ def _opaque(grid: Grid, panes: list[Rectangle]) -> np.ndarray:
 
 
 def _sunlit(grid: Grid, room: Room, pane: Rectangle, random: Random) -> np.ndarray:
-    """Cosine [H, W] of the sun on what it reaches through a window."""
+    """Cosine [H, W] of the sun on the surfaces that it reaches through a window."""
     sun = room.box.turn @ toward(pane.azimuth_deg + random.uniform(-35, 35), random.uniform(15, 50))
     sun = sun.astype(np.float32)
     points = room.points * 0.999
@@ -220,7 +93,7 @@ def _sunlit(grid: Grid, room: Room, pane: Rectangle, random: Random) -> np.ndarr
 
 
 def hall(grid: Grid, random: Random) -> np.ndarray:
-    """An office, a corridor, a shop: lamps in rows on the ceiling of a large room."""
+    """Draw a large room, such as an office or a shop, with rows of lights on its ceiling."""
     room, lights = draw_room(grid, random, (0.25, 0.75), largest_m=10.0), Lights(grid)
     spacing_m = random.uniform(1.2, 3.5, 2)
     size_m = random.choice([np.array([0.09, 0.09]), np.array([0.6, 0.15]), np.array([0.3, 0.3])])
@@ -232,11 +105,11 @@ def hall(grid: Grid, random: Random) -> np.ndarray:
         away = np.abs((room.points[..., axis] - offset + spacing / 2) % spacing - spacing / 2)
         share = share * np.clip((size - away) / foot_m + 0.5, 0, 1) * np.minimum(1, 2 * size / foot_m)
     level = np.exp(random.uniform(0.5, 2.0)) * 0.35 / float(size_m.prod())
-    radiance = paint(share, warmth(random, 0.1, 1.1) * min(level, 250.0))
+    radiance = paint(share, draw_white(random, 0.1, 1.1) * min(level, 250.0))
     lights.image += radiance
     for x in np.arange(offset_m[0] - 3 * spacing_m[0], 3 * spacing_m[0], spacing_m[0]):
         for z in np.arange(offset_m[1] - 3 * spacing_m[1], 3 * spacing_m[1], spacing_m[1]):
-            _hang(room, lights, radiance, np.array([x, room.box.high[1], z]), size_m)
+            _add_ceiling_light(room, lights, radiance, np.array([x, room.box.high[1], z]), size_m)
     if random.random() < 0.5:
         pane = Rectangle(random.uniform(-180, 180), 2.0, random.uniform(0.1, 0.6), random.uniform(0.1, 0.4))
         day = _pane(grid, pane)[..., None] * _outside(grid, random) * np.exp(random.uniform(0.5, 3))
@@ -244,18 +117,20 @@ def hall(grid: Grid, random: Random) -> np.ndarray:
     return lights.image + room.lit(lights) * (1 - share)[..., None]
 
 
-def _hang(room: Room, lights: Lights, radiance: np.ndarray, at_m: np.ndarray, size_m: np.ndarray) -> None:
-    """Let a ceiling lamp of half sizes [2] shine, where it is inside the room: its power by its size."""
+def _add_ceiling_light(
+    room: Room, lights: Lights, radiance: np.ndarray, at_m: np.ndarray, size_m: np.ndarray
+) -> None:
+    """Add a ceiling light at `at_m` [3] (m, box axes), of half sizes [2], if it lies inside the room."""
     inside = ((at_m >= room.box.low) & (at_m <= room.box.high)).all()
-    if not inside or len(lights.lamps) >= 12:
+    if not inside or len(lights.sources) >= _MAX_HALL_LIGHTS:
         return
     distance = float(np.linalg.norm(at_m))
     solid = 4 * float(size_m.prod()) * at_m[1] / distance**3
-    lights.lamps.append((at_m / distance @ room.box.turn, radiance.max((0, 1)) * solid, False))
+    lights.sources.append((at_m / distance @ room.box.turn, radiance.max((0, 1)) * solid, False))
 
 
 def studio(grid: Grid, random: Random) -> np.ndarray:
-    """One to four softboxes, strips and bare lamps between dark to white walls; at times a backdrop."""
+    """Draw a photo studio: softboxes, strip lights and bare bulbs between dark to white walls."""
     room, lights = draw_room(grid, random, (0.001, 0.6)), Lights(grid)
     if random.random() < 0.5:
         room = _with_backdrop(grid, random, room)
@@ -263,21 +138,21 @@ def studio(grid: Grid, random: Random) -> np.ndarray:
         at = (random.uniform(-180, 180), random.uniform(-10, 60))
         box = Rectangle(*at, random.uniform(0.08, 0.6), random.uniform(0.15, 0.7))
         x, y, _ = box.place(grid.directions)
-        hot = np.clip(1 - 0.25 * (x * x + y * y), 0, 1)  # brighter in its middle
+        hot = np.clip(1 - 0.25 * (x * x + y * y), 0, 1)  # brighter at the centre
         face = box.cover(grid.directions, grid.pixel_rad) * hot
         lights.add(
-            box.centre, paint(face, warmth(random, 0.1, 0.5) * np.exp(random.uniform(2, 6))), flat=True
+            box.centre, paint(face, draw_white(random, 0.1, 0.5) * np.exp(random.uniform(2, 6))), flat=True
         )
     for _ in range(random.integers(0, 3)):
         centre = toward(random.uniform(-180, 180), random.uniform(0, 70))
         radius_deg = np.exp(random.uniform(-1.4, 1.1))
-        light = warmth(random, 0.2, 0.9) * np.exp(random.uniform(5, 8)) / radius_deg**2
+        light = draw_white(random, 0.2, 0.9) * np.exp(random.uniform(5, 8)) / radius_deg**2
         lights.add(centre, paint(disc(grid, centre, radius_deg), light), flat=False)
     return lights.image + room.lit(lights)
 
 
 def _with_backdrop(grid: Grid, random: Random, room: Room) -> Room:
-    """A sweep of paper down a wall and over the floor."""
+    """Hang a paper backdrop down a wall and over the floor."""
     paper = random.choice([0.85, 0.8, 0.45, 0.2]) * np.array([1, 1, 1.0])
     middle, half = random.uniform(-np.pi, np.pi), random.uniform(0.35, 1.2)
     away = np.abs((grid.azimuths_rad - middle + np.pi) % (2 * np.pi) - np.pi)
@@ -290,11 +165,11 @@ def _with_backdrop(grid: Grid, random: Random, room: Room) -> Room:
 
 
 def stage(grid: Grid, random: Random) -> np.ndarray:
-    """Two to six strongly coloured lamps in a nearly black hall."""
+    """Draw a nearly black hall with two to six strongly coloured lights."""
     room, lights = draw_room(grid, random, (0.005, 0.25), largest_m=10.0), Lights(grid)
     for _ in range(random.integers(2, 7)):
         rgb = 0.05 + random.dirichlet([0.5, 0.5, 0.5])
         centre = toward(random.uniform(-180, 180), random.uniform(-10, 75))
-        lamp = disc(grid, centre, random.uniform(1, 10))
-        lights.add(centre, paint(lamp, rgb * np.exp(random.uniform(3, 6))), flat=False)
+        spot = disc(grid, centre, random.uniform(1, 10))
+        lights.add(centre, paint(spot, rgb * np.exp(random.uniform(3, 6))), flat=False)
     return lights.image + room.lit(lights)

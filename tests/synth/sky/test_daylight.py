@@ -5,15 +5,9 @@ import warnings
 import numpy as np
 import pytest
 
-from facerf_cli.synth.sky.daylight import (
-    SUN_SR,
-    make_grid,
-    preetham_sky,
-    sky_xyz,
-    sun_irradiance,
-    toward,
-    transmittance,
-)
+from facerf_cli.synth.sky import daylight
+from facerf_cli.synth.sky.daylight import SUN_SR, preetham_sky, sky_xyz, sun_irradiance, transmittance
+from facerf_cli.synth.sky.painting import make_grid, toward
 
 # The authors' code prints five decimals where appendix A.2 prints four: an independent copy of the table.
 AUTHORS_Y = ((0.17872, -1.46303), (-0.35540, 0.42749), (-0.02266, 5.32505), (0.12064, -2.57705))
@@ -77,8 +71,6 @@ def full_sun(elevation_deg: float, turbidity: float) -> np.ndarray:
     cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
     nm = np.arange(380, 751, 5.0)
     matching = np.array([cmfs[x] for x in nm]).T
-    from facerf_cli.synth.sky import daylight
-
     theta_deg = 90 - elevation_deg
     mass = 1 / (np.cos(np.radians(theta_deg)) + 0.15 * (93.885 - theta_deg) ** -1.253)
     water = np.interp(
@@ -108,8 +100,6 @@ def test_clean_air_has_rayleighs_optical_depth() -> None:
 
 def test_the_sun_above_the_air_gives_its_known_illuminance() -> None:
     """127.5 to 133 klx, as published (IES; Darula, Kittler and Gueymard 2005)."""
-    from facerf_cli.synth.sky import daylight
-
     assert 126 < (daylight._sun_to_xyz() @ daylight._SUN)[1] < 134
 
 

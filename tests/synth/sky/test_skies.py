@@ -2,22 +2,23 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.synth.sky.daylight import (
-    SUN_RADIUS_DEG,
+from facerf_cli.synth.sky.clouds import Layer, add_clouds
+from facerf_cli.synth.sky.daylight import SUN_RADIUS_DEG
+from facerf_cli.synth.sky.landscape import Land, Skyline, add_land, sun_is_visible
+from facerf_cli.synth.sky.painting import (
     Rectangle,
-    around,
     disc,
     irradiance,
-    look_up,
     make_grid,
     noise_tile,
     paint,
     ring_noise,
+    sample_ring,
+    sample_tile,
     toward,
 )
-from facerf_cli.synth.sky.interiors import Lights, draw_room
-from facerf_cli.synth.sky.landscape import Land, Skyline, stand_under, sun_is_seen
-from facerf_cli.synth.sky.skies import KINDS, MIX, Layer, cover, draw_sky, kind_of, parse_envmaps
+from facerf_cli.synth.sky.rooms import Lights, draw_room
+from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of, parse_envmaps
 
 UP, NO_BEAM = np.array([0.0, 1.0, 0.0]), np.zeros(3)
 
@@ -87,8 +88,8 @@ def test_noise_is_periodic_and_of_deviation_one() -> None:
     tile, ring = noise_tile(random), ring_noise(random, 1.0)
     assert tile.std() == pytest.approx(1, abs=1e-3) and ring.std() == pytest.approx(1)
     x = np.array([0.3, 1.3, -2.7])
-    assert np.ptp(look_up(tile, x, 0 * x)) < 1e-3
-    columns = around(make_grid(256), ring)
+    assert np.ptp(sample_tile(tile, x, 0 * x)) < 1e-3
+    columns = sample_ring(make_grid(256), ring)
     assert abs(columns[0] - columns[-1]) < 4 * np.abs(np.diff(columns)).max()
 
 
@@ -100,13 +101,13 @@ def test_ground_and_walls_reflect_what_falls_on_them() -> None:
     grid = make_grid(64)
     white = np.ones((32, 64, 3))
     wall = Skyline(np.full(2048, 0.5), np.full((2048, 3), 0.4), 0.0, 0.0)
-    lit = stand_under(grid, white, flat_land(0.5, wall), UP, NO_BEAM)
+    lit = add_land(grid, white, flat_land(0.5, wall), UP, NO_BEAM)
     np.testing.assert_allclose(lit[-8:], 0.5, rtol=0.01)  # under a sky of radiance 1
     np.testing.assert_allclose(lit[:8], 1.0)
     foot = 0.3 + 0.7 * float(grid.elevations_rad[13, 0]) / 0.5  # darker toward its foot
     np.testing.assert_allclose(lit[13], 0.4 * 0.75 * foot, rtol=0.02)  # half sees sky, half the ground
     sun = toward(0, 30).astype(float)
-    lit = stand_under(grid, 0 * white, flat_land(0.5, wall), sun, np.full(3, 2.0))
+    lit = add_land(grid, 0 * white, flat_land(0.5, wall), sun, np.full(3, 2.0))
     np.testing.assert_allclose(lit[-8:], 0.5 / np.pi * 2.0 * 0.5, rtol=0.01)
     assert lit[13, 0, 0] > 3 * lit[13, 32, 0]  # what faces the sun, opposite to it
 
@@ -114,21 +115,21 @@ def test_ground_and_walls_reflect_what_falls_on_them() -> None:
 def test_a_skyline_hides_the_sun() -> None:
     tops = np.where(np.arange(2048) < 1024, 0.3, -0.01)  # azimuth 0 to 180 degrees
     land = flat_land(0.2, Skyline(tops, np.zeros((2048, 3)), 0.0, 0.0))
-    assert not sun_is_seen(land, 90, 10) and sun_is_seen(land, 90, 30) and sun_is_seen(land, -90, 10)
+    assert not sun_is_visible(land, 90, 10) and sun_is_visible(land, 90, 30) and sun_is_visible(land, -90, 10)
 
 
 def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
     grid, sun = make_grid(64), toward(0, 50)
     sky, beam = np.full((32, 64, 3), 5.0) * [0.5, 1, 2], np.full(3, 80.0)
     tile = np.zeros((256, 256), np.float32)
-    closed, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), -1.0, 3.0, 25.0)])
+    closed, share = add_clouds(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), -1.0, 3.0, 25.0)])
     assert share == pytest.approx(np.exp(-3), rel=1e-3)
     assert closed[2, 32, 2] / closed[2, 32, 0] < 2  # bluish sky, whiter cloud
-    none, share = cover(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), 1.0, 3.0, 25.0)])
+    none, share = add_clouds(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), 1.0, 3.0, 25.0)])
     assert share == 1 and np.allclose(none, sky)
 
 
-def test_a_room_is_brightest_near_its_lamp() -> None:
+def test_a_room_is_brightest_near_its_light() -> None:
     grid, random = make_grid(64), np.random.default_rng(2)
     room, lights = draw_room(grid, random, (0.4, 0.5)), Lights(grid)
     centre = toward(70, 20)
@@ -157,6 +158,6 @@ def test_procedural_maps_are_drawn_lazily() -> None:
 
 
 @pytest.mark.parametrize("text", ["procedural:", "procedural:0", "procedural:-3", "procedural:1e3", "sky:3"])
-def test_a_bad_word_for_maps_is_refused(text: str) -> None:
+def test_a_wrong_number_of_maps_is_an_error(text: str) -> None:
     with pytest.raises(UsageError, match="procedural:N"):
         parse_envmaps(text, 0)
