@@ -62,7 +62,7 @@ def relight_dataset(
     """
     from facerf_cli.dataset.dataset import read_dataset
     from facerf_cli.dataset.pairs import RELIT, draw_pairs, pairs_path
-    from facerf_cli.dataset.weights import name_maps, settle_pairs
+    from facerf_cli.dataset.weights import envmap_names, write_pairs
     from facerf_cli.synth.sky.skies import parse_envmaps
 
     settings = settings_of(context)
@@ -71,16 +71,16 @@ def relight_dataset(
     prepared = read_dataset(dataset)
     output = dataset / RELIT
     if envmaps.startswith("procedural:"):
-        names = name_maps(parse_envmaps(envmaps, settings.seed))
+        names = envmap_names(parse_envmaps(envmaps, settings.seed))
     elif not Path(envmaps).exists():
         raise UsageError(f"--envmaps {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
     else:
-        names = name_maps([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
+        names = envmap_names([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
     pairs = draw_pairs(prepared, names, per_subject, settings.seed)
     if not pairs:
         raise UsageError(f"{dataset}: no subject is in a split; run prepare-dataset with another --split")
     if not dry_run:
-        settle_pairs(prepared, pairs, overwrite, _Spread(jobs, settings))
+        write_pairs(prepared, pairs, overwrite, _Spread(jobs, settings))
     if lazy:
         print(pairs_path(prepared))
         return

@@ -1,19 +1,15 @@
-"""Prepared light-stage data on disk (DESIGN, 'Files'): what is where, and reading what is said of it.
+"""The prepared dataset on disk (DESIGN, 'Files'): its paths, and reading and writing `dataset.json`.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
-    findings.jsonl             what the checks of the capture found (`capture/checks/findings.py`)
-    olat/SUBJECT/CAMERA.exr    an OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
+    findings.jsonl             findings of the capture's checks (`capture/checks/findings.py`)
+    olat/SUBJECT/CAMERA.exr    OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
     fits/SUBJECT/CAMERA.npz    its fit (`face/fit.py`)
-    fits/SUBJECT.json          what is known of the subject's fit; written last of its files
+    fits/SUBJECT.json          record of the subject; written last of the subject's files
     sheets/SUBJECT.jpg, index.html, report.jsonl
 
-Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera), the world as the
-capture has it; each stack holds its lights in its own crop's camera space. A subject that lacks lights says
-which it has (`lights`, in the order of its stacks' parts) and why not the others (`left_out`).
-
-Who is trained on, validated with and tested with: subjects drawn by their names.
-
-What `prepare-dataset` writes of a dataset as a whole: `dataset.json`, and the key that one run goes by.
+Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera) and the capture's
+world space; each stack holds its lights in its own crop's camera space. A subject that lacks lights lists
+those it has (`lights`, in the order of its stacks' parts) and why the others are missing (`left_out`).
 """
 
 import hashlib
@@ -39,32 +35,35 @@ FORMAT = "facerf-dataset-1"
 DATASET_FILE = "dataset.json"
 SPLITS = ("train", "validation", "test")
 LARGEST_CROP_PX = 4096
+_COLOUR_SPACE = "lin_rec709"
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A prepared dataset as `dataset.json` describes it; failed subjects are left out."""
+    """The content of `dataset.json`, without failed subjects."""
 
     folder: Path
-    face_model: str  # the name of the model that was fitted
+    face_model: str  # name of the fitted model
     crop_px: int
     light_ids: tuple[str, ...]
     directions_world: np.ndarray  # [L, 3] unit, toward the lights
-    splits: dict[str, tuple[str, ...]]  # subjects of 'train', 'validation' and 'test'
-    cameras: dict[str, tuple[str, ...]]  # of each subject, split or not
+    splits: dict[str, tuple[str, ...]]  # by 'train', 'validation' and 'test'
+    cameras: dict[str, tuple[str, ...]]  # of each subject, in a split or not
     normalisation: dict[str, Any]  # colour space from and to, black level, gain of each light
     provenance: dict[str, Any]
-    traits: dict[str, dict[str, Any]] = field(default_factory=dict)  # of a subject, where the capture has any
-    # Of the subjects that lack some: which lights (places in light_ids, ascending) their stacks hold.
+    traits: dict[str, dict[str, Any]] = field(
+        default_factory=dict
+    )  # of each subject; {} where the capture has none
+    # Lights of subjects that lack some: indices into light_ids, ascending, of the parts of their stacks.
     fewer_lights: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def subjects(self) -> tuple[str, ...]:
-        """All subjects that were prepared, sorted."""
+        """All prepared subjects, sorted."""
         return tuple(self.cameras)
 
     def lights_of(self, subject: str) -> tuple[int, ...]:
-        """The lights in a subject's stacks, in the order of the parts: places in `light_ids`."""
+        """Lights of a subject's stacks, in the order of the parts, as indices into `light_ids`."""
         return self.fewer_lights.get(subject) or self._all_lights
 
     @cached_property
@@ -72,7 +71,7 @@ class Dataset:
         return tuple(range(len(self.light_ids)))
 
     def split_of(self, subject: str) -> str:
-        """'train', 'validation', 'test', or '' for a subject that is in none."""
+        """Split of a subject: 'train', 'validation', 'test', or '' for none."""
         return self._split_by_subject.get(subject, "")
 
     @cached_property
@@ -80,36 +79,36 @@ class Dataset:
         return {subject: split for split, members in self.splits.items() for subject in members}
 
     def stack_path(self, subject: str, camera: str) -> Path:
-        """The OLAT stack of a subject seen by a camera."""
+        """Path of the OLAT stack of a subject and camera."""
         return stack_path(self.folder, subject, camera)
 
     def fit_path(self, subject: str, camera: str) -> Path:
-        """The fit of a subject in that camera's crop."""
+        """Path of the fit of a subject in a camera's crop."""
         return fit_path(self.folder, subject, camera)
 
 
 def stack_path(folder: Path, subject: str, camera: str) -> Path:
-    """Where a dataset keeps a stack."""
+    """Path of a stack."""
     return folder / "olat" / subject / f"{camera}.exr"
 
 
 def fit_path(folder: Path, subject: str, camera: str) -> Path:
-    """Where a dataset keeps a fit."""
+    """Path of a fit."""
     return folder / "fits" / subject / f"{camera}.npz"
 
 
 def record_path(folder: Path, subject: str) -> Path:
-    """Where a dataset keeps what is known of a subject's fit; there once the subject is finished."""
+    """Path of a subject's record; it exists once the subject is finished."""
     return folder / "fits" / f"{subject}.json"
 
 
 def sheet_path(folder: Path, subject: str) -> Path:
-    """Where a dataset keeps a subject's contact sheet."""
+    """Path of a subject's contact sheet."""
     return folder / "sheets" / f"{subject}.jpg"
 
 
 def read_dataset(folder: Path) -> Dataset:
-    """Read and check `dataset.json`, and see that every stack and fit it speaks of is there."""
+    """Read and check `dataset.json`; raise InputError where a stack or fit that it lists is missing."""
     advice = "make it with `facerf prepare-dataset CAPTURE -o DATASET`"
     root = read_document(folder / DATASET_FILE, advice)
     if root["format"].value != FORMAT:
@@ -117,7 +116,7 @@ def read_dataset(folder: Path) -> Dataset:
     lights = root["rig"]["lights"].items(MOST_LIGHTS)
     directions = np.array([light["direction_world"].unit() for light in lights]).reshape(-1, 3)
     if not lights:
-        raise root["rig"]["lights"].wrong("a light at least")
+        raise root["rig"]["lights"].wrong("at least one light")
     cameras, light_ids = _prepared_cameras(root), unique_ids(lights)
     dataset = Dataset(
         folder=folder,
@@ -141,14 +140,14 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def _read_traits(root: Node, subjects: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """What the capture says of subjects, as it stands."""
+    """Traits of subjects, as in the capture."""
     nodes = root["subjects"].entries(MOST_SUBJECTS)
     found = {subject: nodes[subject].get("traits") for subject in subjects}
     return {subject: traits.table() if traits else {} for subject, traits in found.items()}
 
 
 def _read_lights(root: Node, subjects: Iterable[str], light_ids: list[str]) -> dict[str, tuple[int, ...]]:
-    """The lights of the subjects that lack some; entries without `lights` have all."""
+    """Lights of the subjects that lack some; an entry without `lights` has all."""
     nodes = root["subjects"].entries(MOST_SUBJECTS)
     places = {name: place for place, name in enumerate(light_ids)}
     lights = {}
@@ -156,13 +155,13 @@ def _read_lights(root: Node, subjects: Iterable[str], light_ids: list[str]) -> d
         if found := nodes[subject].get("lights"):
             named = [node.text() for node in found.items(MOST_LIGHTS)]
             if not named or [name for name in light_ids if name in named] != named:
-                raise found.wrong("some of the rig's lights, in its order")
+                raise found.wrong("some of the rig's lights, in the rig's order")
             lights[subject] = tuple(places[name] for name in named)
     return lights
 
 
 def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:
-    """The cameras of every subject that did not fail."""
+    """Cameras of every subject that did not fail."""
     known = set(unique_ids(root["cameras"].items(MOST_CAMERAS)))
     cameras = {}
     for subject, node in sorted(root["subjects"].entries(MOST_SUBJECTS).items()):
@@ -170,10 +169,10 @@ def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:
             nodes = node["cameras"].items(MOST_CAMERAS)
             cameras[subject] = tuple(camera.name() for camera in nodes)
             if not nodes:
-                raise node["cameras"].wrong("a camera at least")
+                raise node["cameras"].wrong("at least one camera")
             for camera in nodes:
                 if camera.value not in known or cameras[subject].count(camera.value) > 1:
-                    raise camera.wrong("one of the dataset's cameras, once")
+                    raise camera.wrong("a camera of the dataset, listed once")
     return cameras
 
 
@@ -184,9 +183,9 @@ def _read_splits(node: Node, subjects: set[str]) -> dict[str, tuple[str, ...]]:
         members = node[split].items(MOST_SUBJECTS)
         for member in members:
             if member.name() not in subjects:
-                raise member.wrong("a subject that was prepared")
+                raise member.wrong("a prepared subject")
             if member.name() in placed:
-                raise member.wrong("a subject that is in no split yet")
+                raise member.wrong("a subject of one split only")
             placed.add(member.name())
         splits[split] = tuple(member.name() for member in members)
     return splits
@@ -194,14 +193,14 @@ def _read_splits(node: Node, subjects: set[str]) -> dict[str, tuple[str, ...]]:
 
 @dataclass(frozen=True)
 class Split:
-    """How many subjects go to training, validation and test: counts, or shares of all that sum to 1."""
+    """Sizes of training, validation and test: counts of subjects, or shares of all that sum to 1."""
 
     parts: tuple[float, float, float]
     are_shares: bool
 
     @staticmethod
     def parse(text: str) -> "Split":
-        """`300/10/40` or `0.8/0.1/0.1`."""
+        """Parse `300/10/40` or `0.8/0.1/0.1`; raise UsageError for anything else."""
         words = text.split("/")
         advice = f"--split {text!r}: give counts of subjects such as 300/10/40, or shares such as 0.8/0.1/0.1"
         if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):
@@ -216,7 +215,7 @@ class Split:
         return Split((train, validation, test), are_shares=True)
 
     def counts(self, subjects: int) -> tuple[int, int, int]:
-        """How many of so many subjects go where; of shares, none but 0 goes without one if that can be."""
+        """Split a number of subjects; where it is large enough, every share above 0 gets at least one."""
         if not self.are_shares:
             train, validation, test = (int(part) for part in self.parts)
             if train + validation + test > subjects:
@@ -238,10 +237,10 @@ class Split:
         return train, validation, test
 
     def of(self, subjects: Iterable[str], seed: int) -> dict[str, tuple[str, ...]]:
-        """The subjects of each split, sorted.
+        """Assign subjects to splits, each sorted.
 
-        They are cut from an order that depends on each subject's name and the seed alone, so that a subject
-        more or less moves few of the others.
+        The order that is cut into splits depends on each subject's name and the seed alone, so that adding or
+        removing a subject moves few of the others.
         """
         order = sorted(subjects, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest())
         ends = np.cumsum([0, *self.counts(len(order))]).tolist()
@@ -249,11 +248,8 @@ class Split:
         return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
 
 
-_COLOUR_SPACE = "lin_rec709"
-
-
 def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int) -> str:
-    """What a subject's files depend on besides its pictures, as a short digest."""
+    """Short digest of all that a subject's files depend on besides its images."""
     content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
     return digest(json.dumps(content, sort_keys=True).encode())
 
@@ -267,7 +263,7 @@ def describe_dataset(
     face_model_sha256: str,
     crop_px: int,
 ) -> dict[str, Any]:
-    """The content of `dataset.json`; subjects without a record are those that failed."""
+    """Make the content of `dataset.json`; subjects without a record are marked as failed."""
     splits = split.of(capture.subjects, seed)
     return {
         "format": FORMAT,
@@ -303,7 +299,10 @@ def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _calibration(capture: Capture) -> dict[str, Any]:
-    """Lights, cameras and what was done to the pictures' values."""
+    """Lights, cameras and the normalisation of the images' values.
+
+    `preparation_key` hashes all of it: another word here prepares every dataset again.
+    """
     lights = zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
     gains = zip(capture.light_ids, (1 / capture.intensities).tolist(), strict=True)
     return {
@@ -323,7 +322,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "from": capture.colour_space,
             "to": _COLOUR_SPACE,
             "black_level": capture.black_level,
-            **({"ambient": "subtracted where there is a image of it"} if capture.subtract_ambient else {}),
+            **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
             **({"colour_charts": [chart.record() for chart in capture.charts]} if capture.charts else {}),
@@ -334,6 +333,6 @@ def _calibration(capture: Capture) -> dict[str, Any]:
 
 
 def sha256_of(path: Path) -> str:
-    """The digest of a file's bytes."""
+    """SHA-256 of a file's bytes, in hex."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,6 +1,6 @@
-"""A page to look through prepared data with: every subject's sheet, split and fit; plain HTML, no scripts.
+"""The report of a prepared dataset: a contact sheet a subject, and an HTML page of all subjects.
 
-The contact sheets of prepared subjects: a row of tiles a camera.
+The page shows every subject's sheet, split, fit and findings; it is plain HTML without scripts.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,19 +27,20 @@ img.chart { max-width: 24em }
 .fair { color: #fc6 } .poor, .failed { color: #f66 }
 """
 _COLUMNS = (
-    "A row of a sheet is a camera: the crop under all lights, the fit over it (green: landmarks that were "
-    "found, or the fit's where there was no face; orange: the fit's), what the mask leaves, and a light in "
-    "front, on the left and on the right."
+    "A row of a sheet is a camera: the crop under all lights, the fit over it (green: detected landmarks, or "
+    "the fit's where no face was detected; orange: the fit's), the masked crop, and a light in front, on the "
+    "left and on the right."
 )
+_TILE_PX = 192
+_SHEET_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # front, left and right, in camera space
 
-
-Rows = Sequence[Mapping[str, Any]]
+FindingRows = Sequence[Mapping[str, Any]]
 
 
 def index_page(
-    dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], findings: Mapping[str, Rows]
+    dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], findings: Mapping[str, FindingRows]
 ) -> str:
-    """The page for the content of `dataset.json`, records of its finished subjects, rows of findings."""
+    """Make the page from the content of `dataset.json`, the records of finished subjects and the findings."""
     title = f"{dataset['capture']}: {len(records)} of {len(dataset['subjects'])} subjects"
     return html_page(title, _STYLE, _lines(title, dataset, records, findings))
 
@@ -48,7 +49,7 @@ def _lines(
     title: str,
     dataset: Mapping[str, Any],
     records: Mapping[str, Mapping[str, Any]],
-    findings: Mapping[str, Rows],
+    findings: Mapping[str, FindingRows],
 ) -> Iterator[str]:
     yield f"<h1>{escape(title)}</h1>"
     split_of = {name: split for split, names in dataset["splits"].items() for name in names}
@@ -56,15 +57,15 @@ def _lines(
     lights, cameras = (len(entries) for entries in (dataset["rig"]["lights"], dataset["cameras"]))
     yield f"<p>Subjects: {counts}. Lights: {lights}. Cameras: {cameras}.</p>"
     for chart in dataset["normalisation"].get("colour_charts", ()):
-        yield from _chart(chart)
+        yield from _colour_chart(chart)
     yield f"<p>{escape(_COLUMNS)}</p>"
     for subject in dataset["subjects"]:
         yield from _subject(subject, split_of.get(subject, "in no split"), records.get(subject))
         yield from _findings(findings.get(subject, ()))
 
 
-def _chart(chart: Mapping[str, Any]) -> Iterator[str]:
-    """What a colour chart brought, and its picture."""
+def _colour_chart(chart: Mapping[str, Any]) -> Iterator[str]:
+    """Colour error before and after a colour chart's correction, and the chart's image."""
     before, after = (chart["delta_e_2000"][when]["mean"] for when in ("before", "after"))
     words = (
         f"Colour chart of {', '.join(chart['cameras'])}: CIE delta E 2000 {after:.1f}, before {before:.1f}"
@@ -73,8 +74,8 @@ def _chart(chart: Mapping[str, Any]) -> Iterator[str]:
     yield f'<p>{escape(words)}</p>\n<a href="{file}"><img class="chart" src="{file}" alt="colour chart"></a>'
 
 
-def _findings(rows: Rows) -> Iterator[str]:
-    """The table of a subject's findings."""
+def _findings(rows: FindingRows) -> Iterator[str]:
+    """Table of a subject's findings."""
     if not rows:
         return
     yield "<table>\n<tr><th>finding</th><th>where</th><th></th></tr>"
@@ -90,7 +91,7 @@ def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iter
     name = escape(subject)
     yield f'<h2 id="{name}">{name}</h2>'
     if record is None:
-        yield '<p class="failed">failed; report.jsonl says why</p>'
+        yield '<p class="failed">failed; see report.jsonl</p>'
         return
     yield f"<p>{escape(split)}</p>"
     for key, words in (("left_out", "lights"), ("dropped", "cameras")):
@@ -107,31 +108,27 @@ def _subject(subject: str, split: str, record: Mapping[str, Any] | None) -> Iter
     yield f'</table>\n<a href="{sheet}"><img loading="lazy" src="{sheet}" alt="{name}"></a>'
 
 
-_TILE_PX = 192
-_SHOWN_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # three lights, to the camera
-
-
-def lights_shown(directions: np.ndarray) -> list[int]:
-    """Three lights of the sheet: those nearest to a lamp in front, on the left and on the right."""
-    wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHOWN_AZEL_DEG])
+def sheet_lights(directions: np.ndarray) -> list[int]:
+    """Indices of the sheet's three lights: those nearest to front, left and right; directions [L, 3]."""
+    wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHEET_AZEL_DEG])
     return (wanted @ directions.T).argmax(1).tolist()
 
 
 def sheet_tiles(
     header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
 ) -> np.ndarray:
-    """Fully lit, the fit over it, what the mask leaves of it, three single lights: [6, h, w, 3].
+    """Tiles of one camera [6, h, w, 3]: fully lit, the fit over it, masked, and three single lights.
 
-    Linear, exposed for display: each on its own, but the three lights alike.
+    Scene-linear, exposed for display; the three lights share one exposure.
     """
     side_px = fit.crop.size_px
     lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
     overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
     masked = lit * (0.1 + 0.9 * header.seen[..., None])
-    single = np.stack([shown[light] for light in lights_shown(header.directions)])
+    single = np.stack([shown[light] for light in sheet_lights(header.directions)])
     single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
     small = Crop(0.0, 0.0, float(side_px), min(side_px, _TILE_PX))
     tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])
-    for tile, light in zip(tiles[3:], lights_shown(header.directions), strict=True):
+    for tile, light in zip(tiles[3:], sheet_lights(header.directions), strict=True):
         mark_light(tile, header.directions[light], 1.0)
     return tiles

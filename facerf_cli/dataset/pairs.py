@@ -1,9 +1,9 @@
-"""Recipes of relit pictures (paper, 'Dataset'): subject, camera, map and rotation; and the light to predict.
+"""Training pairs (paper, 'Dataset'): a source under an envmap, and one light to predict from it.
 
     relit/pairs.jsonl         a `Pair` a line, sorted by subject and index
-    relit/SUBJECT/NNNNN.exr   its source, where sources are written
+    relit/SUBJECT/NNNNN.exr   the pair's source, unless the pairs are lazy
 
-`pair_weights.py` settles them: finds their exposures and writes them.
+A pair is a recipe: subject, camera, envmap, rotation and target. `dataset/weights.py` adds the exposures.
 """
 
 import hashlib
@@ -19,16 +19,16 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.errors import InputError
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
-_SAME_CAMERA_SHARE = 0.5
+_SAME_CAMERA_SHARE = 0.5  # of the pairs; the others also train the change of pose
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """A source under a map, and the light of a camera's stack that is to be predicted from it.
+    """A source under an envmap, and the light of a camera's stack that a network predicts from it.
 
-    The source is the subject's stack of `source_camera` weighed by `envmap`, `rotate_deg` added to every
-    azimuth of it, times 2 to the power of `exposure_ev`, which brings the map's mean radiance near 1.
-    `envmap` is a file, or procedural:INDEX:SEED:WIDTH, a map of `stage.sky.skies`.
+    The source is the stack of `source_camera` summed with the weights of `envmap`, `rotate_deg` added to
+    every azimuth, times 2 to the power of `exposure_ev`, which brings the envmap's mean radiance near 1.
+    `envmap` is a file, or procedural:INDEX:SEED:WIDTH for a map of `synth/sky/skies.py`.
     """
 
     subject: str
@@ -39,30 +39,30 @@ class Pair:
     rotate_deg: float
     exposure_ev: int
     target_camera: str
-    target_light: int  # the part of the target camera's stack, from 0
+    target_light: int  # part of the target camera's stack, from 0
 
     @staticmethod
     def from_row(row: dict[str, object]) -> "Pair":
-        """A pair of a line's JSON; ValueError, TypeError where it is none."""
+        """Read a pair from a line's JSON; raise ValueError or TypeError for anything else."""
         kinds = {name: field.type for name, field in Pair.__dataclass_fields__.items()}
         if set(row) != set(kinds) or any(type(row[name]) is not kind for name, kind in kinds.items()):
-            raise ValueError(f"no pair: {row}")
+            raise ValueError(f"not a pair: {row}")
         return Pair(**row)  # type: ignore[arg-type]
 
     @property
     def key(self) -> tuple[str, int]:
-        """What identifies it in its dataset."""
+        """Subject and index, unique within a dataset."""
         return self.subject, self.index
 
 
 def draw_pairs(dataset: Dataset, maps: Sequence[str], per_subject: int, seed: int) -> list[Pair]:
-    """`per_subject` pairs of every subject that is in a split, sorted; exposures are still to be found."""
+    """Draw `per_subject` pairs of every subject in a split, sorted, with exposures still 0."""
     placed = sorted(subject for subject in dataset.subjects if dataset.split_of(subject))
     return [draw_pair(dataset, maps, seed, subject, i) for subject in placed for i in range(per_subject)]
 
 
 def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, index: int) -> Pair:
-    """A function of (seed, subject, index), the subject's cameras and lights, and the list of maps."""
+    """Draw one pair; it depends on (seed, subject, index), the subject's cameras and lights, and `maps`."""
     name = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:8], "little")
     random = np.random.default_rng([seed, name, index])
     cameras = dataset.cameras[subject]
@@ -83,17 +83,17 @@ def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, in
 
 
 def pairs_path(dataset: Dataset) -> Path:
-    """Where a dataset keeps its pairs."""
+    """Path of a dataset's pairs."""
     return dataset.folder / RELIT / PAIRS_NAME
 
 
 def image_path(dataset: Dataset, subject: str, index: int) -> Path:
-    """Where the source of a subject's pair is written."""
+    """Path of the source of a subject's pair."""
     return dataset.folder / RELIT / subject / f"{index:05d}.exr"
 
 
 def read_pairs(dataset: Dataset) -> list[Pair]:
-    """All pairs of a dataset, none where it has none; they must speak of what the dataset holds."""
+    """Read all pairs of a dataset, none where it has none; raise InputError where they do not fit it."""
     path = pairs_path(dataset)
     pairs: list[Pair] = []
     if not path.is_file():
@@ -103,22 +103,22 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
             pair = Pair.from_row(json.loads(line))
             _check_pair(dataset, pair)
             if pairs and pair.key <= pairs[-1].key:
-                raise ValueError("not sorted, or twice")
+                raise ValueError("not sorted, or repeated")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise InputError(
-                f"{path}: line {number} is no pair of this dataset; run relight-dataset with --overwrite"
+                f"{path}: line {number} is not a pair of this dataset; run relight-dataset with --overwrite"
             ) from None
         pairs.append(pair)
     return pairs
 
 
 def _check_pair(dataset: Dataset, pair: Pair) -> None:
-    """KeyError or ValueError for a pair that is not of the dataset."""
+    """Raise KeyError or ValueError where a pair does not fit the dataset."""
     if not {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject]):
-        raise ValueError("another dataset's cameras")
+        raise ValueError("unknown camera")
     if pair.split != dataset.split_of(pair.subject):
-        raise ValueError("another split's subject")
+        raise ValueError("wrong split")
     if not 0 <= pair.target_light < len(dataset.lights_of(pair.subject)) or pair.index < 0:
-        raise ValueError("a number that cannot be")
+        raise ValueError("number out of range")
     if not math.isfinite(pair.rotate_deg):
-        raise ValueError("an angle that cannot be")
+        raise ValueError("angle not finite")

@@ -1,11 +1,11 @@
-"""Photos of faces without any truth but their landmarks, which the Geometry Network also learns from.
+"""Photos of faces, with detected landmarks alone, for the landmark and regularisation terms.
 
-Paper, 'Training': images of FFHQ for the landmark and regularisation terms. Faces are found once:
+The paper uses images of FFHQ ('Training'). Faces are detected once:
 
-    CACHE/KEY.jpg    the largest face's crop at automatic exposure
-    CACHE/KEY.json   its landmarks in the crop's pixels, or null where there is no face; written last
+    CACHE/KEY.jpg    crop of the largest face at automatic exposure
+    CACHE/KEY.json   its landmarks in crop pixels, or null where there is no face; written last
 
-KEY tells the photo's place, size and time. All of it can be removed.
+KEY is a digest of the photo's path, size and time. The cache may be deleted.
 """
 
 import logging
@@ -24,35 +24,35 @@ from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.documents import digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.logs import LOGGER_NAME
-from facerf_cli.network.reflectance import resize
+from facerf_cli.network.inputs import resize
 from facerf_cli.workers import in_shards
 
-CACHED_SIDE_PX = 512
+CACHED_SIDE_PX = 512  # the side of the paper's crops
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
 class PhotoCrops:
-    """B crops of photos [B, 3, S, S], linear, and their detected landmarks [B, 68, 2] in crop pixels."""
+    """B crops of photos [B, 3, S, S], scene-linear, and detected landmarks [B, 68, 2] in crop pixels."""
 
     crops: Tensor
     landmarks_px: Tensor
 
     def to(self, device: torch.device) -> "PhotoCrops":
-        """The same crops on `device`."""
+        """Copy the crops to `device`."""
         return PhotoCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class Photos:
-    """Faces that were found, as crops of a side."""
+    """Detected faces, drawn as crops of `side_px`."""
 
-    paths: tuple[Path, ...]  # of the crops
+    paths: tuple[Path, ...]  # crops in the cache
     landmarks_px: Tensor  # [N, 68, 2] in crops of `CACHED_SIDE_PX`
     side_px: int
 
     def draw(self, generator: torch.Generator) -> PhotoCrops:
-        """One of them, B = 1."""
+        """Draw a random face, B = 1."""
         place = int(torch.randint(len(self.paths), (), generator=generator))
         crop = torch.from_numpy(read_image(self.paths[place]).pixels).permute(2, 0, 1)[None]
         scale = self.side_px / CACHED_SIDE_PX
@@ -60,22 +60,22 @@ class Photos:
 
 
 def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1) -> Photos:
-    """The faces of photos, found where `cache` does not know them; what has no face costs a line of the log.
+    """Open the faces of photos; detect those that are not in `cache`, with a warning for a photo without one.
 
-    Raises InputError where there is no face in any of them.
+    Raises InputError where no photo has a face.
     """
-    known = {path: _record(path, cache) for path in sorted(paths)}
+    known = {path: _record_path(path, cache) for path in sorted(paths)}
     missing = [path for path, record in known.items() if not record.is_file()]
     if missing:
-        log.info("%s: looking for faces in %d photos, once", cache, len(missing))
-        work = partial(_find, cache)
+        log.info("%s: detecting faces in %d photos (done once)", cache, len(missing))
+        work = partial(_detect, cache)
         if jobs > 1 and len(missing) > 1:
             in_shards(work, missing, jobs)
         else:
             work(missing)
     found, landmarks = [], []
     for record in known.values():
-        content = read_document(record, "remove the folder")["landmarks_px"]
+        content = read_document(record, "delete the folder")["landmarks_px"]
         if content.value is not None:
             found.append(record.with_suffix(".jpg"))
             landmarks.append(content.array(68, 2))
@@ -84,16 +84,16 @@ def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1)
     return Photos(tuple(found), torch.from_numpy(np.stack(landmarks)).float(), side_px)
 
 
-def _record(photo: Path, cache: Path) -> Path:
+def _record_path(photo: Path, cache: Path) -> Path:
     facts = photo.stat()
     return cache / f"{digest(f'{photo.absolute()} {facts.st_size} {facts.st_mtime_ns}'.encode())}.json"
 
 
-def _find(cache: Path, photos: list[Path]) -> None:
+def _detect(cache: Path, photos: list[Path]) -> None:
     """Write the crop and the record of each photo."""
     cache.mkdir(parents=True, exist_ok=True)
     for photo in photos:
-        record = _record(photo, cache)
+        record = _record_path(photo, cache)
         landmarks_px = None
         try:
             pixels = read_image(photo).pixels

@@ -1,10 +1,8 @@
-"""A dataset's OLAT stacks: what goes into one beside its lights' pictures.
+"""Prepare one subject of a capture: landmarks, one head fit, crops, OLAT stacks and a contact sheet.
 
-From a capture to prepared data, a subject at a time: landmarks, one head, crops, OLAT stacks, a sheet.
-
-Pictures are read one by one, twice: once for the fully lit sum that the face is found on, once for the stack.
-Never more than one camera's sum is held. What goes in is a `Selection`; a camera that turns out not to see
-the face is left out, too.
+Images are read one by one, twice: for the fully lit sum on which the face is detected, and for the stack. At
+most one camera's sum is in memory. A `Selection` gives the lights and cameras to use; a camera that does not
+see the face is left out as well.
 """
 
 import logging
@@ -21,7 +19,7 @@ from torch import Tensor
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.select import Selection
 from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
-from facerf_cli.dataset.pages import lights_shown, sheet_tiles
+from facerf_cli.dataset.pages import sheet_lights, sheet_tiles
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
@@ -39,9 +37,164 @@ from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenan
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 
+_DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half floats lose precision
+log = logging.getLogger(LOGGER_NAME)
+
+
+def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
+    """All files of a subject, from its record if it has one; the last one is written last."""
+    record = record_path(folder, subject)
+    cameras = read_document(record, "")["cameras"].table() if record.exists() else capture.cameras
+    paths = [place(folder, subject, camera) for camera in cameras for place in (stack_path, fit_path)]
+    return [*paths, sheet_path(folder, subject), record]
+
+
+def prepare_subject(
+    capture: Capture,
+    subject: str,
+    chosen: Selection,
+    model: MorphableModel,
+    folder: Path,
+    crop_px: int,
+    key: str,
+    strict: bool = False,
+) -> dict[str, Any]:
+    """Write a subject's stacks, fits, sheet and record, and return the record.
+
+    `key` comes from `preparation_key`. With `strict` a camera that does not see the face is an error.
+    """
+    record_path(folder, subject).unlink(missing_ok=True)
+    person = _Subject(capture, subject, chosen.lights, model)
+    landmarks = [_find_landmarks(person, camera) for camera in chosen.cameras]
+    with _name_errors(subject):
+        joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
+    cameras, rows, dropped = {}, [], dict(chosen.dropped)
+    for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
+        seen_px = None if error_iod is None else landmarks_px  # missing or rejected without an error
+        error_iod = joint.mean_error_iod if error_iod is None else error_iod
+        try:
+            fit, off_iod = fit_in_crop(model, joint, capture.cameras[camera], seen_px, error_iod, crop_px)
+            header = _header(person, camera, joint, fit)
+        except InputError as error:
+            dropped[camera] = str(error)
+            continue
+        rows.append(_write_camera(person, camera, fit, header, folder))
+        cameras[camera] = _camera_record(fit, seen_px is not None, off_iod)
+    chosen = replace(chosen, dropped=dropped)
+    _remove_dropped(subject, chosen, folder, bool(cameras), strict)
+    sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
+    write_display(sheet_path(folder, subject), sheet, metadata=person.provenance())
+    record = {
+        "prepared": key,
+        "error_iod": round(joint.mean_error_iod, 5),
+        "quality": quality_of(joint.mean_error_iod),
+        "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
+        "cameras": cameras,
+        **_optional_entries(person, chosen),
+    }
+    write_document(record_path(folder, subject), record)
+    return record
+
+
+def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
+    """Records of the finished subjects, by subject; 'prepared' is the key of `prepare_subject`."""
+    return {
+        subject: read_document(record_path(folder, subject), "").table()
+        for subject in capture.subjects
+        if all(path.exists() for path in subject_outputs(capture, subject, folder))
+    }
+
+
+def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, Any]:
+    """Entry of a camera in a record."""
+    return {
+        "face_found": face_found,
+        "error_iod": round(fit.error_iod, 5),
+        "quality": fit.quality,
+        "crop_off_iod": round(off_iod, 5),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Subject:
+    """A subject of a capture, the lights of their stacks (indices into the capture's) and the face model."""
+
+    capture: Capture
+    name: str
+    lights: tuple[int, ...]
+    model: MorphableModel
+
+    @property
+    def directions_world(self) -> np.ndarray:
+        """Unit vectors toward the lights [L, 3]."""
+        return self.capture.directions_world[list(self.lights)]
+
+    def provenance(self, *camera: str) -> dict[str, str | int]:
+        """Metadata of files made from their images, marked as synthetic where the capture is."""
+        synthetic = self.capture.provenance.get("synthetic") is True
+        source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
+        name = "/".join([self.name, *camera])
+        return Provenance(name, **self.model.stamp, source_type=source_type).attributes()
+
+
+def _remove_dropped(subject: str, chosen: Selection, folder: Path, any_left: bool, strict: bool) -> None:
+    """Log what is left out and delete an earlier run's files of it; raise where that is not allowed."""
+    if chosen.dropped and (strict or not any_left):
+        reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
+        advice = "without --strict the other cameras are used" if any_left else "no camera is left"
+        raise InputError(f"{subject}: {reasons}; {advice}")
+    if words := chosen.in_words():
+        log.warning("%s: %s", subject, words)
+    for camera in chosen.dropped:
+        stack_path(folder, subject, camera).unlink(missing_ok=True)
+        fit_path(folder, subject, camera).unlink(missing_ok=True)
+
+
+def _optional_entries(person: _Subject, chosen: Selection) -> dict[str, Any]:
+    """Entries of a record that it has where they are not empty: missing, shifted and uncorrected frames."""
+    capture = person.capture
+    entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
+    if chosen.left_out:
+        entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
+        entries |= {"left_out": chosen.left_out}
+    entries |= {"shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()}}
+    entries |= {"ambient_kept": _ambient_kept(person, chosen.cameras)}
+    return {name: entry for name, entry in entries.items() if entry}
+
+
+def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
+    """Cameras whose ambient image should be subtracted but is missing; logs a warning for them."""
+    if not person.capture.subtract_ambient:
+        return []
+    without = [camera for camera in cameras if person.capture.ambient(person.name, camera) is None]
+    if without:
+        words = "no ambient image of the camera's size; nothing is subtracted"
+        log.warning("%s/%s: %s", person.name, ", ".join(without), words)
+    return without
+
+
+@contextmanager
+def _name_errors(name: str) -> Iterator[None]:
+    """Put the subject's name before an error raised in the block."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
+    """Detect landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
+    weights = constant_weights(person.directions_world)
+    posed = person.capture.cameras[camera]
+    lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
+    for light, weight in zip(person.lights, weights, strict=True):
+        lit += weight * person.capture.frame(person.name, camera, light)
+    faces = detect_landmarks(to_display(lit))
+    return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
+
 
 def constant_weights(directions: np.ndarray) -> np.ndarray:
-    """Weights [L] of lights [L, 3] under a map of radiance 1: the solid angle of each one's cell over pi."""
+    """Weights [L] of lights [L, 3] under a constant map of radiance 1: their cells' solid angles / pi."""
     white = torch.ones(2, 4, 3)
     return envmap_weights(white, torch.from_numpy(directions).float())[:, 0].numpy()
 
@@ -54,10 +207,10 @@ def stack_header(
     inside: np.ndarray,
     metadata: Mapping[str, Any],
 ) -> StackHeader:
-    """The header of a stack of pictures [S, S, 3] in a fit's crop, lit from camera-space directions [L, 3].
+    """Make the header of a stack of images [S, S, 3] in a fit's crop, for camera-space lights [L, 3].
 
-    `source` [S, S, 3] is the crop under a constant map of radiance 1; `inside` [S, S] tells which of its
-    pixels the photo holds. The face is seen where the front of the fitted mesh covers those.
+    `source` [S, S, 3] is the crop under a constant map of radiance 1; `inside` [S, S] is true where the crop
+    lies in the photo. The mask `seen` is 1 where the front of the fitted mesh covers these pixels.
     """
     vertices, triangles = fit.vertices_camera(model), grid_triangles()
     fragments = rasterize(vertices, triangles, fit.camera)
@@ -77,211 +230,57 @@ def stack_header(
     )
 
 
-_DIMMEST = 1e-3  # what a picture under a constant map of radiance 1 may be; halves hold little below
-log = logging.getLogger(LOGGER_NAME)
-
-
-def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
-    """All files of a subject, by its record if it has one; the last of them is written last."""
-    record = record_path(folder, subject)
-    cameras = read_document(record, "")["cameras"].table() if record.exists() else capture.cameras
-    paths = [place(folder, subject, camera) for camera in cameras for place in (stack_path, fit_path)]
-    return [*paths, sheet_path(folder, subject), record]
-
-
-def prepare_subject(
-    capture: Capture,
-    subject: str,
-    chosen: Selection,
-    model: MorphableModel,
-    folder: Path,
-    crop_px: int,
-    key: str,
-    strict: bool = False,
-) -> dict[str, Any]:
-    """Write a subject's stacks, fits, sheet and record; give the record. `key` is of `preparation_key`.
-
-    With `strict` a camera that does not see the face is an error.
-    """
-    record_path(folder, subject).unlink(missing_ok=True)
-    view = _Subject(capture, subject, chosen.lights, model)
-    landmarks = [_find_landmarks(view, camera) for camera in chosen.cameras]
-    with _concerning(subject):
-        joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
-    cameras, rows, dropped = {}, [], dict(chosen.dropped)
-    for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
-        seen_px = None if error_iod is None else landmarks_px  # lost ones are as good as none
-        error_iod = joint.mean_error_iod if error_iod is None else error_iod
-        try:
-            fit, off_iod = fit_in_crop(model, joint, capture.cameras[camera], seen_px, error_iod, crop_px)
-            header = _header(view, camera, joint, fit)
-        except InputError as error:
-            dropped[camera] = str(error)
-            continue
-        rows.append(_write_camera(view, camera, fit, header, folder))
-        cameras[camera] = _camera_record(fit, seen_px is not None, off_iod)
-    chosen = replace(chosen, dropped=dropped)
-    _settle_dropped(subject, chosen, folder, bool(cameras), strict)
-    sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
-    write_display(sheet_path(folder, subject), sheet, metadata=view.provenance())
-    record = {
-        "prepared": key,
-        "error_iod": round(joint.mean_error_iod, 5),
-        "quality": quality_of(joint.mean_error_iod),
-        "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
-        "cameras": cameras,
-        **_record_besides(view, chosen),
-    }
-    write_document(record_path(folder, subject), record)
-    return record
-
-
-def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, Any]:
-    """What a record says of a camera."""
-    return {
-        "face_found": face_found,
-        "error_iod": round(fit.error_iod, 5),
-        "quality": fit.quality,
-        "crop_off_iod": round(off_iod, 5),
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class _Subject:
-    """Whom the work is about, the lights of their stacks (places in the capture's), and the face model."""
-
-    capture: Capture
-    name: str
-    lights: tuple[int, ...]
-    model: MorphableModel
-
-    @property
-    def directions_world(self) -> np.ndarray:
-        """Toward the lights [L, 3]."""
-        return self.capture.directions_world[list(self.lights)]
-
-    def provenance(self, *camera: str) -> dict[str, str | int]:
-        """Metadata of what is made of their pictures; synthetic where the capture says that it is."""
-        synthetic = self.capture.provenance.get("synthetic") is True
-        source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
-        name = "/".join([self.name, *camera])
-        return Provenance(name, **self.model.stamp, source_type=source_type).attributes()
-
-
-def _settle_dropped(subject: str, chosen: Selection, folder: Path, any_left: bool, strict: bool) -> None:
-    """Say what is left out, and remove what an earlier run wrote of it; raise where that cannot be."""
-    if chosen.dropped and (strict or not any_left):
-        reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
-        advice = "without --strict the others would do" if any_left else "no camera is left"
-        raise InputError(f"{subject}: {reasons}; {advice}")
-    if words := chosen.in_words():
-        log.warning("%s: %s", subject, words)
-    for camera in chosen.dropped:
-        stack_path(folder, subject, camera).unlink(missing_ok=True)
-        fit_path(folder, subject, camera).unlink(missing_ok=True)
-
-
-def _record_besides(view: _Subject, chosen: Selection) -> dict[str, Any]:
-    """What a record says besides: the lights there are (ids) and what is lacking, moved or not subtracted."""
-    capture = view.capture
-    entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
-    if chosen.left_out:
-        entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
-        entries |= {"left_out": chosen.left_out}
-    entries |= {"shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()}}
-    entries |= {"ambient_kept": _ambient_kept(view, chosen.cameras)}
-    return {name: entry for name, entry in entries.items() if entry}
-
-
-def _ambient_kept(view: _Subject, cameras: Iterable[str]) -> list[str]:
-    """The cameras, with a warning, whose ambient picture should be subtracted but is not there."""
-    if not view.capture.subtract_ambient:
-        return []
-    without = [camera for camera in cameras if view.capture.ambient(view.name, camera) is None]
-    if without:
-        words = "no ambient picture of the camera's size; nothing is subtracted"
-        log.warning("%s/%s: %s", view.name, ", ".join(without), words)
-    return without
-
-
-@contextmanager
-def _concerning(name: str) -> Iterator[None]:
-    """Say of whom an error within the block speaks."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
-
-
-def _find_landmarks(view: _Subject, camera: str) -> np.ndarray | None:
-    """Landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
-    weights = constant_weights(view.directions_world)
-    posed = view.capture.cameras[camera]
-    lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
-    for light, weight in zip(view.lights, weights, strict=True):
-        lit += weight * view.capture.frame(view.name, camera, light)
-    faces = detect_landmarks(to_display(lit))
-    return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
-
-
-def _header(view: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> StackHeader:
-    """The header of a camera's stack, its source still black; an InputError where it sees no face."""
-    posed = view.capture.cameras[camera]
-    # Through the head, so that lights turn with the normals.
+def _header(person: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> StackHeader:
+    """Make the header of a camera's stack with a black source; raise InputError where it sees no face."""
+    posed = person.capture.cameras[camera]
+    # World to crop by way of the head, so that lights turn with the normals.
     world_to_crop = fit.rotation.double() @ joint.rotation.mT
-    directions = view.directions_world @ world_to_crop.numpy().T
+    directions = person.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)
-    header = stack_header(view.model, fit, directions, source, inside, view.provenance(camera))
+    header = stack_header(person.model, fit, directions, source, inside, person.provenance(camera))
     if not header.seen.any():
         raise InputError("the camera does not see the face")
-    complete = len(view.lights) == len(view.capture.light_ids)
-    return header if complete else replace(header, rig_lights=view.lights)
+    complete = len(person.lights) == len(person.capture.light_ids)
+    return header if complete else replace(header, rig_lights=person.lights)
 
 
-def _write_camera(view: _Subject, camera: str, fit: FaceFit, header: StackHeader, folder: Path) -> np.ndarray:
-    """Write a camera's stack and fit; give its tiles [6, h, w, 3] of the sheet."""
-    shown: dict[int, np.ndarray] = dict.fromkeys(lights_shown(header.directions), header.source)
-    crops = _crops(view, camera, fit.crop, header, shown)
-    write_olat_stack(stack_path(folder, view.name, camera), header, crops)
-    with atomic_path(fit_path(folder, view.name, camera)) as temporary:
+def _write_camera(
+    person: _Subject, camera: str, fit: FaceFit, header: StackHeader, folder: Path
+) -> np.ndarray:
+    """Write a camera's stack and fit; return its tiles [6, h, w, 3] of the sheet."""
+    sheet_images: dict[int, np.ndarray] = dict.fromkeys(sheet_lights(header.directions), header.source)
+    crops = _crops(person, camera, fit.crop, header, sheet_images)
+    write_olat_stack(stack_path(folder, person.name, camera), header, crops)
+    with atomic_path(fit_path(folder, person.name, camera)) as temporary:
         save_fit(temporary, fit, header.metadata)
-    return sheet_tiles(header, fit, view.model, shown)
+    return sheet_tiles(header, fit, person.model, sheet_images)
 
 
 def _crops(
-    view: _Subject, camera: str, crop: Crop, header: StackHeader, shown: dict[int, np.ndarray]
+    person: _Subject, camera: str, crop: Crop, header: StackHeader, sheet_images: dict[int, np.ndarray]
 ) -> Iterator[Tensor]:
-    """A camera's pictures in the crop [1, 3, S, S], one by one; `shown` keeps those whose places it has.
+    """Yield a camera's images in the crop [1, 3, S, S]; fill the lights that `sheet_images` lists.
 
-    The header's source fills up on the way; `write_olat_stack` writes it last. Only here, where the crop has
-    averaged noise, do values below the black level become 0.
+    The header's source accumulates on the way; `write_olat_stack` writes it last. Values below the black
+    level become 0 only here, after the crop has averaged their noise.
     """
     clipped = 0
     for place, weight in enumerate(constant_weights(header.directions)):
-        image = np.maximum(crop.apply(view.capture.frame(view.name, camera, view.lights[place])), 0)
+        image = np.maximum(crop.apply(person.capture.frame(person.name, camera, person.lights[place])), 0)
         np.add(header.source, weight * image, out=header.source)
-        if place in shown:
-            shown[place] = image
+        if place in sheet_images:
+            sheet_images[place] = image
         clipped += int((image > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(image).permute(2, 0, 1)[None]
-    _say_what_halves_lose(f"{view.name}/{camera}", clipped, float(header.source.max()))
+    _warn_of_half_float_limits(f"{person.name}/{camera}", clipped, float(header.source.max()))
 
 
-def _say_what_halves_lose(name: str, clipped: int, lit: float) -> None:
-    """Warn of intensities that are far from DESIGN's unit: a face under a constant map of 1 is below 1."""
+def _warn_of_half_float_limits(name: str, clipped: int, lit: float) -> None:
+    """Warn where values leave the range of half floats; under a constant map of 1 a face is below 1."""
     if clipped:
-        advice = "the lamps' intensities in stage.json are too small for these pictures"
-        log.warning("%s: %d pixels are beyond %g and were clipped; %s", name, clipped, HALF_MAX, advice)
+        advice = "the lights' intensities in stage.json are too small"
+        log.warning("%s: %d pixels are above %g and were clipped; %s", name, clipped, HALF_MAX, advice)
     elif lit < _DIMMEST:
-        advice = "the lamps' intensities in stage.json are too large for these pictures"
-        log.warning("%s: a map of radiance 1 would light it to %.2g at most; %s", name, lit, advice)
-
-
-def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
-    """The records of the subjects that are finished, by subject; 'prepared' is the key they were given."""
-    return {
-        subject: read_document(record_path(folder, subject), "").table()
-        for subject in capture.subjects
-        if all(path.exists() for path in subject_outputs(capture, subject, folder))
-    }
+        advice = "the lights' intensities in stage.json are too large"
+        log.warning("%s: a constant map of radiance 1 gives radiance %.2g at most; %s", name, lit, advice)

@@ -1,9 +1,9 @@
-"""Subjects of a prepared dataset under environment maps (paper, 'Dataset'): weights times the OLAT stack.
+"""Subjects of a prepared dataset under envmaps (paper, 'Dataset'): weighted sums of their OLAT stacks.
 
-The product of weights [M, L] and a stack [L, P], a channel at a time, is done in tiles of always the same
-shape: `TILE_PICTURES` pictures (the last ones are padded with zeros) by some whole rows that depend on the
-picture's size and the number of lights alone. So a picture's bits depend neither on how many others are made
-beside it nor on how much memory there is.
+A channel at a time, weights [M, L] are multiplied with a stack [L, P] in tiles of constant shape:
+`TILE_IMAGES` images (the last tile is padded with zeros) by a number of whole rows that depends on the
+image's size and the number of lights alone. So an image's bits depend neither on how many others are made
+with it nor on the memory limit.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,9 +25,10 @@ from facerf_cli.logs import attributes_of_sum
 from facerf_cli.synth.heads_bank import one_thread
 
 TILE_IMAGES = 128
-_TILE_PX = 1 << 13  # at most, and
-_TILE_VALUES = 1 << 22  # so many lights times pixels, in floats three times over
 DEFAULT_MEMORY_BYTES = 2 << 30
+# A tile has at most so many pixels, and so many lights times pixels, held three times over as float32.
+_TILE_PX = 1 << 13
+_TILE_VALUES = 1 << 22
 
 
 def relight_subject(
@@ -37,24 +38,24 @@ def relight_subject(
     memory_bytes: int = DEFAULT_MEMORY_BYTES,
     overwrite: bool = False,
 ) -> int:
-    """Write the sources of a subject's pairs, of weights [rows, L, 3], that are missing; give how many."""
+    """Write the missing sources of a subject's pairs, with weights [rows, L, 3]; return how many."""
     todo = [row for row, pair in enumerate(pairs) if overwrite or not image_path(dataset, *pair.key).exists()]
     for camera in sorted({pairs[row].source_camera for row in todo}):
         rows = [row for row in todo if pairs[row].source_camera == camera]
         path = dataset.stack_path(pairs[rows[0]].subject, camera)
         images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
-        made = attributes_of_sum(read_olat_header(path).metadata)
+        attributes = attributes_of_sum(read_olat_header(path).metadata)
         for row, image in zip(rows, images, strict=True):
             pixels = image.permute(1, 2, 0).float().numpy()
             recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
-            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata=made | recipe)
+            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata=attributes | recipe)
     return len(todo)
 
 
 def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
-    """The source [3, H, W] float16 of a line of pairs.jsonl, from the dataset and the map alone.
+    """Render the source [3, H, W] float16 of a line of pairs.jsonl from the dataset and the envmap alone.
 
-    Bit for bit what `relight-dataset` writes.
+    The result equals the file that `relight-dataset` writes, bit for bit.
     """
     pair = row if isinstance(row, Pair) else Pair.from_row(dict(row))
     weights = pair_weights(dataset, pair)
@@ -62,20 +63,22 @@ def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
 
 
 def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY_BYTES) -> Iterator[Tensor]:
-    """The pictures [3, H, W] float16 of a stack under weights [M, L, 3], in order, on one thread.
+    """Yield the images [3, H, W] float16 of a stack under weights [M, L, 3], in order, on one thread.
 
-    Half of the memory holds the stack or a strip of its rows, a quarter the pictures that are being made; the
-    stack is read once where it fits, else once for each lot of pictures.
+    Half of the memory holds the stack, or a strip of its rows, and a quarter the current batch of images. A
+    stack that fits is read once, otherwise once a batch.
     """
     header = read_olat_header(path)
     (height, width), lights = header.seen.shape, len(header.directions)
     if weights.shape[1] != lights:
-        raise InputError(f"{path}: {lights} lights, not {weights.shape[1]} as the dataset has")
+        raise InputError(
+            f"{path}: {lights} lights, the dataset has {weights.shape[1]}; run prepare-dataset again"
+        )
     rows = _strip_rows(lights, height, width, memory_bytes // 2)
     whole = read_olats(path) if rows >= height else None
-    lot = max(1, memory_bytes // (4 * 6 * height * width))
-    lot = lot if lot < TILE_IMAGES else lot // TILE_IMAGES * TILE_IMAGES
-    for part in torch.split(weights, lot):
+    batch = max(1, memory_bytes // (4 * 6 * height * width))
+    batch = batch if batch < TILE_IMAGES else batch // TILE_IMAGES * TILE_IMAGES
+    for part in torch.split(weights, batch):
         images = torch.empty(len(part), 3, height, width, dtype=torch.float16)
         for first in range(0, height, rows):
             strip = slice(first, min(first + rows, height))
@@ -84,7 +87,7 @@ def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY
 
 
 def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
-    """Pictures [M, 3, h, W] of OLATs [L, 3, h, W] under weights [M, L, 3]; all but the weights float16."""
+    """Fill images [M, 3, h, W] with OLATs [L, 3, h, W] under weights [M, L, 3]; float16 but the weights."""
     lights, _, height, width = olats.shape
     rows = _tile_rows(lights, width)
     blocks = torch.split(weights.permute(2, 0, 1), TILE_IMAGES, dim=1)  # [3, m, L]
@@ -104,11 +107,11 @@ def _tile_rows(lights: int, width: int) -> int:
 
 
 def _strip_rows(lights: int, height: int, width: int, memory_bytes: int) -> int:
-    """Rows of a stack that are held at once: all, or as many whole tiles and compressed blocks as fit."""
+    """Rows of a stack in memory at once: all, or as many whole tiles and compressed blocks as fit."""
     rows = memory_bytes // (6 * lights * width)
     return height if rows >= height else max(_power_of_two(rows), _tile_rows(lights, width))
 
 
 def _power_of_two(number: int) -> int:
-    """The largest power of two up to a number, at least 1."""
+    """Largest power of two up to a number, at least 1."""
     return 1 << max(0, number.bit_length() - 1)

@@ -8,11 +8,11 @@ from facerf_cli.dataset.crops import PairReader, mean_translation_m, open_pairs,
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path
 from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import load_pairs, name_maps, settle_pairs
+from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.network.reflectance import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 
@@ -26,8 +26,8 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def reader(dataset: Dataset) -> PairReader:
-    maps = name_maps(ProceduralMaps(3, 0, 32))
-    settle_pairs(dataset, draw_pairs(dataset, maps, 4, 0), overwrite=False)
+    maps = envmap_names(ProceduralMaps(3, 0, 32))
+    write_pairs(dataset, draw_pairs(dataset, maps, 4, 0), overwrite=False)
     for rows, weights in load_pairs(dataset).values():
         relight_subject(dataset, rows, weights)
     return open_pairs(dataset, "train", CROP_PX)

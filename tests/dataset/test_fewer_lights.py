@@ -11,15 +11,15 @@ from facerf_cli.dataset.crops import open_pairs
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import draw_pairs, pairs_path, read_pairs
 from facerf_cli.dataset.relight import relight_subject, render_source
-from facerf_cli.dataset.textures import open_captured
+from facerf_cli.dataset.samples import open_dataset_textures
 from facerf_cli.dataset.weights import (
+    envmap_names,
     load_pairs,
     map_directions,
-    name_maps,
     pair_weights,
-    read_map,
-    settle_pairs,
+    read_envmap,
     weights_path,
+    write_pairs,
 )
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
@@ -29,7 +29,7 @@ from tests.dataset.dataset_fixture import write_small_dataset
 
 LIGHTS = 20
 LACKING = {"0000": (0, 7, 8), "0001": (19,)}
-MAPS = name_maps(ProceduralMaps(3, 7, 32))
+MAPS = envmap_names(ProceduralMaps(3, 7, 32))
 
 
 @pytest.fixture(scope="module")
@@ -64,13 +64,13 @@ def test_a_target_is_a_light_that_the_subject_has(dataset: Dataset) -> None:
 
 def test_a_map_is_weighed_over_the_cells_of_the_lights_there_are(dataset: Dataset, tmp_path: Path) -> None:
     here = fresh(dataset, tmp_path)
-    settled = settle_pairs(here, draw_pairs(here, MAPS, 4, 0), overwrite=False)
+    settled = write_pairs(here, draw_pairs(here, MAPS, 4, 0), overwrite=False)
     assert read_pairs(here) == settled
     for subject, (pairs, weights) in load_pairs(here).items():
         lights = list(here.lights_of(subject))
         assert weights.shape == (4, len(lights), 3)
         for pair, row in zip(pairs, weights, strict=True):
-            envmap, directions = read_map(pair.envmap), map_directions(here)
+            envmap, directions = read_envmap(pair.envmap), map_directions(here)
             expected = envmap_weights(envmap, directions[lights], pair.rotate_deg) * 2.0**pair.exposure_ev
             torch.testing.assert_close(torch.from_numpy(np.array(row)), expected)
             torch.testing.assert_close(pair_weights(here, pair), expected)
@@ -83,7 +83,7 @@ def test_a_map_is_weighed_over_the_cells_of_the_lights_there_are(dataset: Datase
 def test_a_constant_map_gives_the_fully_lit_image(dataset: Dataset, tmp_path: Path) -> None:
     here = fresh(dataset, tmp_path)
     write_exr(tmp_path / "white.exr", np.ones((5, 10, 3), np.float32))
-    pairs = settle_pairs(here, draw_pairs(here, [str(tmp_path / "white.exr")], 1, 0), overwrite=False)
+    pairs = write_pairs(here, draw_pairs(here, [str(tmp_path / "white.exr")], 1, 0), overwrite=False)
     for pair in pairs:
         lit = read_olat_header(here.stack_path(pair.subject, pair.source_camera)).source
         image = render_source(here, pair).permute(1, 2, 0).float().numpy()
@@ -93,9 +93,9 @@ def test_a_constant_map_gives_the_fully_lit_image(dataset: Dataset, tmp_path: Pa
 def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) -> None:
     """With pairs, with their pictures, and without any pairs; more lights than somebody has are not asked."""
     here = fresh(dataset, tmp_path)
-    free = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
-    settle_pairs(here, draw_pairs(here, MAPS, 2, 0), overwrite=False)
-    lazy = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
+    free = open_dataset_textures(here.folder, "builtin", 32, 1, LIGHTS)
+    write_pairs(here, draw_pairs(here, MAPS, 2, 0), overwrite=False)
+    lazy = open_dataset_textures(here.folder, "builtin", 32, 1, LIGHTS)
     heads = torch.tensor([0, 1, 2])
     for captured in (free, lazy):
         sample = captured.draw(heads, LIGHTS, torch.Generator().manual_seed(0))
@@ -103,7 +103,7 @@ def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) 
     expected = lazy.draw(heads, 3, torch.Generator().manual_seed(1))
     for rows, weights in load_pairs(here).values():
         relight_subject(here, rows, weights)
-    written = open_captured(here.folder, "builtin", 32, 1, LIGHTS)
+    written = open_dataset_textures(here.folder, "builtin", 32, 1, LIGHTS)
     assert set(written.sources) == {"0000", "0001", "0002"}
     sample = written.draw(heads, 3, torch.Generator().manual_seed(1))
     torch.testing.assert_close(sample.target, expected.target)
@@ -114,10 +114,10 @@ def test_they_train_beside_those_who_have_all(dataset: Dataset, tmp_path: Path) 
 
 def test_a_pair_of_a_light_that_the_subject_lacks_is_none(dataset: Dataset, tmp_path: Path) -> None:
     here = fresh(dataset, tmp_path)
-    pair = settle_pairs(here, draw_pairs(here, MAPS, 1, 0), overwrite=False)[0]
+    pair = write_pairs(here, draw_pairs(here, MAPS, 1, 0), overwrite=False)[0]
     text = pairs_path(here).read_text()
     wrong = text.replace(f'"target_light": {pair.target_light}', '"target_light": 17', 1)
     assert wrong != text
     pairs_path(here).write_text(wrong)
-    with pytest.raises(Exception, match="line 1 is no pair"):
+    with pytest.raises(Exception, match="line 1 is not a pair"):
         read_pairs(here)

@@ -12,14 +12,14 @@ from facerf_cli.dataset.pairs import draw_pair, draw_pairs, image_path, pairs_pa
 from facerf_cli.dataset.prepare import constant_weights
 from facerf_cli.dataset.relight import multiply, relight_subject, relit_images, render_source
 from facerf_cli.dataset.weights import (
+    envmap_names,
     load_pairs,
     map_directions,
-    name_maps,
     pair_weights,
-    read_map,
-    settle_pairs,
+    read_envmap,
     weights_path,
     world_to_map,
+    write_pairs,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.images import read_image, write_exr
@@ -28,7 +28,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 
-MAPS = name_maps(ProceduralMaps(4, 7, 32))
+MAPS = envmap_names(ProceduralMaps(4, 7, 32))
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_pair_depends_on_seed_subject_and_index_alone(dataset: Dataset) -> Non
 
 
 def test_written_sources_are_their_rows_bit_for_bit(fresh: Dataset) -> None:
-    pairs = settle_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
+    pairs = write_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
     for subject, (rows, weights) in load_pairs(fresh).items():
         assert relight_subject(fresh, rows, weights) == 3
         assert relight_subject(fresh, rows, weights) == 0  # all there
@@ -83,7 +83,7 @@ def test_written_sources_are_their_rows_bit_for_bit(fresh: Dataset) -> None:
 
 
 def test_weights_are_made_anew_where_they_are_missing(fresh: Dataset) -> None:
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
     kept = weights_path(fresh).read_bytes()
     weights_path(fresh).unlink()
     pairs_path(fresh).touch()  # what is in memory is forgotten
@@ -94,7 +94,7 @@ def test_weights_are_made_anew_where_they_are_missing(fresh: Dataset) -> None:
 
 def test_a_constant_map_gives_the_fully_lit_image(fresh: Dataset, tmp_path: Path) -> None:
     maps = [write_map(tmp_path / "white.exr", np.full((5, 10, 3), 0.25))]
-    pairs = settle_pairs(fresh, draw_pairs(fresh, maps, 1, 0), overwrite=False)
+    pairs = write_pairs(fresh, draw_pairs(fresh, maps, 1, 0), overwrite=False)
     assert {pair.exposure_ev for pair in pairs} == {2}  # 0.25 brought to 1
     for pair in pairs:
         lit = read_olat_header(fresh.stack_path(pair.subject, pair.source_camera)).source
@@ -131,9 +131,9 @@ def test_all_cameras_see_the_same_light_and_it_turns_about_the_vertical(
 
 
 def _ev(dataset: Dataset, pair: object) -> int:
-    from facerf_cli.dataset.weights import MapWork, weigh_map
+    from facerf_cli.dataset.weights import EnvmapTask, compute_weights
 
-    result = weigh_map(MapWork(pair.envmap, map_directions(dataset), ()))  # type: ignore[attr-defined]
+    result = compute_weights(EnvmapTask(pair.envmap, map_directions(dataset), ()))  # type: ignore[attr-defined]
     assert not isinstance(result, str)
     return result.exposure_ev
 
@@ -141,8 +141,8 @@ def _ev(dataset: Dataset, pair: object) -> int:
 def test_the_weights_are_those_of_the_turned_map_in_a_cameras_own_directions(
     fresh: Dataset, tmp_path: Path
 ) -> None:
-    pair = settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)[0]
-    envmap = read_map(pair.envmap)
+    pair = write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)[0]
+    envmap = read_envmap(pair.envmap)
     expected = envmap_weights(envmap, map_directions(fresh), pair.rotate_deg) * 2.0**pair.exposure_ev
     torch.testing.assert_close(pair_weights(fresh, pair), expected)
     mean = float(pair_weights(fresh, pair).sum(0).mean()) / 4
@@ -217,65 +217,65 @@ def test_parts_of_a_stack(dataset: Dataset) -> None:
 
 def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: Dataset) -> None:
     drawn = draw_pairs(fresh, MAPS, 2, 0)
-    settle_pairs(fresh, drawn, overwrite=False)
+    write_pairs(fresh, drawn, overwrite=False)
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     before = weights_path(fresh)
-    with pytest.raises(UsageError, match=r"another seed, other maps, .* --overwrite"):
-        settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
+    with pytest.raises(UsageError, match=r"another seed, other envmaps, .* --overwrite"):
+        write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
     assert image_path(fresh, "0000", 1).exists()
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
     assert image_path(fresh, "0000", 1).exists() and not before.exists() and len(read_pairs(fresh)) == 16
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=True)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=True)
     assert not image_path(fresh, "0000", 1).exists()
     pairs_path(fresh).write_text("{}\n")
-    with pytest.raises(InputError, match="line 1 is no pair"):
-        settle_pairs(fresh, drawn, overwrite=False)
-    assert len(settle_pairs(fresh, drawn, overwrite=True)) == 8
+    with pytest.raises(InputError, match="line 1 is not a pair"):
+        write_pairs(fresh, drawn, overwrite=False)
+    assert len(write_pairs(fresh, drawn, overwrite=True)) == 8
 
 
 def test_fewer_pairs_leave_no_image_without_its_own(fresh: Dataset) -> None:
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
-    few = settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)  # recipes alone may go
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
+    few = write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)  # recipes alone may go
     assert len(few) == 8
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
-    with pytest.raises(UsageError, match="more of each subject"):
-        settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    with pytest.raises(UsageError, match="a larger --per-subject"):
+        write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
     assert len(read_pairs(fresh)) == 8 and image_path(fresh, "0000", 1).exists()
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not image_path(fresh, "0000", 1).exists()
 
 
 def test_as_many_pairs_of_other_subjects_are_other_pairs(fresh: Dataset) -> None:
     drawn = draw_pairs(fresh, MAPS, 2, 0)
-    settle_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
-    settled = settle_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
+    write_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
+    settled = write_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
     assert [pair.subject for pair in settled] == ["0000", "0001", "0002", "0003"] == list(load_pairs(fresh))
 
 
 def test_a_map_that_changed_is_another_map(fresh: Dataset, tmp_path: Path) -> None:
     name = write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 1.0))
     drawn = draw_pairs(fresh, [name], 1, 0)
-    settle_pairs(fresh, drawn, overwrite=False)
+    write_pairs(fresh, drawn, overwrite=False)
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 8.0))
-    with pytest.raises(UsageError, match="other maps"):
-        settle_pairs(fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
+    with pytest.raises(UsageError, match="other envmaps"):
+        write_pairs(fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
     weights_path(fresh).unlink()
     pairs_path(fresh).touch()
-    with pytest.raises(InputError, match="made with other maps than are there now"):
+    with pytest.raises(InputError, match="the envmaps have changed since the pairs were made"):
         load_pairs(fresh)
-    assert settle_pairs(fresh, drawn, overwrite=True)[0].exposure_ev == -3
+    assert write_pairs(fresh, drawn, overwrite=True)[0].exposure_ev == -3
 
 
 def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: Path) -> None:
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     with pytest.raises(FacerfError, match="cannot be used"):
-        settle_pairs(fresh, draw_pairs(fresh, [str(tmp_path / "none.exr")], 1, 0), overwrite=True)
+        write_pairs(fresh, draw_pairs(fresh, [str(tmp_path / "none.exr")], 1, 0), overwrite=True)
     assert image_path(fresh, "0000", 0).exists() and len(read_pairs(fresh)) == 4
 
 
@@ -292,24 +292,24 @@ def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: 
     ],
 )
 def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, object]) -> None:
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)
     first, *others = pairs_path(fresh).read_text().splitlines()
     changed = json.dumps(json.loads(first) | change)
     pairs_path(fresh).write_text("\n".join([changed, *others]))
     number = 2 if change == {"index": 1} else 1  # twice the same pair
-    with pytest.raises(InputError, match=f"line {number} is no pair"):
+    with pytest.raises(InputError, match=f"line {number} is not a pair"):
         read_pairs(fresh)
 
 
 @pytest.mark.parametrize("name", ["procedural:0:0:99999999", "procedural:0:0:0", "procedural:0"])
 def test_a_row_cannot_ask_for_a_map_of_any_size(name: str) -> None:
     with pytest.raises(InputError, match="no such file"):
-        read_map(name)
+        read_envmap(name)
 
 
 def test_one_camera_predicts_itself(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, (1, 0, 0), cameras=1, lights=6, crop_px=32)
-    (pair,) = settle_pairs(dataset, draw_pairs(dataset, MAPS, 1, 0), overwrite=False)
+    (pair,) = write_pairs(dataset, draw_pairs(dataset, MAPS, 1, 0), overwrite=False)
     assert pair.source_camera == pair.target_camera == "C0"
     assert render_source(dataset, pair).isfinite().all()
 
@@ -319,8 +319,8 @@ def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -
     path.parent.mkdir(parents=True)
     path.write_text("of an unknown light")
     with pytest.raises(UsageError, match="--overwrite"):
-        settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
-    settle_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+        write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not path.exists()
 
 
@@ -334,9 +334,9 @@ def test_every_bad_map_is_named_and_nothing_is_written(
     maps = [good, square, black, str(tmp_path / "text.hdr")]
     with (
         caplog.at_level("ERROR", "facerf"),
-        pytest.raises(FacerfError, match="3 of 4 maps cannot be used; mend them or take them out"),
+        pytest.raises(FacerfError, match="3 of 4 maps cannot be used; repair or remove them"),
     ):
-        settle_pairs(fresh, draw_pairs(fresh, maps, 20, 0), overwrite=False)
+        write_pairs(fresh, draw_pairs(fresh, maps, 20, 0), overwrite=False)
     assert not pairs_path(fresh).exists()
 
 
@@ -344,5 +344,5 @@ def test_a_stack_of_another_rig_is_named(dataset: Dataset) -> None:
     fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
     with pytest.raises(InputError, match="20 lights, the dataset has 12"):
         world_to_map(fewer)
-    with pytest.raises(InputError, match="20 lights, not 12"):
+    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
         list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))

@@ -10,13 +10,15 @@ from safetensors import safe_open
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import draw_pairs, image_path, pairs_path
 from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.textures import Captured, View, open_captured, texture_path
-from facerf_cli.dataset.weights import load_pairs, name_maps, settle_pairs
+from facerf_cli.dataset.samples import DatasetTextures, UnwrappedView, open_dataset_textures
+from facerf_cli.dataset.textures import texture_path
+from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.checkpoint import load_networks
-from facerf_cli.network.reflectance import MEAN_RADIANCE, ReflectanceNetwork, ReflectanceSettings
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.synth.texture_samples import Sample
@@ -26,7 +28,7 @@ from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 
 SIDE, LIGHTS = 32, 20
-NETWORK = ReflectanceSettings(
+NETWORK = DefaultReflectanceSettings(
     side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=LIGHTS
 )
 
@@ -37,26 +39,26 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def lazy(dataset: Dataset) -> Captured:
+def lazy(dataset: Dataset) -> DatasetTextures:
     """Pairs without pictures."""
-    maps = name_maps(ProceduralMaps(3, 0, 32))
-    settle_pairs(dataset, draw_pairs(dataset, maps, 5, 0), overwrite=False)
-    return open_captured(dataset.folder, "builtin", SIDE, 1, LIGHTS)
+    maps = envmap_names(ProceduralMaps(3, 0, 32))
+    write_pairs(dataset, draw_pairs(dataset, maps, 5, 0), overwrite=False)
+    return open_dataset_textures(dataset.folder, "builtin", SIDE, 1, LIGHTS)
 
 
 @pytest.fixture(scope="module")
-def written(dataset: Dataset, lazy: Captured) -> Captured:
+def written(dataset: Dataset, lazy: DatasetTextures) -> DatasetTextures:
     """The same with their pictures."""
     for rows, weights in load_pairs(dataset).values():
         relight_subject(dataset, rows, weights)
-    return open_captured(dataset.folder, "builtin", SIDE, 1, LIGHTS)
+    return open_dataset_textures(dataset.folder, "builtin", SIDE, 1, LIGHTS)
 
 
-def draw(captured: Captured, seed: int = 0) -> Sample:
+def draw(captured: DatasetTextures, seed: int = 0) -> Sample:
     return captured.draw(torch.tensor([0, 1, 2]), 3, torch.Generator().manual_seed(seed))
 
 
-def test_textures_are_the_unwrapped_stack(lazy: Captured) -> None:
+def test_textures_are_the_unwrapped_stack(lazy: DatasetTextures) -> None:
     dataset = lazy.dataset
     stack = read_olat_stack(dataset.stack_path("0001", "C1"))
     from facerf_cli.face.fit import load_fit
@@ -73,7 +75,7 @@ def test_textures_are_the_unwrapped_stack(lazy: Captured) -> None:
     assert not texture_path(dataset, SIDE, "0003", "C0").exists()  # of the split test
 
 
-def test_lazy_sources_are_the_written_ones(lazy: Captured, written: Captured) -> None:
+def test_lazy_sources_are_the_written_ones(lazy: DatasetTextures, written: DatasetTextures) -> None:
     assert not lazy.sources and set(written.sources) == {"0000", "0001", "0002"}
     generator = torch.Generator().manual_seed(1)
     for subject in ("0000", "0002"):
@@ -89,7 +91,7 @@ def test_lazy_sources_are_the_written_ones(lazy: Captured, written: Captured) ->
             assert torch.equal(computed.target, read.target)
 
 
-def test_a_sample_is_exposed_and_weighed_as_the_banks_are(lazy: Captured) -> None:
+def test_a_sample_is_exposed_and_weighed_as_the_banks_are(lazy: DatasetTextures) -> None:
     sample = draw(lazy)
     assert sample.source.shape == (3, 3, SIDE, SIDE) and sample.target.shape == (3, 3, 3, SIDE, SIDE)
     assert all(getattr(sample, field.name).isfinite().all() for field in fields(sample))
@@ -109,7 +111,7 @@ def test_a_sample_is_exposed_and_weighed_as_the_banks_are(lazy: Captured) -> Non
     assert torch.equal(again.source, sample.source) and not torch.equal(draw(lazy, 1).source, sample.source)
 
 
-def test_the_pairs_light_is_among_the_targets(lazy: Captured) -> None:
+def test_the_pairs_light_is_among_the_targets(lazy: DatasetTextures) -> None:
     pairs, _ = load_pairs(lazy.dataset)["0000"]
     wanted = {pair.target_light for pair in pairs}
     for seed in range(4):
@@ -120,12 +122,12 @@ def test_the_pairs_light_is_among_the_targets(lazy: Captured) -> None:
         assert numbers & wanted and len(face.lights) == 2
 
 
-def test_a_target_of_another_camera_has_its_normals_and_lights(lazy: Captured) -> None:
-    with lazy._opened("0000", "C0") as file:
-        source = View.of(file)
+def test_a_target_of_another_camera_has_its_normals_and_lights(lazy: DatasetTextures) -> None:
+    with lazy._open("0000", "C0") as file:
+        source = UnwrappedView.read(file)
     face = lazy._face("0000", "C1", source, source.lit, 5, 3, torch.Generator().manual_seed(0))
-    with lazy._opened("0000", "C1") as file:
-        target = View.of(file)
+    with lazy._open("0000", "C1") as file:
+        target = UnwrappedView.read(file)
         assert torch.equal(face.target[0], file.get_tensor("olats")[5].float())
     torch.testing.assert_close(face.normals_target, target.normals, atol=2e-3, rtol=0)
     torch.testing.assert_close(face.lights[0], target.directions[5])
@@ -133,36 +135,38 @@ def test_a_target_of_another_camera_has_its_normals_and_lights(lazy: Captured) -
     assert bool((face.weight <= target.visible).all())
 
 
-def _rotation(captured: Captured, camera: str) -> torch.Tensor:
+def _rotation(captured: DatasetTextures, camera: str) -> torch.Tensor:
     with safe_open(texture_path(captured.dataset, SIDE, "0000", camera), "pt") as file:
         return file.get_tensor("rotation")
 
 
-def test_without_pairs_the_light_is_drawn(dataset: Dataset, lazy: Captured, tmp_path: Path) -> None:
+def test_without_pairs_the_light_is_drawn(dataset: Dataset, lazy: DatasetTextures, tmp_path: Path) -> None:
     for part in ("olat", "fits", "dataset.json", f"textures-{SIDE}"):
         (tmp_path / part).symlink_to(dataset.folder / part)
     assert not pairs_path(replace(dataset, folder=tmp_path)).exists()
-    captured = open_captured(tmp_path, "builtin", SIDE, 1, LIGHTS)
+    captured = open_dataset_textures(tmp_path, "builtin", SIDE, 1, LIGHTS)
     sample = draw(captured)
     assert sample.source.isfinite().all() and sample.source.std() > 0.02
 
 
-def test_a_changed_stack_or_a_damaged_texture_is_unwrapped_again(dataset: Dataset, lazy: Captured) -> None:
+def test_a_changed_stack_or_a_damaged_texture_is_unwrapped_again(
+    dataset: Dataset, lazy: DatasetTextures
+) -> None:
     path = texture_path(dataset, SIDE, "0000", "C0")
     whole = path.read_bytes()
     path.write_bytes(whole[:1000])
-    open_captured(dataset.folder, "builtin", SIDE, 1, LIGHTS)
+    open_dataset_textures(dataset.folder, "builtin", SIDE, 1, LIGHTS)
     assert path.read_bytes() == whole
     before = path.stat().st_mtime_ns
-    open_captured(dataset.folder, "builtin", SIDE, 1, LIGHTS)
+    open_dataset_textures(dataset.folder, "builtin", SIDE, 1, LIGHTS)
     assert path.stat().st_mtime_ns == before
     dataset.stack_path("0000", "C0").touch()
-    open_captured(dataset.folder, "builtin", SIDE, 1, LIGHTS)
+    open_dataset_textures(dataset.folder, "builtin", SIDE, 1, LIGHTS)
     assert path.stat().st_mtime_ns != before
 
 
-def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: Captured, tmp_path: Path) -> None:
-    objective = ChartObjective(lazy, ReflectanceNetwork(NETWORK), settings=ChartSettings(lights=3))
+def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: DatasetTextures, tmp_path: Path) -> None:
+    objective = ChartObjective(lazy, DefaultReflectanceNetwork(NETWORK), settings=ChartSettings(lights=3))
     path = train(objective, tmp_path, replace(PRESETS["tiny"], steps=60, validate_every=100))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])
@@ -174,14 +178,14 @@ def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: Captured, tmp_
 
 def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such face model"):
-        open_captured(dataset.folder, "nobody.npz", SIDE, 1)
+        open_dataset_textures(dataset.folder, "nobody.npz", SIDE, 1)
     none = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=4, crop_px=32)
     with pytest.raises(InputError, match="no subject in the split validation; run prepare-dataset"):
-        open_captured(none.folder, "builtin", SIDE, 1)
+        open_dataset_textures(none.folder, "builtin", SIDE, 1)
     text = (tmp_path / "dataset.json").read_text().replace('"face_model": "builtin"', '"face_model": "other"')
     (tmp_path / "dataset.json").write_text(text)
     with pytest.raises(InputError, match="fitted with the face model other, not builtin; give --fit-with"):
-        open_captured(none.folder, "builtin", SIDE, 1)
+        open_dataset_textures(none.folder, "builtin", SIDE, 1)
 
 
 @pytest.mark.parametrize(
@@ -197,16 +201,16 @@ def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path:
     ],
 )
 def test_the_licence_is_what_the_dataset_says(
-    dataset: Dataset, lazy: Captured, tmp_path: Path, provenance: dict[str, object], words: str
+    dataset: Dataset, lazy: DatasetTextures, tmp_path: Path, provenance: dict[str, object], words: str
 ) -> None:
     for part in ("olat", "fits", f"textures-{SIDE}"):
         (tmp_path / part).symlink_to(dataset.folder / part)
     content = json.loads((dataset.folder / "dataset.json").read_text()) | {"provenance": provenance}
     (tmp_path / "dataset.json").write_text(json.dumps(content))
-    assert words in open_captured(tmp_path, "builtin", SIDE, 1, LIGHTS).provenance["licence"]
+    assert words in open_dataset_textures(tmp_path, "builtin", SIDE, 1, LIGHTS).provenance["licence"]
 
 
-def test_the_mean_face_is_that_of_the_model(lazy: Captured) -> None:
+def test_the_mean_face_is_that_of_the_model(lazy: DatasetTextures) -> None:
     normals, visibility, directions = lazy.mean_face()
     assert len(visibility) == len(directions) == LIGHTS
     front, behind = int(directions[:, 2].argmax()), int(directions[:, 2].argmin())
