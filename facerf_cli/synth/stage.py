@@ -33,8 +33,9 @@ from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_ap
 from facerf_cli.synth.head.clothes import draw_clothes
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
+from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, scalp_cover
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.synth.heads_bank import GeometrySettings, draw_coefficients
 from facerf_cli.synth.views import StageCamera
 

@@ -1,4 +1,4 @@
-"""A garment about a synthetic head's neck and shoulders: rings measured on the head, lofted down and out."""
+"""A garment around the neck and shoulders of a synthetic head: a loft through rings measured on the head."""
 
 import numpy as np
 import torch
@@ -7,26 +7,27 @@ from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.cranium import Hull, hull_of
+from facerf_cli.synth.head.hull import Hull, hull_of
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless, unit
 
 GARMENTS = ("crew neck", "v-neck", "wide neck", "turtleneck", "shirt")
 
-_CHIN = 8
+_CHIN = 8  # landmark
 _AROUND = 144  # vertices around the neck
-_CUT_M = 0.16  # below the chin
-_LOWEST_CHIN_M = -0.085
-_OFF_SKIN_M = 0.004  # of cloth
-_BANDS_M = {"turtleneck": 0.045, "shirt": 0.006}  # height of the neckline's band, where it is fixed
-_FLARE_M = 0.012  # how much wider than its narrowest a neck still is a neck
-_BELOW_M = -0.06  # height under which cloth may touch skin
-_ASIDE_M = 0.008  # of cloth that still lies over a vertex of the skin
+_CUT_M = 0.16  # lower end of a garment below the chin
+_LOWEST_CHIN_M = -0.085  # limit of the chin's height, so that an open mouth does not move the garment
+_OFF_SKIN_M = 0.004  # minimal distance from cloth to skin
+_BANDS_M = {"turtleneck": 0.045, "shirt": 0.006}  # fixed heights of the neckline's band; drawn for the others
+_FLARE_M = 0.012  # a level counts as neck while it is at most this much wider than the narrowest level
+_BELOW_M = -0.06  # height below which cloth may touch skin
+_ASIDE_M = 0.008  # largest sideways distance at which cloth still lies over a vertex of the skin
+_BODY_ROWS = 33  # rings between neckline and cut
 
 
 def draw_clothes(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
-    """A garment from the neck to the shoulders, as part "cloth", for a bare head."""
+    """Draw a garment from the neck to the shoulders, as part "cloth", for a bare head."""
     kind = str(random.choice(GARMENTS))
-    hull, skin = hull_of(head), _Skin(head)
+    hull, skin = hull_of(head), _NeckSkin(head)
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     collar = _collar_line(kind, azimuth, _chin_m(head), random)
     collar = _on_neck(hull, azimuth, collar, _BANDS_M.get(kind, 0.01))
@@ -37,14 +38,14 @@ def draw_clothes(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
 
 
 def _chin_m(head: HeadMesh) -> float:
-    """Height of the chin's underside, at most so low: an open mouth takes no garment with it."""
+    """Height of the underside of the chin, not below `_LOWEST_CHIN_M`."""
     skin = head.part == PARTS.index("skin")
     nearest = np.linalg.norm(head.uv[skin] - LANDMARK_UV[_CHIN], axis=-1).argmin()
     return max(float(head.vertices[skin][nearest, 1]) - 0.003, _LOWEST_CHIN_M)
 
 
 def _collar_line(kind: str, azimuth: np.ndarray, chin: float, random: np.random.Generator) -> np.ndarray:
-    """Height [N] of the neckline around the neck; lower before than behind."""
+    """Draw the height [N] of the neckline around the neck, lower at the front than at the back."""
     front = (1 + np.cos(azimuth)) / 2
     depth, slope = {
         "crew neck": (0.036, 0.028),
@@ -61,7 +62,7 @@ def _collar_line(kind: str, azimuth: np.ndarray, chin: float, random: np.random.
 
 
 def _on_neck(hull: Hull, azimuth: np.ndarray, line: np.ndarray, band: float) -> np.ndarray:
-    """The neckline [N], raised where the foot of its band would lie on the shoulders of a short neck."""
+    """The neckline [N], raised where the lower end of its band would lie on the shoulders of a short neck."""
     levels = line + np.arange(0, 0.06, 0.003)[:, None]
     radius = np.stack([_radius(hull, azimuth, level - band) for level in levels])
     slender = radius < radius.min(0) + _FLARE_M
@@ -72,16 +73,37 @@ def _on_neck(hull: Hull, azimuth: np.ndarray, line: np.ndarray, band: float) -> 
 def _body(
     kind: str,
     hull: Hull,
-    skin: "_Skin",
+    skin: "_NeckSkin",
     azimuth: np.ndarray,
     collar: np.ndarray,
     bottom: float,
     random: np.random.Generator,
 ) -> HeadMesh:
-    """Rings from inside the neckline over its band down to the shoulders, and straight down to the cut."""
+    """Loft from inside the neckline over its band down to the shoulders, then straight down to the cut."""
     neck = _radius(hull, azimuth, collar) + _OFF_SKIN_M + (0.012 if kind == "wide neck" else 0)
-    band = _BANDS_M.get(kind, random.uniform(0.010, 0.02))
     thick = 0.006 if kind == "turtleneck" else 0.0025
+    rows = _band(kind, hull, azimuth, collar, neck, thick, random)
+    start_radius, start = rows[-1]
+    start_radius = np.maximum(start_radius, neck + thick) - (0.0025 if kind != "turtleneck" else 0.006)
+    rows += _shoulders(azimuth, start_radius, start, bottom, random)
+    rings = np.stack([_ring(hull, azimuth, radius, level) for radius, level in rows])
+    band_rows = len(rows) - _BODY_ROWS
+    rings[band_rows:] += _folds(rings[band_rows:], azimuth, random)
+    rings[3:] = skin.lifted(rings[3:])
+    return _loft("cloth", rings, closed=True)
+
+
+def _band(
+    kind: str,
+    hull: Hull,
+    azimuth: np.ndarray,
+    collar: np.ndarray,
+    neck: np.ndarray,
+    thick: float,
+    random: np.random.Generator,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(radius, height) [N] of the rings of the neckline, from its inside over the edge down its band."""
+    band = _BANDS_M.get(kind, random.uniform(0.010, 0.02))
     rows = [(neck - 0.0025, collar - 0.012), (neck - 0.002, collar - 0.003), (neck, collar)]
     rows += [(neck + thick, collar - 0.0025)]
     for share in (0.35, 0.7, 1.0):
@@ -90,28 +112,33 @@ def _body(
             np.maximum(level, collar - band) if kind != "turtleneck" else np.minimum(level, collar - 0.003)
         )
         rows.append((_radius(hull, azimuth, level) + _OFF_SKIN_M + thick + 0.002 * share, level))
-    start_radius, start = rows[-1]
-    start_radius = np.maximum(start_radius, neck + thick) - (0.0025 if kind != "turtleneck" else 0.006)
+    return rows
 
+
+def _shoulders(
+    azimuth: np.ndarray,
+    start_radius: np.ndarray,
+    start: np.ndarray,
+    bottom: float,
+    random: np.random.Generator,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(radius, height) [N] of the rings from the band, at `start_radius` and height `start`, to the cut."""
     wide = random.uniform(0.195, 0.225)
     deep = np.where(np.cos(azimuth) > 0, random.uniform(0.10, 0.12), random.uniform(0.105, 0.12))
     outline = (np.abs(np.sin(azimuth) / wide) ** 2.6 + np.abs(np.cos(azimuth) / deep) ** 2.6) ** (-1 / 2.6)
     outline = np.maximum(outline, start_radius + 0.012)
     aside = np.sin(azimuth) ** 2
-    fall = random.uniform(0.24, 0.38)  # of the shoulders, height by width
+    fall = random.uniform(0.24, 0.38)  # slope of the shoulders, height by width
     sloped = fall * (outline - start_radius) * aside
     drop = np.maximum(start - sloped - bottom, 0.02)
-    for share in np.linspace(0, 1, 34)[1:]:
+    rows = []
+    for share in np.linspace(0, 1, _BODY_ROWS + 1)[1:]:
         quarter = share * np.pi / 2
         out = (1 - aside) * share**0.75 + aside * np.sin(quarter)
         down = (1 - aside) * share + aside * (1 - np.cos(quarter)) ** 1.4
         radius = start_radius + (outline - start_radius) * out
         rows.append((radius, start - sloped * out - drop * down))
-    rings = np.stack([_ring(hull, azimuth, radius, level) for radius, level in rows])
-    band_rows = len(rows) - 33
-    rings[band_rows:] += _folds(rings[band_rows:], azimuth, random)
-    rings[3:] = skin.lifted(rings[3:])
-    return _loft("cloth", rings, closed=True)
+    return rows
 
 
 def _radius(hull: Hull, azimuth: np.ndarray, level: np.ndarray) -> np.ndarray:
@@ -120,12 +147,13 @@ def _radius(hull: Hull, azimuth: np.ndarray, level: np.ndarray) -> np.ndarray:
 
 
 def _ring(hull: Hull, azimuth: np.ndarray, radius: np.ndarray, level: np.ndarray) -> np.ndarray:
+    """Points [N, 3] around the hull's axis at azimuths, radii and heights [N]."""
     x, z = radius * np.sin(azimuth), radius * np.cos(azimuth) + hull.middle[2]
     return np.stack([x, np.broadcast_to(level, x.shape), z], -1)
 
 
 def _folds(rings: np.ndarray, azimuth: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Offsets [rows, N, 3] of soft folds, from the neckline outward ever larger."""
+    """Draw offsets [rows, N, 3] of soft folds, which grow from the neckline outward."""
     share = np.linspace(0, 1, len(rings))[:, None]
     wave = np.zeros(rings.shape[:2])
     for _ in range(7):
@@ -138,14 +166,14 @@ def _folds(rings: np.ndarray, azimuth: np.ndarray, random: np.random.Generator) 
 
 
 def _ring_normals(rings: np.ndarray) -> np.ndarray:
+    """Unit normals [rows, N, 3] of closed rings."""
     around = np.roll(rings, -1, 1) - np.roll(rings, 1, 1)
     down = np.gradient(rings, axis=0)
-    normal = np.cross(down, around)
-    return unit(normal)
+    return unit(np.cross(down, around))
 
 
-class _Skin:
-    """The skin of a head below its chin, which cloth must not come nearer to than `_OFF_SKIN_M`."""
+class _NeckSkin:
+    """The skin of a head below its chin, from which cloth keeps the distance `_OFF_SKIN_M`."""
 
     def __init__(self, head: HeadMesh) -> None:
         low = (head.part == PARTS.index("skin")) & (head.vertices[:, 1] < _BELOW_M)
@@ -153,25 +181,25 @@ class _Skin:
         self._tree = cKDTree(self.points)
 
     def lifted(self, rings: np.ndarray) -> np.ndarray:
-        """Rings [R, N, 3], moved along the normals of the skin that they come too near to."""
+        """Rings [R, N, 3] moved along the normals of the skin where they come too near to it."""
         for _ in range(4):
             distance, near = self._tree.query(rings)
             facing = (self.normals[near] * _ring_normals(rings)).sum(-1) > 0
             off = ((rings - self.points[near]) * self.normals[near]).sum(-1)
-            aside = np.sqrt(np.maximum(distance**2 - off**2, 0))  # far where the skin has ended
+            aside = np.sqrt(np.maximum(distance**2 - off**2, 0))  # large where the skin mesh ends
             short = np.where(facing & (aside < _ASIDE_M), np.maximum(_OFF_SKIN_M - off, 0), 0)
             rings = rings + short[..., None] * self.normals[near]
         return rings
 
 
 def _lapels(
-    hull: Hull, skin: _Skin, azimuth: np.ndarray, collar: np.ndarray, random: np.random.Generator
+    hull: Hull, skin: _NeckSkin, azimuth: np.ndarray, collar: np.ndarray, random: np.random.Generator
 ) -> HeadMesh:
-    """A shirt's collar: a stand about the neck, folded over to two points before the throat."""
+    """Draw a shirt's collar: a stand around the neck, folded over to two points in front of the throat."""
     gap = random.uniform(0.10, 0.3)
     around = np.linspace(gap, 2 * np.pi - gap, 120)
     base = np.interp(around, azimuth, collar, period=2 * np.pi)
-    off = np.minimum(around, 2 * np.pi - around) - gap  # from the collar's ends
+    off = np.minimum(around, 2 * np.pi - around) - gap  # azimuth from the ends of the collar
     stand = random.uniform(0.016, 0.024) * np.clip(0.55 + off, 0, 1)
     fall = random.uniform(0.034, 0.042) + random.uniform(0.012, 0.03) * np.exp(-((off / 0.35) ** 2))
     neck = _radius(hull, around, base) + _OFF_SKIN_M + 0.002
@@ -189,7 +217,7 @@ def _lapels(
 
 
 def _loft(part: str, rings: np.ndarray, closed: bool) -> HeadMesh:
-    """A surface through rings [R, N, 3] that go down and, seen from outside, to the right."""
+    """Mesh a surface through rings [R, N, 3] that go down and, seen from outside, to the right."""
     count, around = rings.shape[:2]
     ids = np.arange(count * around).reshape(count, around)
     if closed:

@@ -1,7 +1,7 @@
-"""Glasses on a synthetic head, measured on the head itself.
+"""Glasses that fit a synthetic head.
 
-Rims stand before the eyes, as near as nose, brows and cheeks let them, with a bridge over the nose, and
-temples along the head to the ears.
+The rims stand in front of the eyes, as near as nose, brows and cheeks allow. A bridge leads over the nose,
+and the temples lead along the head to the ears.
 """
 
 import numpy as np
@@ -11,36 +11,36 @@ from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless, unit
 
 GLASSES = ("round", "rectangular", "square", "aviator", "half-rim")
 
-_EYES = ((36, 39), (42, 45))  # corners
-_NOSE_ROOT, _NOSE_BRIDGE = 27, 28
-_GAP_M = 0.0012  # between a frame and the skin
-_NEAR_M = 0.003  # how far around a point skin is looked for
+_EYES = ((36, 39), (42, 45))  # landmarks of the corners
+_GAP_M = 0.0012  # between frame and skin
+_NEAR_M = 0.003  # radius around a point in which skin counts
 _TUBE = 10  # vertices around a tube
 
 
 def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Generator) -> HeadMesh:
-    """Glasses without lenses, as part "frame", for a bare head with these landmarks [68, 3]."""
+    """Draw glasses without lenses, as part "frame", for a bare head with these landmarks [68, 3]."""
     kind = str(random.choice(GLASSES))
     metal = kind == "aviator" or random.random() < 0.4
-    depth = random.uniform(0.0008, 0.0012) if metal else random.uniform(0.0013, 0.0019)  # half of it
+    # Half the depth and half the width of the frame.
+    depth = random.uniform(0.0008, 0.0012) if metal else random.uniform(0.0013, 0.0019)
     width = random.uniform(0.0007, 0.0011) if metal else random.uniform(0.0012, 0.0026)
-    face = _Face(head)
+    surface = _HeadSurface(head)
     rims = _rims(kind, landmarks_m, random)
-    rims = _settled(rims, face, landmarks_m, depth + _GAP_M)
+    rims = _settled(rims, surface, landmarks_m, depth + _GAP_M)
     parts = []
     for rim in rims:
-        shown = rim if kind != "half-rim" else _upper(rim)
-        parts.append(_tube(shown, np.array([0, 0, 1.0]), width, depth, closed=kind != "half-rim"))
-    parts.append(_bridge(rims, face, width, depth, 0.15))
+        visible = rim if kind != "half-rim" else _upper(rim)
+        parts.append(_tube(visible, np.array([0, 0, 1.0]), width, depth, closed=kind != "half-rim"))
+    parts.append(_bridge(rims, surface, width, depth, 0.15))
     if kind == "aviator":
-        parts.append(_bridge(rims, face, width, depth, 0.75))
+        parts.append(_bridge(rims, surface, width, depth, 0.75))
     high = width if metal else random.uniform(0.0018, 0.004)
-    parts += [_temple(rim, face, depth, high) for rim in rims]
+    parts += [_temple(rim, surface, depth, high) for rim in rims]
     return joined(*parts)
 
 
-class _Face:
-    """Where skin and eyes of a head lie, asked along one axis."""
+class _HeadSurface:
+    """The outermost skin and eyes of a head along the z or the x axis."""
 
     def __init__(self, head: HeadMesh) -> None:
         outer = np.isin(head.part, [PARTS.index("skin"), PARTS.index("eye")])
@@ -53,15 +53,15 @@ class _Face:
             self._sides[side] = cKDTree(flank[:, 1:]), flank[:, 0] * side
 
     def front(self, points: np.ndarray) -> np.ndarray:
-        """z [N] of the foremost skin at (x, y) of points [N, 3]."""
+        """z [N] of the frontmost skin at (x, y) of points [N, 3]."""
         return _greatest(self._front, self._front_z, points[:, :2])
 
     def flank(self, points: np.ndarray, side: int) -> np.ndarray:
-        """|x| [N] of the outermost skin at (y, z) of points [N, 3], on the side of x's sign."""
+        """|x| [N] of the outermost skin at (y, z) of points [N, 3]; side: sign of x."""
         return _greatest(*self._sides[side], points[:, 1:])
 
     def ear_top(self, side: int) -> tuple[float, float]:
-        """(y, z) just above the ear: the first height from the temple down where the head juts out."""
+        """(y, z) just above the ear: the first height, from the temple down, at which the head juts out."""
         heights = np.arange(0.062, 0.015, -0.002)
         z = np.arange(-0.015, 0.026, 0.003)
         points = np.stack(np.broadcast_arrays(0, heights[:, None], z), -1).reshape(-1, 3)
@@ -74,7 +74,7 @@ class _Face:
 
 
 def _greatest(tree: cKDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The greatest of `values` within `_NEAR_M` of each place [N, 2], or else the nearest one's."""
+    """The greatest of `values` within `_NEAR_M` of each place [N, 2]; if there is none, the nearest one."""
     _, nearest = tree.query(at)
     return np.array(
         [
@@ -85,7 +85,7 @@ def _greatest(tree: cKDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def _rims(kind: str, landmarks_m: np.ndarray, random: np.random.Generator) -> list[np.ndarray]:
-    """Outlines [64, 3] of both lenses, the picture's left one first; from the inner end over the top."""
+    """Draw the outlines [64, 3] of both lenses, left in the image first, from the inner end over the top."""
     size = random.uniform(0.92, 1.08)
     half_width, half_height, power = {
         "round": (0.0225, 0.0215, 2.0),
@@ -94,7 +94,7 @@ def _rims(kind: str, landmarks_m: np.ndarray, random: np.random.Generator) -> li
         "aviator": (0.0275, 0.0230, 2.5),
         "half-rim": (0.0260, 0.0165, 3.2),
     }[kind]
-    span = abs(landmarks_m[45, 0] - landmarks_m[36, 0]) / 0.089  # of this face to the mean one
+    span = abs(landmarks_m[45, 0] - landmarks_m[36, 0]) / 0.089  # relative to the mean face
     half_width, half_height = half_width * size * span, half_height * size * random.uniform(0.95, 1.1)
     centres = [landmarks_m[list(pair)].mean(0) for pair in _EYES]
     apart = np.abs([centre[0] for centre in centres]).mean()
@@ -102,7 +102,7 @@ def _rims(kind: str, landmarks_m: np.ndarray, random: np.random.Generator) -> li
     height = np.mean([centre[1] for centre in centres]) - random.uniform(0.001, 0.004)
     turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     cos, sin = np.cos(turn), np.sin(turn)
-    x = -np.sign(cos) * np.abs(cos) ** (2 / power)  # from the nose, which lies at -x of the right rim
+    x = -np.sign(cos) * np.abs(cos) ** (2 / power)  # starts at the nose, at -x of the right rim
     y = np.sign(sin) * np.abs(sin) ** (2 / power)
     if kind == "aviator":  # a drop that hangs outward
         x = x * (1 - 0.12 * (y < 0) * np.abs(y)) + 0.10 * np.minimum(y, 0) * -1
@@ -115,23 +115,25 @@ def _rims(kind: str, landmarks_m: np.ndarray, random: np.random.Generator) -> li
 
 
 def _settled(
-    rims: list[np.ndarray], face: _Face, landmarks_m: np.ndarray, clear_m: float
+    rims: list[np.ndarray], surface: _HeadSurface, landmarks_m: np.ndarray, clear_m: float
 ) -> list[np.ndarray]:
-    """Rims brought before the face: as near as skin, lids and the nose's bridge let them."""
-    need = max(float((face.front(rim) + clear_m - rim[:, 2]).max()) for rim in rims)
+    """Rims moved in front of the face, as near as skin, lashes and the bridge of the nose allow."""
+    need = max(float((surface.front(rim) + clear_m - rim[:, 2]).max()) for rim in rims)
     eyes = landmarks_m[np.arange(36, 48), 2].max() + 0.009  # room for the lashes
     need = max(need, eyes - float(np.mean([rim[:, 2].mean() for rim in rims])))
     return [rim + np.array([0, 0, need]) for rim in rims]
 
 
 def _upper(rim: np.ndarray) -> np.ndarray:
-    """The half of a rim that a half-rim has: its upper part, and a little down both sides."""
+    """The part of a rim that half-rim glasses have: its upper half, and a little down both sides."""
     order = np.roll(rim, 4, 0)
     return order[: len(rim) // 2 + 8]
 
 
-def _bridge(rims: list[np.ndarray], face: _Face, width: float, depth: float, level: float) -> HeadMesh:
-    """From rim to rim over the nose, `level` (0..1) of the way from the rim's middle to its top."""
+def _bridge(
+    rims: list[np.ndarray], surface: _HeadSurface, width: float, depth: float, level: float
+) -> HeadMesh:
+    """A bar from rim to rim over the nose, at `level` (0..1) from the middle of the rims to their top."""
     ends = []
     for rim in rims:
         inner = rim[np.argsort(np.abs(rim[:, 0]))[: len(rim) // 3]]
@@ -142,19 +144,19 @@ def _bridge(rims: list[np.ndarray], face: _Face, width: float, depth: float, lev
     arch = 4 * share[:, 0] * (1 - share[:, 0])
     path[:, 1] += 0.003 * arch
     path[:, 2] += 0.002 * arch
-    path[:, 2] = np.maximum(path[:, 2], face.front(path) + depth + _GAP_M)
+    path[:, 2] = np.maximum(path[:, 2], surface.front(path) + depth + _GAP_M)
     path[1:-1, 2] = (path[:-2, 2] + 2 * path[1:-1, 2] + path[2:, 2]) / 4
-    path[:, 2] += np.maximum(face.front(path) + depth + 0.5 * _GAP_M - path[:, 2], 0).max() * arch**0.25
+    path[:, 2] += np.maximum(surface.front(path) + depth + 0.5 * _GAP_M - path[:, 2], 0).max() * arch**0.25
     return _tube(path, np.array([0, 0, 1.0]), width, depth, closed=False)
 
 
-def _temple(rim: np.ndarray, face: _Face, thick: float, high: float) -> HeadMesh:
-    """From a rim's outer end along the head to the ear, over it and a little on."""
+def _temple(rim: np.ndarray, surface: _HeadSurface, thick: float, high: float) -> HeadMesh:
+    """A bar from the outer end of a rim along the head to the ear, and a little behind it."""
     side = int(np.sign(rim[:, 0].mean()))
     outer = rim[np.argsort(-np.abs(rim[:, 0]))[:20]]
     level = rim[:, 1].mean() + 0.35 * np.ptp(rim[:, 1]) / 2
     hinge = outer[np.argmin(np.abs(outer[:, 1] - level))]
-    ear_y, ear_z = face.ear_top(side)
+    ear_y, ear_z = surface.ear_top(side)
     top = np.array([hinge[0], ear_y + high, ear_z])
     end = np.array([hinge[0], ear_y + high - 0.004, ear_z - 0.022])
     corner = hinge + np.array([side * 0.004, 0, -0.006])
@@ -162,7 +164,7 @@ def _temple(rim: np.ndarray, face: _Face, thick: float, high: float) -> HeadMesh
     path = np.concatenate(
         [hinge[None], corner[None], corner + (top - corner) * far, top + (end - top) * far[6::7]]
     )
-    out = np.maximum(face.flank(path, side) + thick + _GAP_M, 0)
+    out = np.maximum(surface.flank(path, side) + thick + _GAP_M, 0)
     out[:2] = np.maximum(out[:2], np.abs(path[:2, 0]))
     reach = np.abs(corner[0])
     behind = np.clip((corner[2] - path[:, 2]) / (corner[2] - ear_z), 0, 1)
@@ -174,12 +176,11 @@ def _temple(rim: np.ndarray, face: _Face, thick: float, high: float) -> HeadMesh
 
 
 def _tube(path: np.ndarray, up: np.ndarray, across_m: float, up_m: float, closed: bool) -> HeadMesh:
-    """A rounded bar along `path` [N, 3], half as thick as `up_m` along `up` and as `across_m` across it."""
+    """Mesh a rounded bar along `path` [N, 3]; half thickness: `up_m` along `up`, `across_m` across it."""
     count = len(path)
     along = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
     along = unit(along)
-    aside = np.cross(up, along)
-    aside = unit(aside)
+    aside = unit(np.cross(up, along))
     over = np.cross(along, aside)
     turn = np.linspace(0, 2 * np.pi, _TUBE, endpoint=False)
     cos, sin = np.cos(turn), np.sin(turn)

@@ -1,37 +1,39 @@
-"""Hair: thousands of tapered ribbons, a wisp each, rooted on the scalp and combed over the head.
+"""Hair: thousands of tapered ribbons, one per wisp, rooted on the scalp and combed over the head.
 
-A wisp grows from its root in equal steps. Each step follows the style's combing, and gravity the more the
-farther from the root, slides along the head's hull where it touches, and keeps to the wisp's own layer above
-it; then the wisps of a clump draw together toward their tips, and curl. A wisp that comes before the face is
-grown anew, shorter. Heights and azimuths are those of the canonical chart's frame (`face.topology`).
+A wisp grows from its root in steps. Each step follows the combing direction of the style and, increasingly
+with the distance from the root, gravity; it slides along the hull of the head where it touches it and stays
+in the layer of the wisp above it. Then the wisps of a clump draw together toward their tips, and curl. A wisp
+that hangs in front of the face is grown a second time, shorter. Heights and azimuths are in the head frame
+(`face.topology`).
 """
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from facerf_cli.synth.head.cranium import Hull, hull_of
-from facerf_cli.synth.head.hair_styles import HairStyle, draw_style
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, scalp_margin_m, smoothstep, unit
+from facerf_cli.synth.head.hair_styles import HairStyle, draw_style, scalp_margin_m
+from facerf_cli.synth.head.hull import Hull, hull_of
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, smoothstep, unit
 
-MAX_VERTICES = 250_000
+MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
 
-_FACE_DEG = 50.0  # within this azimuth and below the fringe there is face
-_CHIN_M = -0.13
-_RAGGED_M = 0.002  # unrest of the hairline
-_ROWS_LEFT = 1e-4  # shortest step of a wisp, metres
+_FACE_DEG = 50.0  # largest azimuth at which hair below the fringe covers the face
+_CHIN_M = -0.13  # hair below this height no longer covers the face
+_RAGGED_M = 0.002  # standard deviation of the hairline's height
+_SHORTEST_STEP_M = 1e-4  # of a wisp
 
 
 def draw_hair(head: HeadMesh, random: np.random.Generator) -> tuple[HeadMesh | None, HairStyle]:
-    """Draw a style and grow it on a head, which may wear clothes: long hair falls over them."""
+    """Draw a style and grow it on a head. If the head wears clothes, long hair falls over them."""
     style = draw_style(random)
     hair = grow_hair(head, style, random)
     return hair if len(hair.vertices) else None, style
 
 
 def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> HeadMesh:
-    """The hair alone, as part "hair"; without a vertex if there is none.
+    """Grow the hair alone, as part "hair"; without vertices if the style has none.
 
-    normals: a soft volume's, not the ribbons'; uv: the wisp's random number, and root (0) to tip (1).
+    Normals are those of a soft volume and not of the ribbons. uv: a random number of the wisp, and the
+    position from root (0) to tip (1).
     """
     roots, root_normals, margin = _roots(head, style, random)
     if not len(roots):
@@ -41,10 +43,10 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     length = _lengths(roots, margin, style, random)
     wisps = _Wisps(roots, root_normals, style, hull, random)
     paths = wisps.grow(length)
-    before = _before_face(paths, style)
-    first = np.where(before.any(1), before.argmax(1), style.segments + 1)
+    covers = _covers_face(paths, style)
+    first = np.where(covers.any(1), covers.argmax(1), style.segments + 1)
     last = np.maximum(first - 0.7, 0.3) / style.segments
-    length = length * np.where(before.any(1), last**style.crowding, 1)
+    length = length * np.where(covers.any(1), last**style.crowding, 1)
     paths = wisps.grow(length)
     leader = _leaders(roots, style, random)
     paths = _clumped(paths, leader, style, random)
@@ -52,14 +54,14 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     paths = _curled(paths, normals, length, leader, style, random)
     paths = hull.lifted(paths, np.minimum(0.0008, 0.02 * np.linspace(0, 1, paths.shape[1])))
     paths[:, 0] = roots - 0.001 * root_normals
-    keep = ~_before_face(paths, style).any(1)
+    keep = ~_covers_face(paths, style).any(1)
     return _ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
 
 
 def _roots(
     head: HeadMesh, style: HairStyle, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Roots [W, 3], the skin's normals there [W, 3], and how far above the hairline they lie [W]."""
+    """Draw roots [W, 3], the normals of the skin there [W, 3], and their height above the hairline [W]."""
     triangles = head.triangles[head.part[head.triangles[:, 0]] == PARTS.index("skin")]
     corners = head.vertices[triangles].astype(float)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
@@ -68,19 +70,18 @@ def _roots(
     ragged = margin + random.normal(0, _RAGGED_M, len(margin))
     chance = area * np.clip(ragged / 0.007 + 0.25, 0, 1) ** 1.5
     chance = chance * (1 - style.thinning * _bare_top(centre))
-    if style.comb == "parted":  # all roots show there, so it takes more of them
+    if style.comb == "parted":  # a parting shows its roots, so it needs more of them
         chance = chance * (1 + 3 * np.exp(-(((centre[:, 0] - style.parting_mm / 1000) / 0.008) ** 2)))
     if not style.wisps or not chance.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
     chosen = random.choice(len(triangles), style.wisps, p=chance / chance.sum())
     weights = random.dirichlet([1, 1, 1], style.wisps)[..., None]
-    normals = (head.normals[triangles[chosen]] * weights).sum(1)
-    normals = unit(normals)
+    normals = unit((head.normals[triangles[chosen]] * weights).sum(1))
     return (corners[chosen] * weights).sum(1), normals, margin[chosen]
 
 
 def _bare_top(points: np.ndarray) -> np.ndarray:
-    """Where hair thins with age [N], 0..1: the crown and what lies before it."""
+    """Strength [N] in 0..1 of the thinning of hair: high at the crown and in front of it."""
     crown = np.array([0, 0.145, -0.01])
     distance = np.linalg.norm((points - crown) * [1, 1, 0.8], axis=-1)
     return 0.97 * np.clip((0.075 - distance) / 0.025, 0, 1)
@@ -89,6 +90,7 @@ def _bare_top(points: np.ndarray) -> np.ndarray:
 def _lengths(
     roots: np.ndarray, margin: np.ndarray, style: HairStyle, random: np.random.Generator
 ) -> np.ndarray:
+    """Draw the lengths [W] of wisps in metres."""
     top = smoothstep((roots[:, 1] - 0.055) / 0.05)
     length = style.side_mm + (style.top_mm - style.side_mm) * top
     edge = style.edge + (1 - style.edge) * smoothstep(margin / 0.02)
@@ -96,12 +98,12 @@ def _lengths(
 
 
 def _shares(style: HairStyle) -> np.ndarray:
-    """How far along the wisp each of its rows lies [segments + 1]."""
+    """Position in 0..1 along the wisp of each of its rows [segments + 1]."""
     return np.linspace(0, 1, style.segments + 1) ** style.crowding
 
 
 class _Wisps:
-    """What stays the same while the wisps are grown a second time."""
+    """Wisps with the random numbers that stay the same when they grow a second time."""
 
     def __init__(
         self,
@@ -118,31 +120,30 @@ class _Wisps:
         self.lift = style.lift * random.uniform(0.6, 1.3, count)
 
     def grow(self, length_m: np.ndarray) -> np.ndarray:
-        """Paths [W, segments + 1, 3] of wisps of these lengths [W]."""
+        """Grow paths [W, segments + 1, 3] of wisps of these lengths [W]."""
         style, steps = self.style, self.style.segments
         points, rows = self.roots, [self.roots]
         shares = _shares(style)
         for index in range(steps):
             share = shares[index]
-            step = np.maximum(length_m * (shares[index + 1] - share), _ROWS_LEFT)[:, None]
+            step = np.maximum(length_m * (shares[index + 1] - share), _SHORTEST_STEP_M)[:, None]
             normal = self.normals if index == 0 else self.hull.normals(points)
-            held = 0.1 + 0.9 * smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair just hangs
+            held = 0.1 + 0.9 * smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair hangs down
             held = np.where(length_m > 0.08, held, 1)
-            way = held[:, None] * (_combed(points, normal, self.roots, style) + self.stray)
+            direction = held[:, None] * (_combed(points, normal, self.roots, style) + self.stray)
             fallen = share * length_m / 0.1 * style.gravity
-            way[:, 1] -= np.minimum(fallen, 4)
-            way = way + normal * (self.lift * (1 - share) ** 3)[:, None]
-            inward = (way * normal).sum(-1)
+            direction[:, 1] -= np.minimum(fallen, 4)
+            direction = direction + normal * (self.lift * (1 - share) ** 3)[:, None]
+            inward = (direction * normal).sum(-1)
             touches = self.hull.height(points) < self.layer_m + 0.004
-            way = way - (np.minimum(inward, 0) * touches)[:, None] * normal
-            way = unit(way)
-            points = points + step * way
+            direction = unit(direction - (np.minimum(inward, 0) * touches)[:, None] * normal)
+            points = points + step * direction
             points = self._in_layer(points, shares[index + 1], length_m)
             rows.append(points)
         return np.stack(rows, 1)
 
     def _in_layer(self, points: np.ndarray, share: float, length_m: np.ndarray) -> np.ndarray:
-        """Kept above the skin, and on the skull down to the wisp's own layer."""
+        """Points [W, 3] kept above the skin, and on the skull inside the layer of the wisp."""
         rise = np.minimum(self.layer_m, 0.6 * share * length_m)
         least = 0.6 * rise if self.style.comb != "out" else np.minimum(rise, 0.002)
         points = self.hull.lifted(points, least)
@@ -152,7 +153,7 @@ class _Wisps:
 
 
 def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: HairStyle) -> np.ndarray:
-    """The way [W, 3] hair is combed at these points, along the skull."""
+    """Combing direction [W, 3] at these points, along the skull."""
     x, y, z = points.T
     side = np.sign(roots[:, 0])
     front = smoothstep((roots[:, 2] - 0.0) / 0.05)
@@ -161,32 +162,31 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
     if style.comb == "whorl":
         whorl = points - np.array([0.012, 0.14, -0.045])
         spin = np.stack([-whorl[:, 2], np.zeros(len(x)), whorl[:, 0]], -1)
-        way = whorl + 0.35 * spin
-        way = unit(way)
-        way[:, 2] -= 0.5 * (y < 0.08) * (z > 0)  # temples: downward, not before the face
+        direction = unit(whorl + 0.35 * spin)
+        direction[:, 2] -= 0.5 * (y < 0.08) * (z > 0)  # temples: downward, not in front of the face
     elif style.comb == "back":
-        way = np.stack([0.12 * side, -0.2 - 0.3 * (1 - front), -1 + 0.3 * front], -1)
+        direction = np.stack([0.12 * side, -0.2 - 0.3 * (1 - front), -1 + 0.3 * front], -1)
     elif style.comb == "fringe":
         ahead = smoothstep((roots[:, 2] - 0.02) / 0.03) * (np.abs(roots[:, 0]) < 0.055)
         away = np.clip(x / 0.03, -1, 1)
         aside = 1 - ahead
-        way = np.stack([0.25 * ahead + away * aside, -0.6 + 0 * x, ahead - 0.15 * aside], -1)
+        direction = np.stack([0.25 * ahead + away * aside, -0.6 + 0 * x, ahead - 0.15 * aside], -1)
     else:
         parting = style.parting_mm / 1000
         away = np.tanh((roots[:, 0] - parting) / 0.003)
         front_sweep = smoothstep((roots[:, 2] - 0.05) / 0.03)
-        way = np.stack([1.0 * away, -0.45 + 0 * x, -0.35 - 0.25 * front_sweep], -1)
-    way[:, 2] -= style.tuck * 1.2 * ((y < 0.075) & (z > -0.02))
+        direction = np.stack([1.0 * away, -0.45 + 0 * x, -0.35 - 0.25 * front_sweep], -1)
+    direction[:, 2] -= style.tuck * 1.2 * ((y < 0.075) & (z > -0.02))
     around = np.abs(np.degrees(np.arctan2(x, z)))
     if style.comb != "fringe":
         faced = np.clip((62 - around) / 10, 0, 1) * np.clip((0.09 - y) / 0.02, 0, 1)
         outward = np.stack([np.sign(x) * z, 0 * x, -np.abs(x)], -1) / np.hypot(x, z)[:, None]
-        way = way + 1.5 * faced[:, None] * outward
-    return way - (way * normals).sum(-1, keepdims=True) * normals
+        direction = direction + 1.5 * faced[:, None] * outward
+    return direction - (direction * normals).sum(-1, keepdims=True) * normals
 
 
-def _before_face(paths: np.ndarray, style: HairStyle) -> np.ndarray:
-    """[W, rows] bool: before the face, where only a fringe may hang, and only so low."""
+def _covers_face(paths: np.ndarray, style: HairStyle) -> np.ndarray:
+    """[W, rows] bool: in front of the face and below the height to which a fringe may hang."""
     x, y, z = np.moveaxis(paths, -1, 0)
     azimuth = np.abs(np.degrees(np.arctan2(x, z)))
     low = style.fringe_mm / 1000 + 0.10 * np.abs(x) * (style.comb == "parted")
@@ -194,7 +194,7 @@ def _before_face(paths: np.ndarray, style: HairStyle) -> np.ndarray:
 
 
 def _leaders(roots: np.ndarray, style: HairStyle, random: np.random.Generator) -> np.ndarray:
-    """The wisp [W] that leads each wisp's clump: the nearest one on the scalp."""
+    """Index [W] of the wisp that leads each wisp's clump: the nearest leader on the scalp."""
     leaders = random.choice(len(roots), max(1, len(roots) // style.clump_wisps), replace=False)
     return leaders[cKDTree(roots[leaders]).query(roots)[1]]
 
@@ -202,12 +202,12 @@ def _leaders(roots: np.ndarray, style: HairStyle, random: np.random.Generator) -
 def _clumped(
     paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: np.random.Generator
 ) -> np.ndarray:
-    """Wisps drawn toward their clump's leader, the more the nearer the tip."""
+    """Paths drawn toward the leader of their clump, increasingly toward the tip."""
     share = _shares(style)
     pull = style.clump * random.uniform(0.3, 1, len(paths))[:, None] * share**0.8
     apart = paths[leader] - paths
     reach = np.linalg.norm(apart, axis=-1)
-    pull = pull * np.exp(-((reach / 0.03) ** 2))  # a leader that went elsewhere is left alone
+    pull = pull * np.exp(-((reach / 0.03) ** 2))  # no pull toward a leader that grew elsewhere
     return paths + pull[..., None] * apart
 
 
@@ -219,7 +219,7 @@ def _curled(
     style: HairStyle,
     random: np.random.Generator,
 ) -> np.ndarray:
-    """Each path wound into a helix about itself, with some of its own unrest."""
+    """Paths wound into helices, with some random frizz."""
     along = _tangents(paths)
     across = np.cross(along, normals)
     share = _shares(style)
@@ -229,13 +229,13 @@ def _curled(
     phase = turns * 2 * np.pi + begin + random.uniform(-0.6, 0.6, (len(paths), 1))
     radius = style.curl_mm / 1000 * smoothstep(share * 4)
     wound = radius[:, None] * (np.cos(phase)[..., None] * across + 0.7 * np.sin(phase)[..., None] * normals)
-    unrest = np.cumsum(random.normal(0, 1, paths.shape), 1) * share[:, None]
-    return paths + wound + style.frizz_mm / 1000 / np.sqrt(paths.shape[1]) * unrest
+    frizz = np.cumsum(random.normal(0, 1, paths.shape), 1) * share[:, None]
+    return paths + wound + style.frizz_mm / 1000 / np.sqrt(paths.shape[1]) * frizz
 
 
 def _tangents(paths: np.ndarray) -> np.ndarray:
-    along = np.gradient(paths, axis=1)
-    return unit(along)
+    """Unit tangents [W, R, 3] of paths."""
+    return unit(np.gradient(paths, axis=1))
 
 
 def _ribbons(
@@ -245,37 +245,39 @@ def _ribbons(
     style: HairStyle,
     random: np.random.Generator,
 ) -> HeadMesh:
-    """Paths [W, R, 3] as tapered ribbons, two vertices a row and one at the tip, facing outward."""
+    """Mesh paths [W, R, 3] as tapered ribbons that face outward: two vertices per row, one at the tip."""
     wisps, rows = paths.shape[:2]
     wisps = min(wisps, MAX_VERTICES // (2 * rows - 1))
     paths, normals, root_normals = paths[:wisps], normals[:wisps], root_normals[:wisps]
     along = _tangents(paths)
-    across = np.cross(along, normals)
-    across = unit(across)
+    across = unit(np.cross(along, normals))
     roll = random.uniform(-1.0, 1.0, (wisps, 1, 1))
     across = np.cos(roll) * across + np.sin(roll) * np.cross(along, across)
     share = _shares(style)
     taper = np.minimum(1, 0.6 + 3 * share) * (1 - share**2.5 * (0.4 if style.comb == "out" else 0.8))
     half = 0.5 * style.width_mm / 1000 * random.uniform(0.6, 1.3, (wisps, 1)) * taper
     left, right = paths - half[..., None] * across, paths + half[..., None] * across
-    soft = 0.65 * normals + 0.35 * root_normals[:, None]
-    soft = unit(soft)
+    soft = unit(0.65 * normals + 0.35 * root_normals[:, None])
     uv = np.stack(np.broadcast_arrays(random.uniform(0, 1, (wisps, 1)), share), -1)
 
-    def woven(a: np.ndarray, b: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    def interleaved(a: np.ndarray, b: np.ndarray, tip: np.ndarray) -> np.ndarray:
         pairs = np.stack([a[:, :-1], b[:, :-1]], 2).reshape(wisps, 2 * (rows - 1), a.shape[-1])
         return np.concatenate([pairs, tip[:, -1:]], 1).reshape(-1, a.shape[-1]).astype(np.float32)
 
+    vertices = interleaved(left, right, paths)
+    return HeadMesh(
+        vertices=vertices,
+        normals=interleaved(soft, soft, soft),
+        triangles=_ribbon_triangles(wisps, rows),
+        part=np.full(len(vertices), PARTS.index("hair"), np.uint8),
+        uv=interleaved(uv, uv, uv),
+        tangents=interleaved(along, along, along),
+    )
+
+
+def _ribbon_triangles(wisps: int, rows: int) -> np.ndarray:
+    """Triangles [F, 3] of ribbons with two vertices per row and one at the tip."""
     first = np.arange(rows - 2)[:, None] * 2
     quads = np.concatenate([first + np.array([0, 1, 2]), first + np.array([1, 3, 2])])
     strip = np.concatenate([quads, [[2 * rows - 4, 2 * rows - 3, 2 * rows - 2]]])
-    triangles = (strip + np.arange(wisps)[:, None, None] * (2 * rows - 1)).reshape(-1, 3).astype(np.int64)
-    vertices = woven(left, right, paths)
-    return HeadMesh(
-        vertices=vertices,
-        normals=woven(soft, soft, soft),
-        triangles=triangles,
-        part=np.full(len(vertices), PARTS.index("hair"), np.uint8),
-        uv=woven(uv, uv, uv),
-        tangents=woven(along, along, along),
-    )
+    return (strip + np.arange(wisps)[:, None, None] * (2 * rows - 1)).reshape(-1, 3).astype(np.int64)

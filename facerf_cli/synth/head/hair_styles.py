@@ -1,15 +1,18 @@
-"""How hair is cut and combed: named styles, drawn at random."""
+"""Hair styles: how hair is cut and combed, drawn at random, and the hairline above which it grows."""
 
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-STYLES = ("bald", "buzz", "short", "parted", "swept", "fringe", "bob", "long", "wavy", "curly", "receding")
-_SHARES = (0.06, 0.10, 0.14, 0.13, 0.08, 0.10, 0.10, 0.11, 0.08, 0.06, 0.04)
+from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M
 
-# What makes a style: a value, (low, high) to draw from, or a [choice]; curls: side_mm is a share of top_mm.
-_MADE_OF: dict[str, dict[str, Any]] = {
+STYLES = ("bald", "buzz", "short", "parted", "swept", "fringe", "bob", "long", "wavy", "curly", "receding")
+_FREQUENCIES = (0.06, 0.10, 0.14, 0.13, 0.08, 0.10, 0.10, 0.11, 0.08, 0.06, 0.04)  # of `STYLES`
+
+# Fields of each style: a value, a range (low, high) to draw from, or a [list] to choose from. The side_mm of
+# "curly" is a fraction of its top_mm.
+_STYLE_FIELDS: dict[str, dict[str, Any]] = {
     "bald": {"wisps": 0},
     "buzz": {
         "wisps": 26_000,
@@ -147,49 +150,57 @@ _MADE_OF: dict[str, dict[str, Any]] = {
         "frizz_mm": 2.5,
     },
 }
+# The hairline: height in metres at an azimuth in degrees from the nose, the same on both sides of the head.
+# `forehead_mm` and `recession_mm` of a style are added to the first heights; the ear lies between 75 and
+# 100 degrees.
+_LINE_DEG = (0, 20, 36, 46, 54, 60, 64, 67, 72, 75, 85, 95, 103, 112, 130, 150, 180)
+_LINE_M = (0, 0.001, 0.004, -0.003, -0.022, -0.040, -0.058, -0.076, -0.078)
+_LINE_EAR_M = (0.046, 0.048, 0.043, 0.022, -0.018, -0.052, -0.066, -0.068)
+_RECEDES = (0.0, 0.35, 1.0, 1.0, 0.6, 0.3, 0.1, 0, 0)  # fraction of `recession_mm` at the first azimuths
+_MEAN_FOREHEAD_M = 0.096
 
 
 @dataclass(frozen=True)
 class HairStyle:
-    """How one person's hair is cut and combed; every field is a number or a name, for the record."""
+    """Cut and comb of one person's hair; every field is a number or a name, so that it can be recorded."""
 
     name: str = "short"
     comb: str = "whorl"  # whorl, parted, back, fringe or out
     wisps: int = 14_000
-    segments: int = 7
-    top_mm: float = 40.0
+    segments: int = 7  # of a wisp
+    top_mm: float = 40.0  # length on top of the head
     side_mm: float = 15.0  # length at temples and nape
-    edge: float = 0.5  # share of the length right at the hairline
-    width_mm: float = 1.0
+    edge: float = 0.5  # fraction of the length at the hairline
+    width_mm: float = 1.0  # of a wisp
     layer_mm: float = 10.0  # thickness of the hair over the skull
-    crowding: float = 1.0  # above 1, rows lie closer near the root
-    lift: float = 0.6  # how much it stands off at the root
+    crowding: float = 1.0  # above 1, the rows of a wisp lie closer near the root
+    lift: float = 0.6  # strength by which hair stands off at the root
     gravity: float = 0.6
-    stray: float = 0.16  # how far single wisps are from the common way
-    clump: float = 0.5
-    clump_wisps: int = 14
+    stray: float = 0.16  # deviation of single wisps from the combing direction
+    clump: float = 0.5  # strength by which wisps of a clump draw together
+    clump_wisps: int = 14  # per clump
     curl_mm: float = 0.5  # radius of the curl
-    wave_mm: float = 40.0  # its length along the wisp
+    wave_mm: float = 40.0  # length of one turn of the curl along the wisp
     frizz_mm: float = 0.8
-    forehead_mm: float = 96.0  # height of the hairline above the nose's underside
-    recession_mm: float = 4.0  # at the temples
+    forehead_mm: float = 96.0  # height of the hairline above the underside of the nose
+    recession_mm: float = 4.0  # of the hairline at the temples
     thinning: float = 0.0  # of the crown and behind the forehead
-    fringe_mm: float = 75.0  # height at which hair before the forehead ends
-    parting_mm: float = 30.0  # of the parting from the midline, to the picture's right
+    fringe_mm: float = 75.0  # height at which hair in front of the forehead ends
+    parting_mm: float = 30.0  # offset of the parting from the midline, to the right of the image
     tuck: float = 0.0  # 1: behind the ears
 
 
 def draw_style(random: np.random.Generator, name: str | None = None) -> HairStyle:
-    """Draw a style, or a variant of the one that is named."""
-    drawn = str(random.choice(STYLES, p=np.array(_SHARES) / sum(_SHARES)))
+    """Draw a random style, or a random variant of the style `name`."""
+    drawn = str(random.choice(STYLES, p=np.array(_FREQUENCIES) / sum(_FREQUENCIES)))
     name = drawn if name is None else name
-    if name not in _MADE_OF:
-        raise ValueError(f"no hair style is called {name!r}; there are {', '.join(STYLES)}")
+    if name not in _STYLE_FIELDS:
+        raise ValueError(f"hair style {name!r}: unknown; choose one of {', '.join(STYLES)}")
 
     def between(low: float, high: float) -> float:
         return float(random.uniform(low, high))
 
-    def drawn_of(value: Any) -> Any:
+    def drawn_from(value: Any) -> Any:
         if isinstance(value, list):
             return random.choice(value).item()
         return between(*value) if isinstance(value, tuple) else value
@@ -206,7 +217,28 @@ def draw_style(random: np.random.Generator, name: str | None = None) -> HairStyl
         parting_mm=between(20, 42) * float(random.choice([-1, 1])),
         width_mm=between(0.8, 1.2),
     )
-    own = {field: drawn_of(value) for field, value in _MADE_OF[name].items()}
+    own = {field: drawn_from(value) for field, value in _STYLE_FIELDS[name].items()}
     if name == "curly":
         own["side_mm"] *= own["top_mm"]
     return replace(common, **own)
+
+
+def scalp_margin_m(points: np.ndarray, style: HairStyle) -> np.ndarray:
+    """Height [...] in metres of skin points [..., 3] above the style's hairline; negative below it."""
+    azimuth = np.abs(np.degrees(np.arctan2(points[..., 0], points[..., 2])))
+    first = np.array(_LINE_M) + style.forehead_mm / 1000 + np.array(_RECEDES) * style.recession_mm / 1000
+    fixed = np.array(_LINE_M) + _MEAN_FOREHEAD_M  # the style does not move temples and sideburns
+    first = np.where(np.array(_LINE_DEG[: len(first)]) > 50, fixed, first)
+    return points[..., 1] - np.interp(azimuth, _LINE_DEG, [*first, *_LINE_EAR_M])
+
+
+def scalp_cover(uv: np.ndarray, style: HairStyle) -> np.ndarray:
+    """Cover [...] in 0..1 of the skin by hair at (u, v) [..., 2] of the UV map, which may lie outside 0..1.
+
+    A skin texture stained with it hides the scalp that shows between the wisps.
+    """
+    azimuth = np.radians((uv[..., 0] - 0.5) * 2 * HALF_ANGLE_DEG)
+    y = TOP_M - uv[..., 1] * (TOP_M - BOTTOM_M)
+    points = np.stack([np.sin(azimuth), y, np.cos(azimuth)], -1)
+    cover = np.clip(scalp_margin_m(points, style) / 0.008 + 0.3, 0, 1) * (style.wisps > 0)
+    return cover * np.where(np.abs(azimuth) < np.pi, 1 - 0.7 * style.thinning * (y > 0.1), 0)

@@ -1,4 +1,4 @@
-"""What an open mouth shows: a dark bag behind the lips, and two rows of teeth."""
+"""The inside of an open mouth: a dark bag behind the lips, teeth, gums and tongue, in millimetres."""
 
 from collections.abc import Callable
 
@@ -7,33 +7,32 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.synth.head.eyes import capped, ring_triangles
-from facerf_cli.synth.head.mesh import arc_lengths, unit
+from facerf_cli.synth.head.mesh import arc_lengths, capped, ring_triangles, unit
 
-# From the rim back: how far behind it, and how much wider and taller than it, in millimetres.
+# Rings of the bag from the rim of the lips back: distance behind the rim, and growth in width and height.
 _BAG_MM = ((0, 0, 0), (1.5, 0.2, 2), (4, 0.2, 5), (9, 0, 8), (18, -1, 10), (28, -5, 9), (38, -11, 4))
+# Widths and heights of the teeth of half a row, from the midline outward.
 _UPPER_WIDTHS_MM, _LOWER_WIDTHS_MM = (8.4, 6.7, 7.4, 6.8, 6.6, 9.5), (5.4, 5.9, 6.7, 6.8, 6.8, 10.0)
 _UPPER_HEIGHTS_MM, _LOWER_HEIGHTS_MM = (9.8, 8.6, 9.4, 8.0, 7.2, 6.8), (8.6, 8.8, 9.4, 8.2, 7.6, 7.0)
-_ARCH_HALF_MM, _ARCH_DEPTH_MM = 27.0, 38.0
-_EDGE_MM = np.array([0.0, -35.0, 117.0])  # of the upper incisors, in the average head
-_OVERLAP_MM, _OVERJET_MM = 2.0, 2.2
-_HINGE_MM = np.array([0.0, 12.0, 25.0])
-_STEADY = (27, 28, 29, 30, 33, 36, 39, 42, 45)  # landmarks that no expression moves much
-_LIP_MM = 0.8  # between the lips' inner rim and the teeth
-_CHIN_DOUBT_MM = 4.0  # by which a person's chin may be longer than it seems
+_ARCH_HALF_MM, _ARCH_DEPTH_MM = 27.0, 38.0  # half width and depth of the arch of a row
+_EDGE_MM = np.array([0.0, -35.0, 117.0])  # edge of the upper incisors in the average head
+_OVERLAP_MM, _OVERJET_MM = 2.0, 2.2  # by which the upper incisors lie below and in front of the lower ones
+_HINGE_MM = np.array([0.0, 12.0, 25.0])  # axis of the jaw
+_STEADY = (27, 28, 29, 30, 33, 36, 39, 42, 45)  # landmarks that expressions hardly move
+_LIP_MM = 0.8  # between the inner rim of the lips and the teeth
+_CHIN_DOUBT_MM = 4.0  # a person's chin may be this much longer than the landmarks suggest
 _TOOTH_RINGS, _TOOTH_SEGMENTS = 9, 16
 _GUM_RINGS, _GUM_SEGMENTS = 41, 16
-_GUM_UP_MM, _GUM_HALF_MM, _GUM_BEHIND_MM = 13.0, np.array([4.6, 6.0]), 3.6
-_TONGUE_MM, _TONGUE_HALF_MM = np.array([0, -6.0, -31.0]), np.array([18.0, 6.5, 26.0])
+_GUM_UP_MM, _GUM_HALF_MM, _GUM_BEHIND_MM = 13.0, np.array([4.6, 6.0]), 3.6  # relative to the incisors' edge
+_TONGUE_MM, _TONGUE_HALF_MM = np.array([0, -6.0, -31.0]), np.array([18.0, 6.5, 26.0])  # centre, half size
 
 
 def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A bag behind the lips' inner rim [N, 3] (mm, in order): vertices, triangles seen from within, uv."""
+    """A bag behind the inner rim of the lips [N, 3] (in order): vertices, triangles seen from inside, uv."""
     centre = rim.mean(0)
     offset = rim - centre
     reach = np.maximum(np.abs(offset[:, :2]).max(0), 1.0)
-    direction = offset[:, :2] / reach
-    direction = unit(direction)
+    direction = unit(offset[:, :2] / reach)
     rings = []
     flat = rim[:, 2].mean()
     for behind, wider, taller in _BAG_MM:
@@ -54,9 +53,9 @@ def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both rows behind the lips' rim [N, 3]: vertices [V, 3] in millimetres, triangles [F, 3], uv [V, 2]."""
+    """Both rows of teeth behind the rim of the lips [N, 3]: vertices [V, 3], triangles [F, 3], uv [V, 2]."""
     rows = [_row(_UPPER_WIDTHS_MM, _UPPER_HEIGHTS_MM, 1.0), _row(_LOWER_WIDTHS_MM, _LOWER_HEIGHTS_MM, -1.0)]
-    placed = [place(row) for place, row in zip(_places(landmarks_mm, rim), rows, strict=True)]
+    placed = [place(row) for place, row in zip(_placements(landmarks_mm, rim), rows, strict=True)]
     one = capped(_TOOTH_RINGS, _TOOTH_SEGMENTS)
     count = _TOOTH_RINGS * _TOOTH_SEGMENTS
     number = 2 * 2 * len(_UPPER_WIDTHS_MM)
@@ -67,8 +66,8 @@ def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.nda
 def gums_and_tongue(
     landmarks_mm: np.ndarray, rim: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The ridges that the teeth stand in, and the tongue behind the lower ones, each as `teeth`."""
-    upper, lower = _places(landmarks_mm, rim)
+    """The gums of both rows of teeth, and the tongue behind the lower row, each in the form of `teeth`."""
+    upper, lower = _placements(landmarks_mm, rim)
     triangles, uv = capped(_GUM_RINGS, _GUM_SEGMENTS), _ring_uv(_GUM_RINGS, _GUM_SEGMENTS)
     gums = [(upper(_ridge(1.0)), triangles[:, ::-1], uv), (lower(_ridge(-1.0)), triangles, uv)]
     angle, turn = np.meshgrid(
@@ -84,12 +83,12 @@ def gums_and_tongue(
     return [*gums, (lower(tongue + _TONGUE_MM), triangles, uv)]
 
 
-def _places(
+def _placements(
     landmarks_mm: np.ndarray, rim: np.ndarray
 ) -> tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]:
-    """What carries points [V, 3] from the upper and the lower row's own frame into the mouth.
+    """Two functions that map points [V, 3] from the frame of the upper and of the lower row into the mouth.
 
-    A row's origin is the middle of its incisors' edge.
+    The origin of a row's frame is the middle of the edge of its incisors.
     """
     scale, turn, shift = _skull(landmarks_mm)
     drop = _jaw(landmarks_mm, scale, turn, shift)
@@ -111,7 +110,7 @@ def _places(
 
 
 def _skull(landmarks_mm: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Scale, turn [3, 3] and shift [3] from the average head to this one."""
+    """Scale, rotation [3, 3] and shift [3] from the average head to this one."""
     a, b = LANDMARKS_M[list(_STEADY)] * 1000, landmarks_mm[list(_STEADY)]
     turn, _ = Rotation.align_vectors(b - b.mean(0), a - a.mean(0))
     matrix = turn.as_matrix()
@@ -122,7 +121,7 @@ def _skull(landmarks_mm: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 def _jaw(
     landmarks_mm: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """The jaw's turn about its hinge, as far as both the chin and the lower lip have gone down."""
+    """The rotation of the jaw around its hinge that explains how far chin and lower lip have moved down."""
     found = (landmarks_mm - shift) @ turn / scale
     chin = LANDMARKS_M[8, 1] * 1000 - found[8, 1]
     parted = found[[61, 62, 63], 1].mean() - found[[67, 66, 65], 1].mean() - 2
@@ -133,14 +132,14 @@ def _jaw(
 
 
 def _too_near(row: np.ndarray, lip: np.ndarray) -> float:
-    """How far back [mm] a row must go to stay behind a lip's inner rim [N, 3]."""
+    """Distance by which a row must move back to stay behind the inner rim [N, 3] of a lip."""
     middle = lip[np.abs(lip[:, 0] - lip[:, 0].mean()) < 0.25 * np.ptp(lip[:, 0])]
     front = row[:, 2].max()
     return float(max(front + _LIP_MM - middle[:, 2].min(), 0))
 
 
 def _arch() -> tuple[CubicSpline, float]:
-    """(x, z) by the length along half an arch from the midline, and that length."""
+    """Half the arch of a row: a spline of (x, z) over the arc length from the midline, and its length."""
     along = np.linspace(0, np.pi / 2, 200)
     arch = np.stack([np.sin(along) * _ARCH_HALF_MM, np.cos(along) * _ARCH_DEPTH_MM - _ARCH_DEPTH_MM], -1)
     length = arc_lengths(arch)
@@ -148,14 +147,13 @@ def _arch() -> tuple[CubicSpline, float]:
 
 
 def _ridge(up: float) -> np.ndarray:
-    """A gum [V, 3] along the whole arch, tapering at its ends."""
+    """A gum [V, 3] along the whole arch, with tapered ends; `up`: 1 for the upper row, -1 for the lower."""
     curve, length = _arch()
     along = np.linspace(-1, 1, _GUM_RINGS)
     at, slope = curve(np.abs(along) * length * 0.96), curve(np.abs(along) * length * 0.96, 1)
     side = np.where(along < 0, -1.0, 1.0)
     centre = np.stack([side * at[:, 0], np.full(_GUM_RINGS, up * _GUM_UP_MM), at[:, 1]], -1)
-    back = np.stack([side * slope[:, 1], np.zeros(_GUM_RINGS), -slope[:, 0]], -1)
-    back = unit(back)
+    back = unit(np.stack([side * slope[:, 1], np.zeros(_GUM_RINGS), -slope[:, 0]], -1))
     taper = np.sqrt(np.clip(1 - (np.abs(along) - 0.9).clip(0) ** 2 / 0.01, 0, 1))
     around = np.arange(_GUM_SEGMENTS) / _GUM_SEGMENTS * 2 * np.pi
     ring = np.stack([np.cos(around) * _GUM_HALF_MM[0], np.sin(around) * _GUM_HALF_MM[1]], -1)
@@ -165,7 +163,7 @@ def _ridge(up: float) -> np.ndarray:
 
 
 def _row(widths: tuple[float, ...], heights: tuple[float, ...], up: float) -> np.ndarray:
-    """Teeth [V, 3] of a row with the incisors' edge at the origin, roots `up` (1 or -1)."""
+    """Teeth [V, 3] of a row with the edge of its incisors at the origin; `up`: 1 if roots point up, or -1."""
     curve, _ = _arch()
     centres = np.cumsum(widths) - np.array(widths) / 2
     sides = []
@@ -186,7 +184,7 @@ def _row(widths: tuple[float, ...], heights: tuple[float, ...], up: float) -> np
 
 
 def _tooth(width: float, height: float, depth: float) -> np.ndarray:
-    """A rounded block [V, 3] whose front is at z = 0 and edge at y = 0."""
+    """A rounded block [V, 3] with its front at z = 0 and its edge at y = 0."""
     level = np.linspace(0, 1, _TOOTH_RINGS)
     around = np.arange(_TOOTH_SEGMENTS) / _TOOTH_SEGMENTS * 2 * np.pi
     cos, sin = np.cos(around), np.sin(around)
@@ -202,4 +200,5 @@ def _tooth(width: float, height: float, depth: float) -> np.ndarray:
 
 
 def _ring_uv(rings: int, segments: int) -> np.ndarray:
+    """uv [rings * segments, 2] of a surface of rings."""
     return np.stack(np.meshgrid(np.linspace(0, 1, segments), np.linspace(0, 1, rings)), -1).reshape(-1, 2)

@@ -1,7 +1,8 @@
-"""The skin's sheet of (u, level) samples, with the eyes and the mouth cut out of it.
+"""The mesh of the skin in (u, level), with the eyes and the mouth cut out.
 
-Samples near an outline move onto it before the cut, so that its rim is a clean curve and never a staircase.
-Nothing here depends on the person: the chart's landmarks say where the openings are.
+(u, level) are the coordinates of `cranium.py`. Samples near an outline move onto it before the cut, so that
+the rim is a smooth curve and not a staircase. Nothing here depends on the person, because the landmarks of
+the UV map, which are the same for everybody, give the openings.
 """
 
 from dataclasses import dataclass
@@ -12,24 +13,25 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
-from facerf_cli.face.topology import CHART_MM, LANDMARK_UV, grid_uv
+from facerf_cli.face.topology import LANDMARK_UV, UV_SIZE_MM, grid_uv
 from facerf_cli.synth.head.cranium import BACK_U, CROWN_LEVEL, NECK_LEVEL
 from facerf_cli.synth.head.mesh import arc_lengths
 from facerf_cli.synth.heads_bank import one_thread
 
+# Landmarks along the upper and the lower edge of an opening; the right eye mirrors the left one.
 _ARCS = {"eye_left": ([36, 37, 38, 39], [39, 40, 41, 36]), "mouth": ([*range(60, 65)], [64, 65, 66, 67, 60])}
-_ROWS_PER_COLUMN = 0.75  # so that cells are about square on the skin
-_GROWTH, _COARSEST_MM = 1.1, 3.5  # cells grow away from the face
-_RELAXATIONS, _RELAXED_MM = 8, 5.0
-_BLURRED_MM, _SOURCE_MM, _SIDE_MM, _CORNER_MM = 0.4, 6.0, 6.0, 2.0  # about an outline; see `lips`
-_SMOOTHING = 0.5
+_ROWS_PER_COLUMN = 0.75  # makes cells about square on the skin
+_GROWTH, _COARSEST_MM = 1.1, 3.5  # growth per cell away from the face, and largest cell
+_RELAXATIONS, _RELAXED_MM = 8, 5.0  # steps that even out samples near the rim, and their reach
+_BLURRED_MM, _SOURCE_MM, _SIDE_MM, _CORNER_MM = 0.4, 6.0, 6.0, 2.0  # distances from an outline; see `lips`
+_SMOOTHING = 0.5  # of the thin-plate spline
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """Samples [N, 2] as (u, level), triangles [F, 3], and each cut opening's rim as vertex ids in order.
+    """Samples [N, 2] as (u, level), triangles [F, 3], and the rim of each cut opening as vertex ids in order.
 
-    `same` [N] names the vertex that stands for each place: the two sides of the seam are one place.
+    `same` [N] is the vertex that represents the place of each sample; the two sides of the seam share places.
     """
 
     u_level: np.ndarray
@@ -40,7 +42,7 @@ class Sheet:
 
 @cache
 def skin_sheet(subdivisions: int, cut: tuple[str, ...]) -> Sheet:
-    """The whole head's skin as one sheet, with the openings named in `cut` cut out."""
+    """Mesh the skin of the whole head, with the openings named in `cut` cut out."""
     columns = 128 * 2**subdivisions
     rows = round(columns * _ROWS_PER_COLUMN)
     u = _columns(columns)
@@ -67,18 +69,19 @@ def skin_sheet(subdivisions: int, cut: tuple[str, ...]) -> Sheet:
 
 @cache
 def outline(name: str) -> np.ndarray:
-    """Closed outline [N, 2] of an opening in (u, v), dense, its corners among the points."""
+    """Closed outline [N, 2] of an opening in (u, v): dense, with its corners among the points."""
     if name == "eye_right":
         return outline("eye_left") * [-1, 1] + [1, 0]
-    arcs = [_smooth(LANDMARK_UV[list(arc)] * CHART_MM) for arc in _ARCS[name]]
-    return np.concatenate([arc[:-1] for arc in arcs]) / CHART_MM
+    arcs = [_smooth(LANDMARK_UV[list(arc)] * UV_SIZE_MM) for arc in _ARCS[name]]
+    return np.concatenate([arc[:-1] for arc in arcs]) / UV_SIZE_MM
 
 
 @dataclass(frozen=True, eq=False)
 class Lip:
-    """One side of an opening, a lid or a lip, and how it goes on into the opening.
+    """One side of an opening, a lid or a lip, extrapolated into the opening.
 
-    The chart's vertices `replaced` [M] are `weights` [M, N] of the vertices `sources` [N] on this side.
+    The face's vertices `replaced` [M] are weighted sums, with `weights` [M, N], of the vertices `sources` [N]
+    on this side.
     """
 
     name: str
@@ -88,8 +91,8 @@ class Lip:
     weights: np.ndarray
 
     def holds(self, uv: np.ndarray) -> np.ndarray:
-        """[N] bool: samples that belong to this side."""
-        line, points = outline(self.name) * CHART_MM, uv * CHART_MM
+        """[N] bool: samples at uv [N, 2] that belong to this side."""
+        line, points = outline(self.name) * UV_SIZE_MM, uv * UV_SIZE_MM
         left, right = line[:, 0].min(), line[:, 0].max()
         low, high = line[:, 1].min() - _SIDE_MM, line[:, 1].max() + _SIDE_MM
         inside = (points[:, 0] > left) & (points[:, 0] < right) & (points[:, 1] > low) & (points[:, 1] < high)
@@ -98,12 +101,12 @@ class Lip:
 
 @cache
 def lips(name: str) -> tuple[Lip, Lip]:
-    """The two sides of an opening, as if each went on into it.
+    """The upper and the lower side of an opening, each extrapolated into it.
 
-    The chart drops from the lid to the eyeball, and from lip to lip, within a cell or two, which a fine
-    sample of the rim would see.
+    The canonical mesh drops from the lid to the eyeball, and from lip to lip, within a cell or two. A finely
+    sampled rim would show that drop.
     """
-    points, line = grid_uv().double().numpy() * CHART_MM, outline(name) * CHART_MM
+    points, line = grid_uv().double().numpy() * UV_SIZE_MM, outline(name) * UV_SIZE_MM
     signed, _ = _signed(points, line)
     corners = line[[0, len(line) // 2]]
     between = (points[:, 0] > corners[:, 0].min()) & (points[:, 0] < corners[:, 0].max())
@@ -121,7 +124,7 @@ def lips(name: str) -> tuple[Lip, Lip]:
 
 
 def _thin_plate(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Weights [M, N] that carry values at `known` [N, 2] on to `wanted` [M, 2]."""
+    """Weights [M, N] that extrapolate values at `known` [N, 2] to `wanted` [M, 2] by a thin-plate spline."""
 
     def rows(points: np.ndarray) -> np.ndarray:
         squared = cdist(points, known, "sqeuclidean")
@@ -132,13 +135,13 @@ def _thin_plate(known: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     system[: len(known)] = rows(known)
     system[len(known) :, : len(known)] = system[: len(known), len(known) :].T
     system[np.arange(len(known)), np.arange(len(known))] += _SMOOTHING
-    with one_thread():  # numpy's solver would round by the number of cores
+    with one_thread():  # rounding in numpy's solver depends on the number of cores
         solved = torch.linalg.solve(torch.from_numpy(system.T), torch.from_numpy(rows(wanted).T))
     return solved.numpy().T[:, : len(known)]
 
 
 def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """[N] bool: above the middle between an outline's two arcs (v runs down)."""
+    """[N] bool: points [N, 2] above the middle between the two arcs of an outline (v runs down)."""
     half = len(line) // 2
     arcs = (line[: half + 1], np.concatenate([line[half:], line[:1]]))
     margins = [np.interp(points[:, 0], *arc[np.argsort(arc[:, 0])].T) for arc in arcs]
@@ -146,6 +149,7 @@ def _above(points: np.ndarray, line: np.ndarray) -> np.ndarray:
 
 
 def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:
+    """A spline through points [K, 2], sampled `steps` times between neighbours."""
     length = arc_lengths(points)
     knots = np.arange(len(points))
     at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
@@ -153,7 +157,7 @@ def _smooth(points: np.ndarray, steps: int = 12) -> np.ndarray:
 
 
 def _graded(start: float, total: float, step: float, coarsest: float) -> np.ndarray:
-    """Positions after `start`, `total` further on at last, in steps that grow from `step` to `coarsest`."""
+    """Positions from `start` (left out) to `start + total`, in steps that grow from `step` to `coarsest`."""
     steps = [step]
     while sum(steps) < total:
         steps.append(min(steps[-1] * _GROWTH, coarsest))
@@ -161,21 +165,23 @@ def _graded(start: float, total: float, step: float, coarsest: float) -> np.ndar
 
 
 def _columns(columns: int) -> np.ndarray:
+    """u of the columns of samples: `columns` cells over the face, coarser ones around the head."""
     inside = np.linspace(0, 1, columns + 1)
     beyond = _graded(1, BACK_U - 1, 1 / columns, _COARSEST_MM * 256 / columns / 165)
     return np.concatenate([1 - beyond[::-1], inside, beyond])
 
 
 def _levels(rows: int) -> np.ndarray:
+    """Levels of the rows of samples: `rows` cells over the face, coarser ones above and below."""
     inside = np.linspace(0, 1, rows + 1)
-    coarsest = _COARSEST_MM * 192 / rows / CHART_MM[1]
+    coarsest = _COARSEST_MM * 192 / rows / UV_SIZE_MM[1]
     above = _graded(0, -CROWN_LEVEL, 1 / rows, coarsest)[:-1]
     below = _graded(1, NECK_LEVEL - 1, 1 / rows, coarsest)
     return np.concatenate([-above[::-1], inside, below])
 
 
 def _triangles(rows: int, columns: int) -> np.ndarray:
-    """Counter-clockwise from outside, diagonals mirrored about the midline, with a fan about the pole."""
+    """Triangles [F, 3], counter-clockwise from outside: a grid mirrored at the midline, a fan at the pole."""
     row, col = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
     tl = (row * columns + col).ravel()
     tr, bl, br = tl + 1, tl + columns, tl + columns + 1
@@ -190,8 +196,8 @@ def _triangles(rows: int, columns: int) -> np.ndarray:
 def _cut(
     uv: np.ndarray, triangles: np.ndarray, closed: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Samples moved onto the outline, triangles without those inside it, and the rim in order."""
-    points, polygon = uv * CHART_MM, closed * CHART_MM
+    """Cut a closed outline out of samples: moved samples, the triangles outside it, and the rim in order."""
+    points, polygon = uv * UV_SIZE_MM, closed * UV_SIZE_MM
     low, high = polygon.min(0) - 2 * _RELAXED_MM, polygon.max(0) + 2 * _RELAXED_MM
     near = np.flatnonzero(((points > low) & (points < high)).all(-1))
     local = np.full(len(points), -1)
@@ -207,16 +213,19 @@ def _cut(
     result[near] = moved
     keep = np.ones(len(triangles), bool)
     keep[np.flatnonzero(touched)[within]] = False
-    return result / CHART_MM, triangles[keep], near[_rim(faces[within])]
+    return result / UV_SIZE_MM, triangles[keep], near[_rim(faces[within])]
 
 
 def _snapped(points: np.ndarray, faces: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points with one end of every edge that crosses the outline moved onto it; side 1 in, 0 on, -1 out."""
+    """Points after one end of every edge that crosses the outline is moved onto it, and their side.
+
+    The side [N] is 1 inside, 0 on and -1 outside the outline.
+    """
     signed, nearest = _signed(points, polygon)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     crossing = edges[signed[edges[:, 0]] * signed[edges[:, 1]] < 0]
     distance = np.abs(signed[crossing])
-    distance = distance + np.where(signed[crossing] > 0, 0, 1e-6)  # a tie falls alike on both sides
+    distance = distance + np.where(signed[crossing] > 0, 0, 1e-6)  # breaks ties alike on both halves
     snap = np.unique(crossing[np.arange(len(crossing)), distance.argmin(-1)])
     moved, side = points.copy(), np.sign(signed).astype(int)
     moved[snap], side[snap] = nearest[snap], 0
@@ -228,7 +237,7 @@ def _snapped(points: np.ndarray, faces: np.ndarray, polygon: np.ndarray) -> tupl
 
 
 def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance [N] to the outline, positive inside, and the outline's nearest point [N, 2]."""
+    """Distance [N] to the outline, positive inside, and its nearest points [N, 2]."""
     start, along = polygon, np.roll(polygon, -1, 0) - polygon
     offset = points[:, None] - start
     fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0, 1)
@@ -244,7 +253,7 @@ def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """Samples beside the rim evened out, so that none of their triangles stays squeezed."""
+    """Even out the samples outside the rim, so that none of their triangles stays squeezed."""
     edges = np.unique(
         np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), -1), axis=0
     )
@@ -262,7 +271,7 @@ def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: n
 
 
 def _rim(inner: np.ndarray) -> np.ndarray:
-    """The border of the triangles that were cut out, in order, counter-clockwise from outside."""
+    """The border of the removed triangles, in order, counter-clockwise from outside."""
     edges = np.concatenate([inner[:, [0, 1]], inner[:, [1, 2]], inner[:, [2, 0]]])
     pairs = {(int(a), int(b)) for a, b in edges}
     onward = {a: b for a, b in pairs if (b, a) not in pairs}
@@ -271,5 +280,5 @@ def _rim(inner: np.ndarray) -> np.ndarray:
     while onward[rim[-1]] != start:
         rim.append(onward[rim[-1]])
     if len(rim) != len(onward):
-        raise ValueError("an opening is not one piece")
+        raise ValueError("opening: not one connected piece; use an outline that does not cross itself")
     return np.array(rim)

@@ -1,7 +1,7 @@
-"""Any face model's chart closed into a whole head for the synthetic stage.
+"""A whole head around the face of any face model, for models that have no head.
 
-The chart's surface is sampled finely and goes on over skull, sides and neck (`cranium.py`); eyes and mouth
-are cut open between the lids and between the lips (`openings.py`) where they are open, and filled.
+The surface of the face is sampled finely and continued over skull, sides and neck (`cranium.py`). Where eyes
+and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled.
 """
 
 from functools import cache
@@ -10,28 +10,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import BOTTOM_M, CHART_MM, HALF_ANGLE_DEG, TOP_M, landmark_weights
+from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, UV_SIZE_MM, landmark_weights
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head import eyes as eyeballs
-from facerf_cli.synth.head import mesh as ears
 from facerf_cli.synth.head import mouth
-from facerf_cli.synth.head.cranium import Surroundings, on_chart, template
+from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface
+from facerf_cli.synth.head.ear import ear_hollow_mm, ear_surface
+from facerf_cli.synth.head.eyes import RADIUS_MM, eyeball, fitted_centre
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, unit
 from facerf_cli.synth.head.openings import Sheet, lips, outline, skin_sheet
 
 _LIDS = {"eye_left": ((37, 41), (38, 40)), "eye_right": ((43, 47), (44, 46))}  # upper and lower landmarks
 _LIPS = ((61, 67), (62, 66), (63, 65))
-_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # between the landmarks; no wider than that is left uncut
-_OVERSHUT_LIDS_MM = 0.5  # a lid drawn further over the other one is cut free of it, or it would fold
-_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0
-_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0
-_EAR_OUT_MM = 1.5
+_SHUT_LIDS_MM, _SHUT_LIPS_MM = 2.0, 3.2  # gaps between landmarks up to which an opening is not cut
+_OVERSHUT_LIDS_MM = 0.5  # lids that overlap more than this are cut apart, because the skin would fold
+_AROUND_EYE_MM, _AROUND_EAR_MM = 9.0, 40.0  # reach of the skin that counts as near an eye, near an ear
+_EAR_AZIMUTH_DEG, _EAR_Y_MM = 79.0, 8.0  # place of the ear canal
+_EAR_OUT_MM = 1.5  # of the ear canal from the skin
 
 
 def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: int) -> HeadMesh:
-    """The whole bare head of a face given as canonical vertices [GRID * GRID, 3] in metres.
+    """Build the whole bare head of a face given as canonical vertices [GRID * GRID, 3] in metres.
 
-    gaze: azimuth to the picture's right, elevation up, in degrees. The skin's samples are about
+    gaze_deg: azimuth to the right of the image, elevation up. The samples of the skin are about
     1 mm / 2 ** (subdivisions - 1) apart.
     """
     face_mm = vertices.detach().cpu().double().numpy() * 1000
@@ -44,10 +44,10 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
     for side, root in roots.items():
         skin_mm = _hollowed(skin_mm, root, side)
     around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _LIDS}
-    balls = {name: eyeballs.fitted_centre(on_chart(face_mm, outline(name)), around[name]) for name in _LIDS}
+    balls = {name: fitted_centre(face_surface(face_mm, outline(name)), around[name]) for name in _LIDS}
     normals = _normals(skin_mm, sheet.triangles, sheet.same)
     parts = [_ear(root, side) for side, root in roots.items()]
-    parts += [_part("eye", *eyeballs.eyeball(centre, gaze_deg)) for centre in balls.values()]
+    parts += [_part("eye", *eyeball(centre, gaze_deg)) for centre in balls.values()]
     rims = {}
     for name, rim in sheet.rims.items():
         edge, down = skin_mm[rim], -normals[rim]
@@ -62,8 +62,8 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
 
 
 def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]) -> HeadMesh:
-    """The skin with the rims' rings [N, 3] added to its openings; a rim has the uv of its edge."""
-    vertices, uv, triangles = [skin_mm], [_chart_uv(sheet.u_level)], [sheet.triangles]
+    """The skin with rings [N, 3] added at the rims of its openings; a ring has the uv of its rim."""
+    vertices, uv, triangles = [skin_mm], [_continued_uv(sheet.u_level)], [sheet.triangles]
     for name, rings in rims.items():
         triangles.append(_strip(sheet.rims[name], sum(map(len, vertices)), len(rings)))
         vertices += rings
@@ -74,7 +74,7 @@ def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]
 
 
 def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
-    """Which openings are wide enough to be cut."""
+    """Names of the openings that are wide enough to be cut."""
     gaps = {
         name: max(landmarks_mm[upper, 1] - landmarks_mm[lower, 1] for upper, lower in pairs)
         for name, pairs in _LIDS.items()
@@ -85,55 +85,57 @@ def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
 
 
 def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, ...]) -> np.ndarray:
-    """Positions [N, 3] in millimetres of the sheet's samples."""
-    on = _on_chart(sheet.u_level)
+    """Positions [N, 3] in millimetres of the samples of the sheet."""
+    on = _on_face(sheet.u_level)
     skin = np.empty((len(on), 3))
-    skin[on] = on_chart(face_mm, sheet.u_level[on])
+    skin[on] = face_surface(face_mm, sheet.u_level[on])
     for name in cut:
-        for lip, held in zip(lips(name), _held(subdivisions, cut, name), strict=True):
+        for lip, held in zip(lips(name), _side_samples(subdivisions, cut, name), strict=True):
             side_mm = face_mm.copy()
             side_mm[lip.replaced] = lip.weights @ face_mm[lip.sources]
-            skin[held] = on_chart(side_mm, sheet.u_level[held])
+            skin[held] = face_surface(side_mm, sheet.u_level[held])
     skin[~on] = _surroundings(subdivisions).positions(face_mm)
     return skin[sheet.same]
 
 
 @cache
-def _held(subdivisions: int, cut: tuple[str, ...], name: str) -> list[np.ndarray]:
-    """Samples of the upper and of the lower side of an opening."""
+def _side_samples(subdivisions: int, cut: tuple[str, ...], name: str) -> list[np.ndarray]:
+    """Ids of the samples of the upper and of the lower side of an opening."""
     return [np.flatnonzero(lip.holds(skin_sheet(subdivisions, cut).u_level)) for lip in lips(name)]
 
 
 @cache
 def _surroundings(subdivisions: int) -> Surroundings:
+    """The head outside the face, at the samples of the sheet."""
     u_level = skin_sheet(subdivisions, ()).u_level
-    return Surroundings(u_level[~_on_chart(u_level)])
+    return Surroundings(u_level[~_on_face(u_level)])
 
 
-def _on_chart(u_level: np.ndarray) -> np.ndarray:
+def _on_face(u_level: np.ndarray) -> np.ndarray:
+    """[N] bool: samples inside the UV map of the face."""
     inside: np.ndarray = (u_level >= 0) & (u_level <= 1)
     return inside[:, 0] & inside[:, 1]
 
 
 @cache
 def _around_eye(subdivisions: int, cut: tuple[str, ...], name: str) -> np.ndarray:
-    """Samples [M] of the skin about an eye."""
+    """Ids [M] of the skin's samples around an eye."""
     uv, line = skin_sheet(subdivisions, cut).u_level, outline(name)
     margin = _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
     return np.flatnonzero(((uv > line.min(0) - margin) & (uv < line.max(0) + margin)).all(-1))
 
 
-def _chart_uv(u_level: np.ndarray) -> np.ndarray:
-    """The extended chart's uv [N, 2]: heights over the crown are those of the average head."""
+def _continued_uv(u_level: np.ndarray) -> np.ndarray:
+    """uv [N, 2] of the continued UV map: over the crown, v is the height on the average head."""
     v = u_level[:, 1].copy()
     crown = v < 0
-    y = template(*u_level[crown].T)[:, 1] / 1000
+    y = average_head_mm(*u_level[crown].T)[:, 1] / 1000
     v[crown] = (TOP_M - y) / (TOP_M - BOTTOM_M)
     return np.stack([u_level[:, 0], v], -1)
 
 
 def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Unit vectors [N, 3] in the surface from a counter-clockwise rim into its opening."""
+    """Unit vectors [N, 3] along the surface from a counter-clockwise rim into its opening."""
     along = np.roll(edge, -1, 0) - np.roll(edge, 1, 0)
     across = np.cross(normals, along)
     for _ in range(2):
@@ -143,16 +145,16 @@ def _inward(edge: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def _lid(edge: np.ndarray, inward: np.ndarray, ball: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
-    """Rings of a lid's margin, from its edge to just under the eyeball's surface."""
+    """Rings of the margin of the lids, from their edge to just under the surface of the eyeball."""
     low = edge + 0.6 * inward
     to_ball = low - ball
-    foot = ball + unit(to_ball) * (eyeballs.RADIUS_MM - 0.3)
+    foot = ball + unit(to_ball) * (RADIUS_MM - 0.3)
     rounded = edge + 0.2 * inward + 0.15 * down
     return [rounded, 0.6 * rounded + 0.4 * foot + 0.15 * inward, foot]
 
 
 def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.ndarray]:
-    """Rings of the lips rolling back into the mouth."""
+    """Rings of the lips, which roll back into the mouth."""
     back = np.array([0.0, 0, -1])
     return [
         edge + 0.25 * inward + 0.35 * down + 0.2 * back,
@@ -162,7 +164,7 @@ def _lips(edge: np.ndarray, inward: np.ndarray, down: np.ndarray) -> list[np.nda
 
 
 def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
-    """Triangles between the rim's vertices and rings of new ones that start at `first`."""
+    """Triangles between the vertices of a rim and rings of new vertices with ids from `first`."""
     count = len(rim)
     ids = np.concatenate([rim[None], first + np.arange(rings * count).reshape(rings, count)])
     a, b = ids[:-1], np.roll(ids[:-1], -1, 1)
@@ -171,23 +173,24 @@ def _strip(rim: np.ndarray, first: int, rings: int) -> np.ndarray:
 
 
 def _ear_root(skin_mm: np.ndarray, sheet: Sheet, side: float) -> np.ndarray:
-    """Where the ear sits [3] at the head's `side` (1: the picture's right)."""
+    """Place [3] of the ear canal on one side of the head (1: right in the image, -1: left)."""
     u = 0.5 + side * _EAR_AZIMUTH_DEG / (2 * HALF_ANGLE_DEG)
     v = (TOP_M - _EAR_Y_MM / 1000) / (TOP_M - BOTTOM_M)
-    nearest = (((sheet.u_level - [u, v]) * CHART_MM) ** 2).sum(-1).argmin()
+    nearest = (((sheet.u_level - [u, v]) * UV_SIZE_MM) ** 2).sum(-1).argmin()
     return skin_mm[nearest] + [side * _EAR_OUT_MM, 0, 0]
 
 
 def _hollowed(skin_mm: np.ndarray, root: np.ndarray, side: float) -> np.ndarray:
-    """The skin drawn in behind the ear's bowl."""
+    """The skin pushed in behind the bowl of the ear."""
     near = np.flatnonzero((np.abs(skin_mm - root) < _AROUND_EAR_MM).all(-1))
-    drawn = skin_mm.copy()
-    drawn[near, 0] -= side * ears.hollow_mm((skin_mm[near] - root) * [side, 1, 1])
-    return drawn
+    hollowed = skin_mm.copy()
+    hollowed[near, 0] -= side * ear_hollow_mm((skin_mm[near] - root) * [side, 1, 1])
+    return hollowed
 
 
 def _ear(root: np.ndarray, side: float) -> HeadMesh:
-    vertices, triangles = ears.ear()
+    """The ear at its place, as part of the skin."""
+    vertices, triangles = ear_surface()
     points = root + vertices * [side, 1, 1]
     azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
     u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
@@ -198,11 +201,11 @@ def _ear(root: np.ndarray, side: float) -> HeadMesh:
 def _part(
     name: str, vertices_mm: np.ndarray, triangles: np.ndarray, uv: np.ndarray, same: np.ndarray | None = None
 ) -> HeadMesh:
-    """A piece of mesh of one part, without vertices that no triangle uses."""
+    """Make a mesh of one part, without unused vertices; same [V]: the vertex that represents each place."""
     used = np.zeros(len(vertices_mm), bool)
     used[triangles] = True
-    stands = np.arange(len(vertices_mm)) if same is None else same
-    normals = _normals(vertices_mm, triangles, stands)[used]
+    place = np.arange(len(vertices_mm)) if same is None else same
+    normals = _normals(vertices_mm, triangles, place)[used]
     return HeadMesh(
         vertices=(vertices_mm[used] / 1000).astype(np.float32),
         normals=normals.astype(np.float32),
@@ -214,5 +217,5 @@ def _part(
 
 
 def _normals(vertices: np.ndarray, triangles: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """Unit normals [V, 3], area-weighted; vertices that stand for one place share theirs."""
+    """Unit normals [V, 3], area-weighted; vertices with the same place share their normal."""
     return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(same[triangles])).numpy()[same]

@@ -1,13 +1,13 @@
-"""Hair grows on the scalp alone, and leaves the face to be seen."""
+"""Hair grows on the scalp only and leaves the face visible."""
 
 import numpy as np
 import pytest
 
-from facerf_cli.face.topology import chart_uv
-from facerf_cli.synth.head.cranium import hull_of
+from facerf_cli.face.topology import cylinder_uv
 from facerf_cli.synth.head.hair import draw_hair, grow_hair
-from facerf_cli.synth.head.hair_styles import STYLES, HairStyle, draw_style
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, scalp_cover, scalp_margin_m
+from facerf_cli.synth.head.hair_styles import STYLES, HairStyle, draw_style, scalp_cover, scalp_margin_m
+from facerf_cli.synth.head.hull import hull_of
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 
 Hairs = dict[str, tuple[HairStyle, HeadMesh]]
 HAIRY = tuple(name for name in STYLES if name != "bald")
@@ -15,7 +15,7 @@ HAIRY = tuple(name for name in STYLES if name != "bald")
 
 @pytest.fixture(scope="module")
 def hairs(head: HeadMesh) -> Hairs:
-    """Every style but none, grown once."""
+    """One example of every style except bald."""
     return {name: grown(head, name) for name in HAIRY}
 
 
@@ -98,12 +98,12 @@ def test_drawing_gives_hair_and_its_style_or_none_for_the_bald(head: HeadMesh) -
     assert draw_hair(head, np.random.default_rng(bald))[0] is None
     hair, style = draw_hair(head, np.random.default_rng(drawn.index("buzz")))
     assert hair is not None and style.name == "buzz"
-    with pytest.raises(ValueError, match="no hair style is called 'mullet'"):
+    with pytest.raises(ValueError, match="hair style 'mullet': unknown; choose one of bald, "):
         draw_style(np.random.default_rng(0), "mullet")
 
 
 def test_the_cover_of_the_scalp_is_where_roots_are_and_not_on_the_face(hairs: Hairs) -> None:
     style, hair = hairs["buzz"]
     roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
-    assert scalp_cover(chart_uv(roots), style).mean() > 0.8
+    assert scalp_cover(cylinder_uv(roots), style).mean() > 0.8
     assert (scalp_cover(np.array([[0.5, 0.3], [0.3, 0.5], [0.5, 0.9]]), style) == 0).all()

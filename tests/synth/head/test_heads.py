@@ -1,7 +1,4 @@
-"""Heads for the stage: they agree with the canonical mesh, shut their eyes and open their mouths."""
-
-import sys
-from types import SimpleNamespace
+"""Heads agree with the canonical mesh, shut their eyes and open their mouths."""
 
 import numpy as np
 import pytest
@@ -14,8 +11,10 @@ from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_mode
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.synth.head.heads import build_head, loop_step
+from facerf_cli.synth.head import heads
+from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.subdivision import loop_step
 
 FULL = 1 / 0.3  # the coefficient of a whole blendshape
 
@@ -32,7 +31,7 @@ def head(model: MorphableModel, alpha=(0.0, 0.0), gaze_deg=(0.0, 0.0), subdivisi
 
 
 def seen_parts(mesh: HeadMesh, centre_m: tuple[float, float, float], across_m: float) -> dict[str, int]:
-    """How many of 256 x 256 pixels before the head show each part."""
+    """Number of pixels, of a 256 x 256 image from the front, that show each part."""
     side = 256
     camera = Camera(side / across_m, side, side, side / 2, side / 2)
     vertices = torch.from_numpy(mesh.vertices) - torch.tensor(centre_m) - torch.tensor([0, 0, 1.0])
@@ -84,7 +83,7 @@ def test_subdivision_refines_the_skin_and_leaves_the_teeth(ict_model):
     assert [after / before for before, after in zip(*counts, strict=True)] == [4, 4, 1, 1]
 
 
-def test_uv_at_the_landmarks_is_the_chart(ict_model):
+def test_uv_at_the_landmarks_is_that_of_the_canonical_mesh(ict_model):
     mesh = head(ict_model)
     skin = mesh.part == 0
     landmarks = ict_model.landmarks(ict_model.mean[None])[0].numpy()
@@ -110,7 +109,7 @@ def test_the_ball_stays_behind_half_shut_lids(ict_model):
     assert ((near - closest) * ball.face_normals[faces]).sum(-1).min() > -0.0001
 
 
-def test_eyes_look_where_they_are_told(ict_model):
+def test_eyes_look_along_the_gaze(ict_model):
     def apexes(gaze_deg):
         mesh = head(ict_model, gaze_deg=gaze_deg)
         eye = mesh.part == 1
@@ -121,13 +120,13 @@ def test_eyes_look_where_they_are_told(ict_model):
 
     for ahead, turned in zip(apexes((0, 0)), apexes((20, 0)), strict=True):
         by = np.degrees(np.arctan2(turned[0], turned[2]) - np.arctan2(ahead[0], ahead[2]))
-        assert abs(by - 20) < 1.5  # of the picture's right
+        assert abs(by - 20) < 1.5  # to the right of the image
     for ahead, turned in zip(apexes((0, 0)), apexes((0, 12)), strict=True):
         by = np.degrees(np.arctan2(turned[1], turned[2]) - np.arctan2(ahead[1], ahead[2]))
         assert abs(by - 12) < 1.5  # up
 
 
-def test_lids_follow_the_gaze_and_a_shut_eye_does_not_care(ict_model):
+def test_lids_follow_the_gaze_unless_the_eye_is_shut(ict_model):
     lid = head(ict_model).vertices
     down = head(ict_model, gaze_deg=(0.0, -20.0)).vertices
     moved = (down - lid)[head(ict_model).part == 0]
@@ -160,7 +159,7 @@ def test_a_model_without_a_head_gets_a_shell(monkeypatch):
         asked.append(arguments)
         return "a shell"
 
-    monkeypatch.setitem(sys.modules, "facerf_cli.synth.head.shell", SimpleNamespace(shell_head=shell_head))
+    monkeypatch.setattr(heads, "shell_head", shell_head)
     model = load_face_model()
     alpha, expression = torch.zeros(len(model.identity)), torch.zeros(len(model.expression))
     assert build_head(model, alpha, expression, (3.0, 4.0), 2) == "a shell"

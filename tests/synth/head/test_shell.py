@@ -1,4 +1,4 @@
-"""Any chart closed into a whole head: what is closed, what is open, and what lies behind what."""
+"""A whole head around any face: closed skin, open eyes and mouth, and the order of the parts in depth."""
 
 import os
 import subprocess
@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.face.topology import CHART_MM, TOP_M, grid_triangles, grid_uv, inside_mm
+from facerf_cli.face.topology import TOP_M, UV_SIZE_MM, grid_triangles, grid_uv, inside_mm
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.synth.head.eyes import RADIUS_MM
@@ -121,7 +121,7 @@ def test_normals_are_unit_and_turned_outward(which: str | int) -> None:
 
 
 @pytest.mark.parametrize("which", FACES)
-def test_the_chart_is_kept_away_from_the_cuts(which: str | int) -> None:
+def test_the_face_is_kept_away_from_the_cuts(which: str | int) -> None:
     mesh, vertices = head(which), face(which).numpy()
     skin = np.unique(of_part(mesh, "skin"))
     uv = mesh.uv[skin].astype(np.float64)
@@ -142,7 +142,7 @@ def test_the_chart_is_kept_away_from_the_cuts(which: str | int) -> None:
 
 
 @pytest.mark.parametrize("which", FACES)
-def test_the_surface_goes_on_smoothly_across_the_charts_border(which: str | int) -> None:
+def test_the_surface_is_smooth_across_the_border_of_the_face(which: str | int) -> None:
     mesh = head(which)
     skin = of_part(mesh, "skin")
     corners = mesh.vertices[skin].astype(np.float64)
@@ -244,14 +244,14 @@ def test_the_skull_has_the_measures_of_a_head() -> None:
     assert mesh.vertices[:, 1].min() == pytest.approx(-0.17, abs=0.01)
 
 
-def test_uv_is_the_chart_gone_on() -> None:
+def test_uv_continues_that_of_the_face() -> None:
     mesh = head("mean")
     skin = mesh.part == 0
     grid, points = grid_uv().numpy(), face("mean").numpy()
     distance, nearest = cKDTree(mesh.vertices[skin]).query(points[::37])
     close = distance < 3e-4
     assert close.sum() > 100
-    wrong_mm = np.abs(mesh.uv[skin][nearest[close]] - grid[::37][close]) * CHART_MM
+    wrong_mm = np.abs(mesh.uv[skin][nearest[close]] - grid[::37][close]) * UV_SIZE_MM
     assert wrong_mm.max() < 1
     u, v = mesh.uv[skin].T
     assert -1 < u.min() < -0.95 and 1.95 < u.max() < 2

@@ -1,4 +1,4 @@
-"""Glasses sit before the eyes and off the skin; clothes lie about the neck."""
+"""Glasses sit in front of the eyes and off the skin; clothes lie around the neck."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def require_sound(mesh: HeadMesh, part: str) -> None:
 
 
 @pytest.mark.parametrize("kind", GLASSES)
-def test_glasses_sit_before_the_eyes_and_not_in_the_skin(
+def test_glasses_sit_in_front_of_the_eyes_and_not_in_the_skin(
     head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(glasses, "GLASSES", (kind,))
