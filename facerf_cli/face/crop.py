@@ -1,4 +1,4 @@
-"""The square that the face is cut out of a photo with: axis-aligned, never rotated (paper, 'Dataset').
+"""The square crop of a photo around a face: axis-aligned, never rotated (paper, 'Dataset').
 
 Pixel positions follow `raster/camera.py`: centres at index + `PIXEL_CENTRE`, origin at the top-left corner.
 """
@@ -14,7 +14,7 @@ from facerf_cli.face.topology import LANDMARKS_M, TOP_M
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
 
 MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
-_SMALLEST_FACE_PX = 4.0
+_SMALLEST_FACE_PX = 4.0  # landmarks within fewer pixels cannot be a face
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)
 # The hairline lies this far above the eyes, in units of the distance from the eyes to the mouth.
 _EYES_M, _MOUTH_M = LANDMARKS_M[_EYES].mean(0), LANDMARKS_M[_MOUTH].mean(0)
@@ -32,7 +32,7 @@ class Crop:
 
     @property
     def camera(self) -> Camera:
-        """The fixed camera of the crop's pixels."""
+        """The fixed camera of the crop."""
         return crop_camera(self.size_px)
 
     @property
@@ -41,21 +41,21 @@ class Crop:
         return self.size_px / self.side_px
 
     def to_crop(self, photo_px: np.ndarray) -> np.ndarray:
-        """Photo positions [..., 2] in the crop's pixels."""
+        """Convert photo positions [..., 2] to the crop's pixels."""
         return (np.asarray(photo_px, np.float64) - (self.x0_px, self.y0_px)) * self.scale
 
     def to_photo(self, crop_px: np.ndarray) -> np.ndarray:
-        """Crop positions [..., 2] in the photo's pixels."""
+        """Convert crop positions [..., 2] to the photo's pixels."""
         return np.asarray(crop_px, np.float64) / self.scale + (self.x0_px, self.y0_px)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """Cut an image [H, W, C] to float32 [size, size, C]; beyond its border the edge pixels go on.
+        """Resample an image [H, W, C] to float32 [size, size, C]; beyond its border the edge pixels repeat.
 
-        Catmull-Rom, widened to the crop's pixel where that is larger. Its undershoot is held inside the
-        image's own range, so that light stays non-negative.
+        The filter is Catmull-Rom, widened where a crop pixel is larger than a photo pixel. The result is
+        clipped to the range of the image region, so that radiance stays non-negative.
         """
         if image.ndim != 3:
-            raise ValueError(f"image has shape {image.shape}, not [H, W, C]")
+            raise ValueError(f"image: its shape is {image.shape}, not [H, W, C]")
         rows = _resampler(image.shape[0], self.y0_px, self.side_px, self.size_px)
         columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)
         top, bottom = _used(rows)
@@ -69,18 +69,18 @@ class Crop:
         return np.ascontiguousarray(bounded, np.float32)
 
     def valid(self, height_px: int, width_px: int) -> np.ndarray:
-        """Bool [size, size]: True where the crop's pixel has its centre inside a photo of that size."""
+        """A bool mask [size, size]: True where a crop pixel has its centre inside a photo of that size."""
         centres_px = np.arange(self.size_px) + PIXEL_CENTRE
         x, y = self.to_photo(np.stack([centres_px, centres_px], -1)).T
         return ((y >= 0) & (y <= height_px))[:, None] & ((x >= 0) & (x <= width_px))
 
 
 def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
-    """The square around landmarks [68, 2] in photo pixels that holds chin, temples, forehead and a margin."""
+    """The crop around landmarks [68, 2] in photo pixels: chin, temples, forehead and a margin."""
     landmarks_px = check_landmarks(landmarks_px)
     up = landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0)
     forehead_px = landmarks_px[[0, *range(17, 27), 16]]
-    # brows and temples moved along the face's own up, so that a head that lies on its side keeps its forehead
+    # Brows and temples move along the face's up direction, so the forehead is inside at any roll.
     along = (forehead_px - landmarks_px[_EYES].mean(0)) @ up / (up @ up)
     points = np.concatenate([landmarks_px, forehead_px + (_FOREHEAD - along)[:, None] * up])
     low, high = points.min(0), points.max(0)
@@ -90,22 +90,22 @@ def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
 
 
 def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:
-    """The landmarks as float64 [68, 2], or an InputError where no face can have them."""
+    """The landmarks as float64 [68, 2]; raises InputError where they cannot be a face."""
     landmarks_px = np.asarray(landmarks_px, np.float64)
     if landmarks_px.shape != (68, 2):
-        raise InputError(f"landmarks have the shape {landmarks_px.shape}; 68 pairs of x and y are needed")
+        raise InputError(f"landmarks: their shape is {landmarks_px.shape}; give 68 pairs of x and y")
     if not np.isfinite(landmarks_px).all():
-        raise InputError("landmarks hold values that are not finite; detect them again or mend the file")
+        raise InputError("landmarks: some values are not finite; detect them again or correct the file")
     eyes_to_mouth_px = np.linalg.norm(landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0))
     if min(np.ptp(landmarks_px, axis=0).min(), eyes_to_mouth_px) < _SMALLEST_FACE_PX:
-        raise InputError("landmarks lie on one spot or one line; a face of some pixels' size is needed")
+        raise InputError("landmarks: they lie on one spot or one line; give a face of at least a few pixels")
     return landmarks_px
 
 
 def _resampler(length: int, start_px: float, side_px: float, size_px: int) -> csr_array:
-    """Weights [size, length] of a one-dimensional Catmull-Rom resampling with replicated ends."""
+    """Weights [size, length] of a one-dimensional Catmull-Rom resampling with repeated ends."""
     step = side_px / size_px
-    width = max(step, 1.0)  # photo pixels in a unit of the kernel
+    width = max(step, 1.0)  # photo pixels for a unit of the kernel
     centres_px = start_px + (np.arange(size_px) + PIXEL_CENTRE) * step
     taps = math.ceil(4 * width) + 1
     index = np.floor(centres_px - PIXEL_CENTRE - 2 * width).astype(np.int64)[:, None] + np.arange(taps + 1)

@@ -1,8 +1,9 @@
-"""Whose face it is: the descriptor of dlib's face-recognition network (paper, 'Results': Face dis)."""
+"""Identity of a face: the descriptor of dlib's face-recognition network (paper, 'Results': Face dis)."""
 
 from functools import cache
 from typing import Any
 
+import dlib
 import numpy as np
 
 from facerf_cli.face.landmarks import bundled_model
@@ -16,15 +17,15 @@ _NETWORK_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
 
 def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
-    """The descriptor [128] of a face in an sRGB picture [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
+    """The descriptor [128] of a face in an sRGB image [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
 
-    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a chip of
-    150 px that the landmarks turn upright. Photos of one person mostly lie within 0.6 of each other.
+    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a
+    150 px image that the landmarks align. Descriptors of one person are mostly less than 0.6 apart.
     """
-    import dlib
-
     if landmarks_px.shape != (68, 2) or image_srgb.ndim != 3 or image_srgb.shape[2] != 3:
-        raise ValueError(f"picture {image_srgb.shape}, landmarks {landmarks_px.shape}")
+        raise ValueError(
+            f"image {image_srgb.shape}, landmarks {landmarks_px.shape}: give [H, W, 3] and [68, 2]"
+        )
     image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
     points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
     (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
@@ -34,16 +35,14 @@ def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndar
 
 
 def descriptor_distance(first: np.ndarray, second: np.ndarray) -> float:
-    """Face dis: the Euclidean distance of two descriptors [128].
+    """The Euclidean distance of two descriptors [128] ('Face dis').
 
-    Take both by the truth's landmarks, so that a prediction is not helped by being found elsewhere, and of
-    pictures that are masked alike.
+    Compute both with the landmarks of the ground truth, on images with the same mask, so that differences in
+    detection do not count.
     """
     return float(np.linalg.norm(first - second))
 
 
 @cache
 def _network() -> Any:
-    import dlib
-
     return dlib.face_recognition_model_v1(str(bundled_model(_NETWORK_FILE)))
