@@ -1,10 +1,10 @@
 """The mean face of the built-in model, from named anatomical measures (millimetres, head frame).
 
-The neutral is a height field over the chart's cylinder: distance from the vertical axis at azimuth and
-height. A table of section depths gives head, cheeks and jaw without their features; nose, eyes and mouth are
-laid on it by their own few measures; at last the surface is pulled onto the 68 landmarks of `LANDMARKS_M`.
-Only the picture's left half is built, then mirrored. Depths were measured on the ICT-FaceKit mean face and
-rounded to half a millimetre; none of its vertices are in here.
+The neutral face is a height field over the cylinder of `topology.py`: the distance from the vertical axis at
+an azimuth and a height. A table of section depths gives head, cheeks and jaw; a few measures each add nose,
+eyes and mouth; last, the surface is pulled onto the 68 landmarks of `LANDMARKS_M`. Only the image's left half
+is built and then mirrored. The depths were measured on the ICT-FaceKit mean face and rounded to half a
+millimetre; none of its vertices are used.
 """
 
 import numpy as np
@@ -12,18 +12,18 @@ from scipy.interpolate import CubicSpline, PchipInterpolator, RectBivariateSplin
 
 from facerf_cli.face.topology import (
     BOTTOM_M,
-    CHART_MM,
     GRID,
     HALF_ANGLE_DEG,
     LANDMARK_UV,
     LANDMARKS_M,
     TOP_M,
+    UV_SIZE_MM,
     grid_uv,
     inside_mm,
     landmark_weights,
 )
 
-# Section depths: height | distance from the axis at each azimuth, the nose and the lips taken away.
+# Section depths: height | distance from the axis at each azimuth, without nose and lips.
 _AZIMUTHS_DEG = (0, 8, 16, 24, 32, 40, 48, 54.5, 61)
 _SECTIONS_MM = """
  93 | 107.5 107   105.5 101.5  96    91    86.5  83   80.5
@@ -52,7 +52,7 @@ _SECTIONS_MM = """
 -84 |  79.5  74.5  68    63    59    57.5  57.5  58   58.5
 """
 
-_SECTION_ROUNDING_MM = 0.2  # what the table's steps leave uncertain
+_SECTION_ROUNDING_MM = 0.2  # uncertainty due to the rounding of the table
 
 # Nose: height | depth of the midline profile, half width of the section, roundness of its ridge (exponent).
 _NOSE_MM = """
@@ -76,14 +76,14 @@ _ALA_XY_MM, _ALA_HALF_MM, _ALA_HEIGHT_MM = (12.8, -2.6), (5.8, 7.4), 11.0
 _ALAR_GROOVE_MM = 0.9
 _NOSTRIL_DEPTH_MM = 4.0
 
-# Eyes: a sphere with a cornea, lids laid over it.
+# Eyes: a sphere with a cornea, covered by lids.
 EYE_CENTRE_MM, EYE_RADIUS_MM = np.array([-31.5, 35.3, 92.5]), 12.2
 _CORNEA_RADIUS_MM, _CORNEA_RISE_MM = 5.8, 0.9
-_LID_THICKNESS_MM, _CANTHUS_DEPTH_MM = 1.5, 2.5  # the inner corner is no deeper than this
+_LID_THICKNESS_MM, _CANTHUS_DEPTH_MM = 1.5, 2.5  # largest depth of the inner corner
 _FOLD_ABOVE_MM, _FOLD_DEPTH_MM = 4.5, 0.9
 
-# Lips: share of the way from the seam to the vermilion's edge, and relief over the sections there, upper and
-# lower lip; beyond the edge it falls off over a few millimetres.
+# Lips: relief over the sections at shares of the way from the seam to the vermilion's edge, for the upper and
+# the lower lip; beyond the edge it falls off over a few millimetres.
 _LIP_SHARES = (0, 0.15, 0.4, 0.7, 1.0)
 _LIP_UPPER_MM, _LIP_LOWER_MM = (0.8, 3.5, 4.7, 4.9, 3.6), (0.8, 3.2, 5.0, 5.4, 4.0)
 _LIP_FALLOFF_MM = (2.8, 3.4)
@@ -93,7 +93,7 @@ _PHILTRUM_MM = (5.0, 0.7, 0.6)  # half distance of the columns, their height, de
 
 
 def mean_vertices() -> np.ndarray:
-    """The mean face [V, 3] in metres; mirror symmetric to the last bit."""
+    """The mean face [V, 3] in metres, mirror symmetric to the last bit."""
     uv = grid_uv().double().numpy()
     left = uv[:, 0] <= 0.5
     radius_mm = _features(uv[left])
@@ -102,12 +102,13 @@ def mean_vertices() -> np.ndarray:
 
 
 def _mirrored(left: np.ndarray) -> np.ndarray:
-    """Values [GRID * (GRID // 2 + 1)] of the picture's left half and midline, to the whole grid [V]."""
+    """Mirror values [GRID * (GRID // 2 + 1)] of the image's left half and midline to the whole grid [V]."""
     half = left.reshape(GRID, GRID // 2 + 1)
     return np.concatenate([half, half[:, -2::-1]], 1).reshape(-1)
 
 
 def _on_rays(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Points [N, 3] in millimetres at (u, v) [N, 2] and distances [N] from the axis."""
     azimuth = np.radians((uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG)
     height = (TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)) * 1000
     return np.stack([radius * np.sin(azimuth), height, radius * np.cos(azimuth)], -1)
@@ -132,6 +133,7 @@ def _table(text: str) -> np.ndarray:
 
 
 def _sections(azimuth_deg: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Distance from the axis [N] by a smoothing spline of the section depths."""
     rows = _table(_SECTIONS_MM)[::-1]
     azimuths = np.array([*(-a for a in _AZIMUTHS_DEG[:0:-1]), *_AZIMUTHS_DEG])
     depths = np.concatenate([rows[:, :1:-1], rows[:, 1:]], 1)
@@ -176,6 +178,7 @@ def _mouth(uv: np.ndarray, across: np.ndarray, height: np.ndarray) -> np.ndarray
 
 
 def _lower_line(column: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Height [N] of the lower lip's lower edge at u = `column` [N], through landmarks (u, y)."""
     order = [48, 59, 58, 57, 56, 55, 54]
     return CubicSpline(u[order], y[order])(column)
 
@@ -183,16 +186,17 @@ def _lower_line(column: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _lip(
     from_seam: np.ndarray, breadth: np.ndarray, relief: tuple[float, ...], falloff_mm: float
 ) -> np.ndarray:
+    """Relief of one lip [N] at distances from the seam, for the lip's breadth there."""
     breadth = np.maximum(breadth, 1.5)
     inside = PchipInterpolator(_LIP_SHARES, relief)(np.clip(from_seam / breadth, 0, 1))
     return inside * np.exp(-((np.maximum(from_seam - breadth, 0) / falloff_mm) ** 2))
 
 
 def _eye(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """The lids over the eyeball, and the eyeball between them."""
+    """Distance from the axis [N] with the lids over the eyeball and the eyeball between them."""
     inside = inside_mm("eyes", uv)
     ball = _eyeball(uv)
-    above = (LANDMARK_UV[[36, 39], 1].mean() - uv[:, 1]) * CHART_MM[1]
+    above = (LANDMARK_UV[[36, 39], 1].mean() - uv[:, 1]) * UV_SIZE_MM[1]
     lid = ball + _LID_THICKNESS_MM - np.clip(-inside - 3, 0, None) ** 2 * 0.15
     skin = _soft_maximum(radius, lid, 0.67)
     fold = np.exp(-(((-inside - _FOLD_ABOVE_MM) / 1.1) ** 2)) * _step(above, 1, 4)
@@ -202,7 +206,7 @@ def _eye(uv: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def _eyeball(uv: np.ndarray) -> np.ndarray:
-    """Distance from the axis to the eyeball along the chart's rays, 0 where they miss it."""
+    """Distance from the axis [N] to the eyeball along the rays at (u, v) [N, 2]; 0 where a ray misses it."""
     directions = _on_rays(uv, np.ones(len(uv)))
     height, directions[:, 1] = directions[:, 1].copy(), 0
     to_centre = EYE_CENTRE_MM - np.stack([np.zeros_like(height), height, np.zeros_like(height)], -1)
@@ -216,27 +220,28 @@ def _eyeball(uv: np.ndarray) -> np.ndarray:
 
 
 def _pull_onto_landmarks(uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
-    """What to add to the radius [V] so that the landmarks of the mesh lie at their measures."""
+    """The correction [V] of the radius that brings the mesh's landmarks to their measures."""
     corners, weights = (tensor.numpy() for tensor in landmark_weights())
     wanted = np.hypot(LANDMARKS_M[:, 0], LANDMARKS_M[:, 2]) * 1000
     found = (_on_rays(uv, radius_mm)[corners] * weights[..., None]).sum(1)
     residual = wanted - np.hypot(found[:, 0], found[:, 2])
-    landmarks_mm = LANDMARK_UV * CHART_MM
+    landmarks_mm = LANDMARK_UV * UV_SIZE_MM
     strength = np.linalg.solve(_near(landmarks_mm, landmarks_mm), residual)
-    return _near(uv * CHART_MM, landmarks_mm) @ strength
+    return _near(uv * UV_SIZE_MM, landmarks_mm) @ strength
 
 
 def _near(a_mm: np.ndarray, b_mm: np.ndarray) -> np.ndarray:
-    """A Matern kernel [A, B], 1 at the same place, so that each landmark pulls its own surroundings only."""
+    """A Matern kernel [A, B], 1 at distance 0, so that a landmark pulls only its surroundings."""
     distance = np.linalg.norm(a_mm[:, None] - b_mm, axis=-1) * np.sqrt(3) / _PULL_REACH_MM
     return (1 + distance) * np.exp(-distance)
 
 
 def _soft_maximum(a: np.ndarray | float, b: np.ndarray | float, width_mm: float) -> np.ndarray:
+    """A maximum of a and b that is smooth over about `width_mm`."""
     return np.logaddexp(np.divide(a, width_mm), np.divide(b, width_mm)) * width_mm
 
 
 def _step(value: np.ndarray, start: float, end: float) -> np.ndarray:
-    """0 below `start`, 1 above `end`, smooth between."""
+    """A smooth step: 0 below `start`, 1 above `end`."""
     share = np.clip((value - start) / (end - start), 0, 1)
     return share * share * (3 - 2 * share)

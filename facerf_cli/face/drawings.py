@@ -1,7 +1,4 @@
-"""A fit drawn over its photo, for people to judge it by.
-
-A face model seen from eight sides, shaded as clay: what `facerf face-model show` draws.
-"""
+"""Drawings for visual checks: a fit over its photo, and a face model shaded as clay from eight sides."""
 
 import math
 
@@ -18,17 +15,33 @@ from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 
-_CELLS = 16  # of the wire mesh, along u and along v
+_CELLS = 16  # cells of the wire mesh along u and along v
 _SHADE, _LINE = 0.35, 0.5  # opacity of the shaded mesh and of its wires
 _WIRE_COLOUR = np.array([0.1, 0.5, 1.0], np.float32)
-_GIVEN_COLOUR, _FITTED_COLOUR = (0.05, 1.0, 0.1), (1.0, 0.25, 0.0)
+_TARGET_COLOUR, _FITTED_COLOUR = (0.05, 1.0, 0.1), (1.0, 0.25, 0.0)
 _DOT = 1 / 160  # radius over the crop's side
+
+POSES = 8
+_COLUMNS = 4
+_FACE_SPAN_DEG = 80.0  # a face without a whole head is turned this far to either side
+_OVERSAMPLE = 3
+_FOCAL_PER_SIDE = 4.0
+_FILL = 0.9  # share of a cell that the model's bounding sphere fills
+_LIGHT = torch.nn.functional.normalize(torch.tensor([-0.5, 0.6, 0.8]), dim=0)
+_AMBIENT, _DIFFUSE = 0.12, 0.75
+_BACKGROUND = 0.02
+_COLOURS = {
+    "skin": (0.62, 0.55, 0.50),
+    "eye": (0.8, 0.8, 0.8),
+    "mouth": (0.4, 0.16, 0.15),
+    "teeth": (0.7,) * 3,
+}
 
 
 def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarray:
-    """The linear photo [H, W, 3] at automatic exposure, with the mesh half transparent and landmarks.
+    """Draw the half-transparent mesh and landmarks over a linear photo [H, W, 3] at automatic exposure.
 
-    Green are the landmarks that were given, orange those of the fit (without the sliding contour).
+    Green are the targets of the fit, orange its landmarks without the sliding contour.
     """
     image = (photo * np.float32(2 ** auto_exposure_ev(photo))).clip(0, 1)
     height, width = photo.shape[:2]
@@ -42,7 +55,7 @@ def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarr
     region += _LINE * covered * _wires(view.uv.numpy(), line_px)[..., None] * (_WIRE_COLOUR - region)
     fitted_px = project(model.landmarks(vertices[None])[0, len(CONTOUR) :], fit.camera).numpy()
     radius_px = max(1.0, _DOT * fit.crop.side_px)
-    _dots(image, fit.crop.to_photo(fit.landmarks_px.numpy()), _GIVEN_COLOUR, radius_px)
+    _dots(image, fit.crop.to_photo(fit.landmarks_px.numpy()), _TARGET_COLOUR, radius_px)
     _dots(image, fit.crop.to_photo(fitted_px), _FITTED_COLOUR, 0.6 * radius_px)
     return image
 
@@ -60,7 +73,7 @@ def _wires(uv: np.ndarray, line_px: float) -> np.ndarray:
 
 
 def _dots(image: np.ndarray, points_px: np.ndarray, colour: tuple[float, ...], radius_px: float) -> None:
-    """Draw antialiased discs at points [N, 2] into a picture [H, W, 3]."""
+    """Draw antialiased discs at points [N, 2] into an image [H, W, 3]."""
     for x, y in points_px:
         left, top = (max(0, int(centre - radius_px - 1)) for centre in (x, y))
         patch = image[top : max(top, int(y + radius_px + 2)), left : max(left, int(x + radius_px + 2))]
@@ -69,27 +82,10 @@ def _dots(image: np.ndarray, points_px: np.ndarray, colour: tuple[float, ...], r
         patch += np.clip(radius_px + 0.5 - distance, 0, 1)[..., None] * (np.array(colour) - patch)
 
 
-POSES = 8
-_COLUMNS = 4
-_FACE_SPAN_DEG = 80.0  # a face without a head behind it is turned this far to either side
-_OVERSAMPLE = 3
-_FOCAL_PER_SIDE = 4.0
-_FILL = 0.9  # of a cell, by the model's sphere
-_LIGHT = torch.nn.functional.normalize(torch.tensor([-0.5, 0.6, 0.8]), dim=0)
-_AMBIENT, _DIFFUSE = 0.12, 0.75
-_BACKGROUND = 0.02
-_COLOURS = {
-    "skin": (0.62, 0.55, 0.50),
-    "eye": (0.8, 0.8, 0.8),
-    "mouth": (0.4, 0.16, 0.15),
-    "teeth": (0.7,) * 3,
-}
-
-
 def draw_turntable(model: MorphableModel, cell_px: int = 256) -> np.ndarray:
-    """The mean from eight sides, linear Rec.709 [2 cell_px, 4 cell_px, 3]: its head, or the face alone.
+    """Draw the mean from eight sides, linear Rec.709 [2 cell_px, 4 cell_px, 3]: the head, or the face alone.
 
-    A head turns once around, a face from one profile to the other; light comes from the upper left.
+    A head makes a full turn, a face turns from one profile to the other; light comes from the upper left.
     """
     vertices, triangles, colours = _clay(model)
     low, high = vertices.amin(0), vertices.amax(0)
@@ -103,7 +99,7 @@ def draw_turntable(model: MorphableModel, cell_px: int = 256) -> np.ndarray:
 
 
 def _clay(model: MorphableModel) -> tuple[Tensor, Tensor, Tensor]:
-    """Vertices [N, 3], triangles [F, 3] and colours [N, 3] of what is drawn."""
+    """Vertices [N, 3], triangles [F, 3] and colours [N, 3] of the head or face."""
     if model.head is None:
         colours = torch.tensor(_COLOURS["skin"]).expand(len(model.mean), 3)
         return model.mean, grid_triangles(), colours
@@ -119,12 +115,12 @@ def _normals(vertices: Tensor, triangles: Tensor) -> Tensor:
 def _draw(
     vertices: Tensor, triangles: Tensor, normals: Tensor, colours: Tensor, yaw_deg: float, cell_px: int
 ) -> np.ndarray:
-    """One cell [cell_px, cell_px, 3], its pixels averaged over `_OVERSAMPLE`^2 samples."""
+    """Draw one cell [cell_px, cell_px, 3], each pixel the mean of `_OVERSAMPLE`^2 samples."""
     side_px = cell_px * _OVERSAMPLE
     camera = Camera(_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
     head_to_camera = pose_to_rotation(yaw_deg, 0, 0)
     radius_m = float(vertices.norm(dim=-1).max())
-    # A sphere's outline is where rays touch it: sin of the half angle, not tan.
+    # Rays along a sphere's outline are tangent to it: sin of the half angle, not tan.
     away_m = radius_m / math.sin(math.atan(_FILL / (2 * _FOCAL_PER_SIDE)))
     posed = vertices @ head_to_camera.T - torch.tensor([0, 0, away_m])
     fragments = rasterize(posed, triangles, camera)

@@ -1,4 +1,4 @@
-"""A fitted face seen by a camera: what each pixel shows of it, and its soft mask."""
+"""A fitted face rendered by a camera: (u, v), normal and position of each pixel, and a soft mask."""
 
 from dataclasses import dataclass
 
@@ -15,15 +15,15 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
 
 _TINY = 1e-8
-_MASK_SIDE = 256  # texels of the mask; finer ones take seconds to draw
-FEATHER = 0.04  # of the mask's border, inward, in crop sides
+FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
+_MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
 
 
 @dataclass(frozen=True, eq=False)
 class FaceView:
-    """A fitted face seen by its photo's camera; one z-buffer serves every texture.
+    """A fitted face rendered by its photo's camera, ready to be textured any number of times.
 
-    All tensors cover the window [h, w] of the photo [H, W] at `top`, `left`.
+    All tensors cover the window [h, w] of the photo [H, W] whose first row and column are `top` and `left`.
     """
 
     height_px: int
@@ -37,35 +37,31 @@ class FaceView:
     mask: Tensor  # [h, w] 0..1, the face inside jaw and hairline with a soft border
 
     def render(self, texture: Tensor) -> Tensor:
-        """A texture [C, T, T] in the window [h, w, C], zero off the mesh."""
+        """Render a texture [C, T, T] in the window [h, w, C], zero off the mesh."""
         return sample_texture(texture, self.uv) * self.coverage[..., None]
 
     def full(self, window: Tensor) -> np.ndarray:
-        """Values of the window [h, w, ...] in the photo's frame [H, W, ...], zero beyond it."""
+        """Place values of the window [h, w, ...] in the photo [H, W, ...], zero elsewhere."""
         frame = np.zeros((self.height_px, self.width_px, *window.shape[2:]), np.float32)
         frame[self.window] = window.numpy()
         return frame
 
     @property
     def window(self) -> tuple[slice, slice]:
-        """Rows and columns of the photo."""
+        """The window's rows and columns in the photo."""
         height, width = self.coverage.shape
         return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
 
 def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
-    """The crop's camera, continued over the whole photo in the photo's pixels."""
+    """The crop's camera extended to the whole photo, in the photo's pixels."""
     half = crop.side_px / 2
     focal_px = crop.camera.focal_px / crop.scale
     return Camera(focal_px, width_px, height_px, crop.x0_px + half, crop.y0_px + half)
 
 
-def view_face(
-    vertices_camera: Tensor,
-    camera: Camera,
-    side_px: float,
-) -> FaceView:
-    """See the mesh [V, 3] with a camera; `side_px` is the crop's side in its pixels."""
+def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceView:
+    """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
     top, left, window = _window(vertices_camera, camera)
     triangles = grid_triangles()
     fragments = rasterize(vertices_camera, triangles, window)
@@ -75,7 +71,9 @@ def view_face(
     coverage = fragments.covered.float()
     mask = sample_texture(region_mask("face", _MASK_SIDE)[None], uv)[..., 0]
     inside = (mask * coverage > 0.02).numpy()
-    if not inside.all():  # the chart's border is steep where the face turns away, so it is softened in pixels
+    if (
+        not inside.all()
+    ):  # where the face turns away the UV mask is steep in the image, so soften it in pixels
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
         mask = mask * smooth(edge_px / max(FEATHER * side_px, 1))
     unit = F.normalize(normal, dim=-1)
@@ -83,7 +81,7 @@ def view_face(
 
 
 def _window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
-    """First row and column of the part of the picture that holds the mesh, a pixel to spare; its camera."""
+    """First row and column of the part of the image around the mesh (and a pixel more), and its camera."""
     in_front = torch.cat([vertices_camera[:, :2], vertices_camera[:, 2:].clamp(max=-_TINY)], 1)
     x, y = project(in_front, camera).T
     left, right = (int(v.floor().clamp(0, camera.width_px - 1)) for v in (x.min() - 1, x.max() + 1))
@@ -96,3 +94,15 @@ def smooth(x: Tensor) -> Tensor:
     """Smooth step of 0..1, flat at both ends."""
     x = x.clamp(0, 1)
     return x * x * (3 - 2 * x)
+
+
+def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Rasterize the mesh [V, 3]: the (u, v) of each pixel [H, W, 2] and the coverage [H, W], 0 or 1."""
+    fragments = rasterize(vertices_camera, grid_triangles(), camera)
+    return interpolate(grid_uv(), grid_triangles(), fragments), fragments.covered.float()
+
+
+def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
+    """Images [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black off the mesh."""
+    images = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
+    return images.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)

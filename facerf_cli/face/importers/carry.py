@@ -19,7 +19,14 @@ from facerf_cli.face.importers.find_landmarks import (
 )
 from facerf_cli.face.importers.source import SourceHead, SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel, load_face_model
-from facerf_cli.face.topology import GRID, LANDMARKS_M, OUTER_EYE_CORNERS, chart_uv, grid_triangles, grid_uv
+from facerf_cli.face.topology import (
+    GRID,
+    LANDMARKS_M,
+    OUTER_EYE_CORNERS,
+    cylinder_uv,
+    grid_triangles,
+    grid_uv,
+)
 
 _LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and the angle at which eye textures show it
 
@@ -33,7 +40,7 @@ def carried_head(
 ) -> HeadModel:
     """The source's own head, turned to the head frame; its skin in the chart of the canonical mean [V, 3]."""
     mean = source.mean @ rotation.T + translation
-    uv = chart_uv(mean)
+    uv = cylinder_uv(mean)
     skin = np.flatnonzero(head.part == HEAD_PARTS.index("skin"))
     uv[skin] = skin_uv(mean[skin], canonical)
     for eye in head.eyes:
@@ -63,10 +70,10 @@ def skin_uv(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
     nearest, faces = nearest_on_mesh(mesh, points)
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], nearest)
     inner = (weights[..., None] * grid[mesh.faces[faces]]).sum(1)
-    formula = chart_uv(points)
+    formula = cylinder_uv(points)
     inside = ((inner > 1e-3) & (inner < 1 - 1e-3) & (np.abs(formula - 0.5) < 0.7)).all(-1)
     border = ((grid == 0) | (grid == 1)).any(-1)
-    at = chart_uv(canonical[border])
+    at = cylinder_uv(canonical[border])
     pull = 1 / (cdist(formula, at) ** 4 + 1e-12)  # inverse distance: exact at the border, smooth beyond
     beyond = formula + (pull @ (grid[border] - at)) / pull.sum(-1, keepdims=True)
     return np.where(inside[:, None], inner, beyond)

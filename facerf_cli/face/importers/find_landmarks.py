@@ -25,8 +25,8 @@ from facerf_cli.face.topology import (
     GRID,
     LANDMARK_UV,
     LANDMARKS_M,
-    chart_rays,
-    chart_uv,
+    cylinder_rays,
+    cylinder_uv,
     grid_triangles,
     grid_uv,
     landmark_weights,
@@ -45,10 +45,10 @@ def register(
 
     The displacement of the landmarks [68, 3] from their canonical (u, v) bends the whole grid (thin plate).
     """
-    warp = RBFInterpolator(LANDMARK_UV, chart_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
+    warp = RBFInterpolator(LANDMARK_UV, cylinder_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
     uv = grid_uv().double().numpy()
     mesh = trimesh.Trimesh(mean, triangles, process=False)
-    points, covered = _cast(mesh, *chart_rays(uv + warp(uv)))
+    points, covered = _cast(mesh, *cylinder_rays(uv + warp(uv)))
     points, faces = nearest_on_mesh(mesh, _pulled(points, landmarks))
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
     weights = np.clip(weights, 0, None)
