@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from facerf_cli.baselines.explain import explain
 from torch import Tensor
 
-from facerf_cli.baselines import prt, specular_sh
-from facerf_cli.baselines.base import DETAIL, Kind
-from facerf_cli.baselines.explain import explain
+from facerf_cli.baselines import Kind, prt, specular_sh
+from facerf_cli.baselines.synthesis import DETAIL
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.weights import load_pairs
 from facerf_cli.evaluation.methods import View

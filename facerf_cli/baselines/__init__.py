@@ -1,6 +1,6 @@
-"""The reflectance models that the paper compares with (paper, 'Light Estimation'); docs/baselines.md."""
+"""The reflectance models with which the paper compares ('Light Estimation'); see docs/baselines.md."""
 
 from typing import Literal
 
-# `--reflectance`: the paper's neural field, or one of the models that it is compared with.
+# Values of `--reflectance`: the paper's neural field, or one of the models that it is compared with.
 Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]

@@ -1,8 +1,7 @@
-"""A face that is diffuse, under light of order 2: what the paper's comparison with Tewari et al. assumes.
+"""Baseline `diffuse-sh`: a diffuse face under light of order 2, after Tewari et al. (MoFA, ICCV 2017).
 
-Albedo and light are regressed by one network (`network/diffuse_sh.py`, after MoFA, ICCV 2017), and the light
-is then solved for with that albedo; a face is lit by their product alone, so it has no highlights and casts
-no shadows on itself.
+One network (`network/diffuse_sh.py`) regresses albedo and light, then the light is solved for with that
+albedo. A face is the product of its albedo and shading: it has no highlights and no cast shadows.
 """
 
 import math
@@ -17,39 +16,38 @@ from torch import Tensor
 from facerf_cli.baselines.base import Explained
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sh import coefficients_to_rig, irradiance, rig_coefficients
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.models import Models
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import COEFFICIENTS, ORDER, DiffuseNetwork, shading
-from facerf_cli.network.reflectance import resize
-from facerf_cli.pipeline import FaceTexture, Models
+from facerf_cli.network.inputs import resize
 
-_SEEN = 0.9  # of a texel, for the light's sake
-_HOLD = 1e-4  # to the network's light, as a share of the evidence on a coefficient
-_OUTLIER, _ROUNDS = 3.0, 8  # texels further off than so many median errors weigh less; of reweighting
 CHECKPOINT = Path(__file__).parents[1] / "assets" / "diffuse_sh.safetensors"
+_SEEN = 0.9  # visibility from which on a texel counts in the solution for the light
+_HOLD = 1e-4  # weight of the network's light, as a share of the evidence on a coefficient
+_OUTLIER = 3.0  # median errors from which on a texel's weight falls
+_ROUNDS = 8  # of reweighting
 
 
 @dataclass(frozen=True, eq=False)
 class Diffuse:
-    """Albedo [3, T, T] at the photo's exposure, and the normals [3, T, T] of the photo's pose."""
+    """Albedo [3, T, T] at the exposure and normals [3, T, T] in the pose of a photo; a `Reflectance`."""
 
     albedo: Tensor
     normals: Tensor
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        """See `Reflectance`; of a light its order 2 alone counts, and what that makes negative is black."""
+        """See `Reflectance`; only order 2 of the light is used, and negative radiance becomes 0."""
         normals = self.normals if turn is None else torch.einsum("dc,cij->dij", turn, self.normals)
         coefficients = rig_coefficients(RigLight(directions, weights), ORDER)
         return self.albedo * shading(normals[None], coefficients[None])[0]
 
 
 def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
-    """Albedo and light of a face's photo, by the network that is shipped where the models have none.
-
-    `fit` is not needed.
-    """
+    """Estimate albedo and light by the models' network, or by the shipped one; `fit` is not used."""
     return explain_texture(models.diffuse or load_diffuse_network(CHECKPOINT).to(models.device), face)
 
 
@@ -57,10 +55,10 @@ def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Ex
 def explain_texture(
     network: DiffuseNetwork, face: FaceTexture, fine: bool = True, refit: bool = True
 ) -> Explained:
-    """Albedo and light of a texture; the light as signed weights over the paper's 150 lights.
+    """Estimate albedo and light of a texture; the light as signed weights of the paper's 150 lights.
 
-    `fine`: the network's gain and bias are applied at the texture's own side; else at the network's.
-    `refit`: its light is where `refitted` starts. Both make the baseline stronger (benchmarks/diffuse_sh.py).
+    `fine` applies the network's gain and bias at the side of the texture, else at that of the network.
+    `refit` improves the network's light by `refitted`. Both improve the baseline (benchmarks/diffuse_sh.py).
     """
     device, side = next(network.parameters()).device, face.texture.shape[-1]
     inputs = [x[None].to(device) for x in (face.texture, face.normals, face.visible[None])]
@@ -75,9 +73,10 @@ def explain_texture(
 
 
 def refitted(reflectance: Diffuse, face: FaceTexture, coefficients: Tensor) -> Tensor:
-    """The light [9, 3] that explains a texture best given its albedo, held a little to `coefficients` [9, 3].
+    """Solve for the light [9, 3] that best explains a texture by its albedo, near `coefficients` [9, 3].
 
-    Least squares, a channel at a time; what is clipped, shadowed or covered weighs less.
+    Iteratively reweighted least squares, a channel at a time: clipped, shadowed and covered texels lose
+    weight.
     """
     seen = face.visible > _SEEN
     white = irradiance(face.normals[:, seen].T.double(), torch.eye(COEFFICIENTS).double()) / math.pi  # [N, 9]
@@ -97,7 +96,10 @@ def refitted(reflectance: Diffuse, face: FaceTexture, coefficients: Tensor) -> T
 
 @cache
 def load_diffuse_network(path: Path) -> DiffuseNetwork:
-    """The network of a checkpoint of `facerf train --stage diffuse-sh`; read once a process."""
+    """Load the network from a checkpoint of `facerf train --stage diffuse-sh`; read once per process.
+
+    Raises InputError if the checkpoint holds no such network.
+    """
     network: Any = load_networks(path, LAYOUT_VERSION)[0].get("diffuse_sh")
     if not isinstance(network, DiffuseNetwork):
         raise InputError(f"{path}: holds no diffuse network; give one by `facerf train --stage diffuse-sh`")

@@ -1,15 +1,10 @@
-"""A fitted mesh's transfer of light, baked once and kept in the user's cache for the next run.
+"""Baseline `prt`: a diffuse face that shadows itself, by precomputed radiance transfer, with one bounce.
+
+The assumption is that of Schneider et al. (*Efficient Global Illumination for Morphable Models*, ICCV 2017),
+on this project's fitted mesh and priors; their code and models are not used. They learn the transfer of a
+morphable model; here the transfer of each mesh is baked. It is kept in the user's cache for the next run:
 
     CACHE/transfer/KEY.npy   [2, K, t, t] float16; KEY is the digest of the mesh and of the bake's settings
-
-The folder is kept below `_MOST_BYTES`: the oldest go first.
-
-A diffuse face that shadows itself, in the light of spherical harmonics: precomputed radiance transfer.
-
-The assumption of Schneider et al. (*Efficient Global Illumination for Morphable Models*, ICCV 2017), one of
-the three that the paper compares with, on this project's fitted mesh and priors; their code and models are
-not used, and where they learn the transfer of a morphable model, here each mesh's own is baked
-(`baked_transfer.py`), with one bounce off a face of its mean albedo.
 """
 
 import hashlib
@@ -25,19 +20,21 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from facerf_cli.baselines.base import (
+from facerf_cli.baselines.base import Explained
+from facerf_cli.baselines.priors import SIDE, light_prior, skin_prior
+from facerf_cli.baselines.synthesis import (
     DETAIL,
-    SIDE,
-    Explained,
+    Scene,
+    SolveSettings,
     coarse,
-    light_prior,
+    light_given,
     shrunk,
-    skin_prior,
+    solve,
     with_detail,
 )
-from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import cache_folder
@@ -45,113 +42,40 @@ from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated, 
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.logs import LOGGER_NAME, json_line
-from facerf_cli.pipeline import FaceTexture, Models
+from facerf_cli.models import Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
 
-_MOST_BYTES = 256 << 20
-_VERSION = 1  # of what is computed; a change of it leaves old files unused
 log = logging.getLogger(LOGGER_NAME)
+
+_ROUNDS = 2  # of estimating the mean albedo of the face, which tints the bounce
+_MOST_BYTES = 256 << 20  # of the cache: beyond it the files that were not used for longest are removed
+_VERSION = 1  # of the bake; a change leaves older files in the cache unused
 
 
 @dataclass(frozen=True)
 class TransferSettings:
-    """Harmonics up to `order`, on `side` texels, from `lights` lamps as wide as their cells."""
+    """Order of the harmonics, `side` in texels, number of area `lights`, each as wide as its cell.
+
+    `lamp_samples` and `bounce_samples` are rays per texel for a light and for the bounce.
+    """
 
     order: int = 4
     side: int = 128
     lights: int = 200
     lamp_samples: int = 4
     bounce_samples: int = 16
-    blur_texels: float = 1.0  # against the grain of few samples
-
-
-def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Path | None = None) -> Tensor:
-    """Transfer vectors [2, K, t, t] of a mesh [V, 3] in the head frame, from the cache if they are there.
-
-    Times a light's coefficients they give a white diffuse face's radiance: direct with its own shadows, and
-    after one bounce off a face of albedo 1.
-    """
-    path = (cache or cache_folder() / "transfer") / f"{_key(vertices_head, settings)}.npy"
-    kept = _read(path, settings)
-    if kept is not None:
-        return kept
-    transfer = bake_transfer(vertices_head, settings).half()
-    try:
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.save(file, transfer.numpy())
-        _forget_oldest(path)
-    except FacerfError as error:
-        log.warning("%s; the next run bakes again", error)
-    return transfer.float()
-
-
-def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
-    """The transfer, baked (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, 2002)."""
-    positions = bake_attributes(vertices_head, GRID, settings.side).permute(1, 2, 0)
-    normals = normal_map(vertices_head, grid_triangles(), settings.side).permute(1, 2, 0)
-    directions = rig_directions(settings.lights)
-    cell_deg = float(np.degrees(2 / np.sqrt(settings.lights)))  # the radius of a cap of its solid angle
-    transport = bake_transport(
-        positions.numpy(),
-        normals.numpy(),
-        vertices_head.numpy(),
-        grid_triangles().numpy(),
-        directions.numpy(),
-        BakeSettings(settings.lamp_samples, cell_deg, settings.bounce_samples),
-    )
-    cosines = torch.einsum("lc,ijc->lij", directions, normals).clamp_min(0)
-    direct = torch.from_numpy(transport.visibility) * cosines
-    both = torch.stack([direct, torch.from_numpy(transport.bounce).float()])
-    # Sum over equal cells of 4 pi / L; over pi as the coefficients are of radiance.
-    basis = sh_basis(directions, settings.order) * (4 / settings.lights)
-    transfer = torch.einsum("lk,nlij->nkij", basis, both).numpy()
-    blur = settings.blur_texels
-    return torch.from_numpy(gaussian_filter(transfer, (0, 0, blur, blur), mode="nearest"))
-
-
-def _key(vertices_head: Tensor, settings: TransferSettings) -> str:
-    rounded_um = np.round(vertices_head.double().numpy() * 1e6).astype(np.int64)
-    made = json_line({"version": _VERSION, "layout": LAYOUT_VERSION, **asdict(settings)})
-    return hashlib.sha256(made.encode() + rounded_um.tobytes()).hexdigest()[:32]
-
-
-def _read(path: Path, settings: TransferSettings) -> Tensor | None:
-    """What is kept; None where nothing is, or nothing whole."""
-    shape = (2, (settings.order + 1) ** 2, settings.side, settings.side)
-    try:
-        kept = np.load(path, allow_pickle=False)
-        os.utime(path)  # it was of use
-    except (OSError, ValueError, EOFError):
-        return None
-    if kept.shape != shape or kept.dtype != np.float16 or not np.isfinite(kept).all():
-        return None
-    return torch.from_numpy(kept).float()
-
-
-def _forget_oldest(newest: Path) -> None:
-    """Remove files that were not used for longest until the folder is small enough; others may do so, too."""
-    found = []
-    for path in newest.parent.glob("*.npy"):
-        try:
-            facts = path.stat()
-            found.append((facts.st_mtime_ns, facts.st_size, path))
-        except OSError:
-            continue
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
-        if total <= _MOST_BYTES or path == newest:
-            break
-        path.unlink(missing_ok=True)
-        total -= size
+    blur_texels: float = 1.0  # removes the noise of few samples
 
 
 SETTINGS, BAKE = SolveSettings(), TransferSettings()
-_ROUNDS = 2  # of the face's mean albedo, which tints its bounce
 
 
 @dataclass(frozen=True, eq=False)
 class Prt:
-    """Albedo [3, T, T], and transfer [3, K, t, t] in the head frame; `rotation` [3, 3] is the photo's."""
+    """Albedo [3, T, T], transfer [3, K, t, t] in the head frame, the photo's head_to_camera [3, 3].
+
+    It is a `Reflectance`.
+    """
 
     albedo: Tensor
     transfer: Tensor
@@ -179,7 +103,7 @@ def explain_by_prt(
     bake: TransferSettings = BAKE,
     detail: float = DETAIL,
 ) -> Explained:
-    """The most probable albedo and light of a fitted photo."""
+    """Estimate the most probable albedo and light of a fitted photo."""
     vertices = models.face.vertices(fit.alpha[None], fit.beta[None])[0]
     direct, bounce = baked_transfer(vertices, bake)
     side = face.texture.shape[-1]
@@ -198,9 +122,92 @@ def explain_by_prt(
 
 
 def _scene(transfer: Tensor, fit: FaceFit, face: FaceTexture) -> Scene:
-    """The photo, and a transfer in the head frame as one in camera space, where the light's prior is."""
+    """The photo with its transfer, rotated from the head frame to camera space, as the prior of light is."""
     camera_to_head = rotated(torch.eye(transfer.shape[1]), fit.rotation.T)  # [K, K] of coefficients
     small = F.interpolate(transfer, (SIDE, SIDE), mode="area").flatten(2)
     radiance, trust = coarse(face)
     in_camera = torch.einsum("ckn,kj->cnj", small, camera_to_head)
     return Scene(radiance.flatten(1), trust.flatten(), in_camera, None)
+
+
+def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Path | None = None) -> Tensor:
+    """Transfer vectors [2, K, t, t] of a mesh [V, 3] in the head frame, from the cache if they are there.
+
+    Times the coefficients of a light they give the radiance of a white diffuse face: [0] direct, with its own
+    shadows, and [1] after one bounce off a face of albedo 1.
+    """
+    path = (cache or cache_folder() / "transfer") / f"{_key(vertices_head, settings)}.npy"
+    kept = _read(path, settings)
+    if kept is not None:
+        return kept
+    transfer = bake_transfer(vertices_head, settings).half()
+    try:
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            np.save(file, transfer.numpy())
+        _remove_oldest(path)
+    except FacerfError as error:
+        log.warning("%s; the next run bakes the transfer again", error)
+    return transfer.float()
+
+
+def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
+    """Bake the transfer (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, 2002)."""
+    positions = bake_attributes(vertices_head, GRID, settings.side).permute(1, 2, 0)
+    normals = normal_map(vertices_head, grid_triangles(), settings.side).permute(1, 2, 0)
+    directions = rig_directions(settings.lights)
+    cell_deg = float(np.degrees(2 / np.sqrt(settings.lights)))  # the radius of a cap of a cell's solid angle
+    transport = bake_transport(
+        positions.numpy(),
+        normals.numpy(),
+        vertices_head.numpy(),
+        grid_triangles().numpy(),
+        directions.numpy(),
+        BakeSettings(settings.lamp_samples, cell_deg, settings.bounce_samples),
+    )
+    cosines = torch.einsum("lc,ijc->lij", directions, normals).clamp_min(0)
+    direct = torch.from_numpy(transport.visibility) * cosines
+    both = torch.stack([direct, torch.from_numpy(transport.bounce).float()])
+    # A sum over cells of solid angle 4 pi / L, divided by pi, as the coefficients are of radiance.
+    basis = sh_basis(directions, settings.order) * (4 / settings.lights)
+    transfer = torch.einsum("lk,nlij->nkij", basis, both).numpy()
+    blur = settings.blur_texels
+    return torch.from_numpy(gaussian_filter(transfer, (0, 0, blur, blur), mode="nearest"))
+
+
+def _key(vertices_head: Tensor, settings: TransferSettings) -> str:
+    rounded_um = np.round(vertices_head.double().numpy() * 1e6).astype(np.int64)
+    bake = json_line({"version": _VERSION, "layout": LAYOUT_VERSION, **asdict(settings)})
+    return hashlib.sha256(bake.encode() + rounded_um.tobytes()).hexdigest()[:32]
+
+
+def _read(path: Path, settings: TransferSettings) -> Tensor | None:
+    """Read a transfer from the cache; None if it is missing or damaged."""
+    shape = (2, (settings.order + 1) ** 2, settings.side, settings.side)
+    try:
+        kept = np.load(path, allow_pickle=False)
+        os.utime(path)  # marks it as used
+    except (OSError, ValueError, EOFError):
+        return None
+    if kept.shape != shape or kept.dtype != np.float16 or not np.isfinite(kept).all():
+        return None
+    return torch.from_numpy(kept).float()
+
+
+def _remove_oldest(newest: Path) -> None:
+    """Remove the files that were not used for longest until the folder is small enough.
+
+    Other processes may remove files at the same time.
+    """
+    found = []
+    for path in newest.parent.glob("*.npy"):
+        try:
+            facts = path.stat()
+            found.append((facts.st_mtime_ns, facts.st_size, path))
+        except OSError:
+            continue
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= _MOST_BYTES or path == newest:
+            break
+        path.unlink(missing_ok=True)
+        total -= size

@@ -1,9 +1,9 @@
-"""A face of diffuse and specular albedo in the light of spherical harmonics, without shadows of its own.
+"""Baseline `specular-sh`: a face of diffuse and specular albedo in the light of spherical harmonics.
 
-The assumption of Smith et al. (*A Morphable Face Albedo Model*, CVPR 2020), one of the three that the paper
-compares with, on this project's fitted mesh and priors; their code and their model of albedo are not used.
-The diffuse part takes light of order 2 (Ramamoorthi and Hanrahan, *An Efficient Representation for
-Irradiance Environment Maps*, 2001), the gloss a Blinn-Phong lobe about the mirrored view, filtered in
+The assumption is that of Smith et al. (*A Morphable Face Albedo Model*, CVPR 2020), on this project's fitted
+mesh and priors; their code and their model of albedo are not used. No part of the face shadows another. The
+diffuse part uses light of order 2 (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance
+Environment Maps*, 2001). The gloss is a Blinn-Phong lobe about the reflected view direction, filtered in
 spherical harmonics (the same authors' *Frequency Space Environment Map Rendering*, 2002).
 """
 
@@ -16,35 +16,37 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.baselines.base import (
+from facerf_cli.baselines.base import Explained
+from facerf_cli.baselines.priors import SIDE, light_prior, skin_prior
+from facerf_cli.baselines.synthesis import (
     DETAIL,
-    SIDE,
-    Explained,
+    Scene,
+    SolveSettings,
     coarse,
-    light_prior,
+    light_given,
     shrunk,
-    skin_prior,
+    solve,
     with_detail,
 )
-from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, rig_coefficients, sh_basis
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import FaceTexture, Models
+from facerf_cli.models import Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
 
 DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
-EXPONENT = 12.0  # of the Blinn-Phong lobe, which then ends at GLOSS_ORDER
+EXPONENT = 12.0  # of the Blinn-Phong lobe, which then has no degrees above GLOSS_ORDER
 SETTINGS = SolveSettings()
-_NODES = 256  # at which the lobe is integrated
+_NODES = 256  # of the quadrature of the lobe
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Texels in camera space, of the photo's pose: unit normals and positions [3, T, T] in metres.
+class FaceSurface:
+    """Unit normals and positions [3, T, T] (m) of the texels, in camera space and the pose of the photo.
 
-    The head turns about `centre_m` [3].
+    `centre_m` [3] is the point about which the head rotates.
     """
 
     normals: Tensor
@@ -52,18 +54,21 @@ class Surface:
     centre_m: Tensor
 
     def views(self, turn: Tensor | None) -> Tensor:
-        """Unit directions [3, T, T] to the camera of the head turned by `turn`, in the photo's pose."""
+        """Unit directions [3, T, T] toward the camera of the head rotated by `turn`, in the photo's pose."""
         if turn is None:
             return F.normalize(-self.positions_m, dim=0)
-        camera_m = self.centre_m - turn.T @ self.centre_m  # where the camera is to the unturned head
+        camera_m = self.centre_m - turn.T @ self.centre_m  # the camera relative to the head in its old pose
         return F.normalize(camera_m[:, None, None] - self.positions_m, dim=0)
 
 
 @dataclass(frozen=True, eq=False)
 class SpecularSh:
-    """Diffuse albedo [3, T, T] and reflectance at normal incidence [1, T, T] on a surface."""
+    """Diffuse albedo [3, T, T] and gloss [1, T, T] of a surface; a `Reflectance`.
 
-    surface: Surface
+    Gloss is the reflectance at normal incidence.
+    """
+
+    surface: FaceSurface
     albedo: Tensor
     gloss: Tensor
 
@@ -75,7 +80,7 @@ class SpecularSh:
         return (self.albedo * shading + self.gloss * shining).clamp_min(0)
 
     def parts(self, light: Tensor, turn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Radiance of a white diffuse face, and of gloss 1 [M, 3, T, T], for coefficients [M, K, 3]."""
+        """Radiance [M, 3, T, T] of a white diffuse face, and of gloss 1, for coefficients [M, K, 3]."""
         transfer = diffuse_transfer(self.surface.normals)
         mirror = mirror_transfer(self.surface.normals, self.surface.views(turn))
         low = transfer.shape[-1]
@@ -90,7 +95,7 @@ def explain_by_specular_sh(
     settings: SolveSettings = SETTINGS,
     detail: float = DETAIL,
 ) -> Explained:
-    """The most probable albedo, gloss and light of a fitted photo."""
+    """Estimate the most probable albedo, gloss and light of a fitted photo."""
     vertices = fit.vertices_camera(models.face)
     small = _surface(vertices, fit, SIDE)
     transfer = diffuse_transfer(small.normals)
@@ -110,19 +115,19 @@ def explain_by_specular_sh(
     return Explained(SpecularSh(surface, albedo.exp(), gloss.exp()), coefficients_to_rig(coefficients))
 
 
-def _surface(vertices: Tensor, fit: FaceFit, side: int) -> Surface:
+def _surface(vertices: Tensor, fit: FaceFit, side: int) -> FaceSurface:
     positions_m = bake_attributes(vertices, GRID, side)
-    return Surface(normal_map(vertices, grid_triangles(), side), positions_m, fit.translation_m)
+    return FaceSurface(normal_map(vertices, grid_triangles(), side), positions_m, fit.translation_m)
 
 
 def diffuse_transfer(normals: Tensor) -> Tensor:
-    """Radiance [T, T, 9] of a white Lambertian face of normals [3, T, T], a coefficient of the light."""
+    """Radiance [T, T, 9] of a white Lambertian face of normals [3, T, T], per coefficient of the light."""
     lobes = [cosine_lobe(degree) / math.pi for degree in range(DIFFUSE_ORDER + 1)]
     return sh_basis(normals.permute(1, 2, 0), DIFFUSE_ORDER) * _by_degree(tuple(lobes))
 
 
 def mirror_transfer(normals: Tensor, views: Tensor) -> Tensor:
-    """Radiance [T, T, K] of gloss 1, a coefficient of the light, for normals and views [3, T, T]."""
+    """Radiance [T, T, K] of gloss 1 for normals and views [3, T, T], per coefficient of the light."""
     cosine = (normals * views).sum(0).clamp(0, 1)
     mirrored = 2 * cosine * normals - views
     mirrored = F.normalize(mirrored, dim=0).permute(1, 2, 0)
@@ -131,15 +136,16 @@ def mirror_transfer(normals: Tensor, views: Tensor) -> Tensor:
 
 
 def _by_degree(factors: tuple[float, ...]) -> Tensor:
-    """A factor of each degree as one of each coefficient [K]."""
+    """Repeat a factor for each degree as one for each coefficient [K]."""
     return torch.cat([torch.full((2 * degree + 1,), factor) for degree, factor in enumerate(factors)])
 
 
 @cache
 def _blinn_phong(exponent: float, order: int) -> tuple[float, ...]:
-    """The factors at degrees 0 to `order` of a lobe cos^exponent(angle / 2) whose integral is 1.
+    """Factors at degrees 0 to `order` of a lobe cos^exponent(angle / 2) whose integral is 1.
 
-    The half vector's angle to the normal is half the light's to the mirrored view, in the plane of both.
+    In the plane of both, the angle of the half vector to the normal is half that of the light to the
+    reflected view direction.
     """
     cosine, share = np.polynomial.legendre.leggauss(_NODES)
     lobe = share * ((1 + cosine) / 2) ** (exponent / 2)

@@ -1,44 +1,51 @@
-"""Analysis by synthesis: albedo and light of one photo, as coordinates of their priors.
+"""Analysis by synthesis: the most probable albedo, gloss and light of one photo under their priors.
 
-A photo's texture is taken to be exp(albedo) * (transfer x) + exp(gloss) * (mirror x), where x are the light's
-spherical-harmonic coefficients and the transfers, linear in them, hold what geometry does to light. The most
-probable albedo, gloss and light are found together by damped Gauss-Newton steps, a small problem as all three
-are Gaussian (Blanz and Vetter, *A Morphable Model for the Synthesis of 3D Faces*, 1999, do so step by step).
-What no skin explains (hair, glasses, clipped highlights) is weighed down by a Cauchy weight.
+The texture of a photo is modelled as exp(albedo) * (transfer x) + exp(gloss) * (mirror x), where x are the
+spherical-harmonic coefficients of the light, and the transfers, linear in x, hold the effect of the geometry.
+Albedo, gloss and light, as coordinates of Gaussian priors, are found together by damped Gauss-Newton steps
+(Blanz and Vetter, *A Morphable Model for the Synthesis of 3D Faces*, 1999, optimise them likewise). Texels
+that the priors cannot explain (hair, glasses, clipped highlights) lose influence by a Cauchy weight.
 """
 
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.baselines.base import LightPrior, LogGaussian
+from facerf_cli.baselines.priors import SIDE, LightPrior, LogGaussian
+from facerf_cli.face.head import FaceTexture
+from facerf_cli.face.topology import region_mask
 
-_FLOOR = 0.1  # of the mean radiance, below which errors do not grow: they are relative to the radiance
-_FIRM_STEPS = 3  # before outliers are told by the fit
+DETAIL = 0.5  # share of the photo's residual that is added to the albedo
+_SEEN = 0.5  # visible share of a coarse texel from which on it counts
+_FLOOR = 0.1  # share of the mean radiance: relative errors are relative to at least this
+_SHADOW_FLOOR = 0.15  # share of the mean shading: in darker shadow less of the residual is added
+_MOST_DETAIL = 1.5  # bound of the residual's logarithm
+_FIRM_STEPS = 3  # before outliers are found by their errors
 _OUTLIER = 2.0  # median errors at which a texel's weight is halved
 
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """`evidence`: what all texels' relative errors weigh together, against priors of unit variance.
+    """Number of steps, and `evidence`: the weight of all texels together against priors of unit variance.
 
-    Neighbouring texels err together, so it is far less than a term a texel would make it.
+    Errors of neighbouring texels are correlated, so that it is far less than the number of texels.
     """
 
     evidence: float = 500.0
     steps: int = 15
 
 
-_OF_LIGHT = SolveSettings(evidence=2e4)
+_LIGHT_SETTINGS = SolveSettings(evidence=2e4)  # for the light alone, of which a photo says more
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """N texels of a photo, in the chart's order of the priors' fields.
+    """N texels of a photo, in the order of the priors' texels.
 
-    radiance [3, N]; trust [N] in 0..1; transfer [3, N, K]: radiance of a white diffuse face a coefficient;
-    mirror [N, K] of one with gloss 1, None where nothing shines.
+    radiance [3, N]; trust [N] in 0..1; transfer [3, N, K], the radiance of a white diffuse face per
+    coefficient of the light; mirror [N, K], that of a face with gloss 1, or None without gloss.
     """
 
     radiance: Tensor
@@ -49,31 +56,77 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Coordinates of albedo and gloss, and the light's coefficients [K, 3]."""
+    """Coordinates of albedo and gloss, and coefficients [K, 3] of the light."""
 
     albedo: Tensor
     gloss: Tensor
     light: Tensor
 
 
-def light_given(scene: Scene, albedo: Tensor, gloss: Tensor, light: LightPrior) -> Tensor:
-    """The light [K, 3] of a scene whose logarithms of albedo [3, t, t] and gloss [1, t, t] are known.
+def coarse(face: FaceTexture) -> tuple[Tensor, Tensor]:
+    """Radiance [3, t, t] of a photo at the side of the priors, and its trust [t, t], 0 in the eyes."""
+    share = F.interpolate(face.visible[None, None], (SIDE, SIDE), mode="area")[0, 0]
+    seen = F.interpolate((face.texture * face.visible)[None], (SIDE, SIDE), mode="area")[0]
+    trust = share * (share > _SEEN) * (1 - region_mask("eyes", SIDE))
+    return seen / share.clamp_min(1e-6), trust
 
-    The photo says more of it than of a face that is still to be found.
-    """
-    return solve(scene, _known(albedo), _known(gloss), light, _OF_LIGHT).light
+
+def shrunk(field: Tensor) -> Tensor:
+    """A texture [C, T, T] at the side of the priors."""
+    return F.interpolate(field[None], (SIDE, SIDE), mode="area")[0]
+
+
+def solve(
+    scene: Scene,
+    albedo: LogGaussian,
+    gloss: LogGaussian,
+    light: LightPrior,
+    settings: SolveSettings = SolveSettings(),
+) -> Solution:
+    """Find the most probable albedo, gloss and light of a scene whose texels are the priors' [t, t]."""
+    seen = scene.trust > 0
+    scale = float((scene.radiance[:, seen].mean(0) * scene.trust[seen]).sum() / scene.trust.sum())
+    if not scale > 0:  # a black photo has no light and says nothing about the face
+        dark = torch.zeros_like(light.mean)
+        return Solution(torch.zeros(len(albedo.modes)), torch.zeros(len(gloss.modes)), dark)
+    problem = _problem(scene, seen, scale, albedo, gloss, light, settings)
+    state = _minimise(problem, settings.steps)
+    _, _, albedo_at, gloss_at = problem.split(state)
+    return Solution(albedo_at.float(), gloss_at.float(), scale * problem.light_of(state).float())
+
+
+def light_given(scene: Scene, albedo: Tensor, gloss: Tensor, light: LightPrior) -> Tensor:
+    """Find the light [K, 3] of a scene whose logarithms of albedo [3, t, t] and gloss [1, t, t] are known."""
+    return solve(scene, _known(albedo), _known(gloss), light, _LIGHT_SETTINGS).light
 
 
 def _known(logarithm: Tensor) -> LogGaussian:
     return LogGaussian(logarithm, logarithm.new_zeros(0, *logarithm.shape))
 
 
+def with_detail(albedo: Tensor, face: FaceTexture, shading: Tensor, shining: Tensor, share: float) -> Tensor:
+    """Add a share of the photo's residual to the logarithm of an albedo [3, T, T].
+
+    `shading` [3, T, T] is the radiance of a white diffuse face in the photo's light, `shining` that of the
+    gloss. Less is added where the photo is dark or the face hidden: it is the most probable residual under a
+    Gaussian prior, with noise relative to the shading.
+    """
+    if share == 0:
+        return albedo
+    floor = _SHADOW_FLOOR * (shading * face.visible).sum((1, 2)) / face.visible.sum()
+    floor = floor.clamp_min(1e-9)[:, None, None]
+    lit = shading.clamp_min(0) + floor
+    lacking = (face.texture - shining + floor * albedo.exp()).clamp_min(1e-9).log() - lit.log() - albedo
+    finer = albedo + share * face.visible * lacking.clamp(-_MOST_DETAIL, _MOST_DETAIL)
+    return finer.clamp(max=0)  # nothing reflects more light than it receives
+
+
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """All in float64 and flattened; texels of no trust are left out."""
+    """A scene and priors in float64, flattened, without texels of trust 0."""
 
     radiance: Tensor  # [3, N], of mean 1
-    evidence: Tensor  # [N], of a texel's squared relative error
+    evidence: Tensor  # [N], weight of a texel's squared relative error
     transfer: Tensor  # [3, N, K]
     mirror: Tensor | None
     albedo: tuple[Tensor, Tensor]  # mean [3, N] and modes [Q, 3, N] of logarithms
@@ -90,25 +143,6 @@ class _Problem:
         """Coefficients [K, 3]."""
         strength, light, _, _ = self.split(state)
         return strength.exp() * (self.light.mean + torch.einsum("r,rkc->kc", light, self.light.modes))
-
-
-def solve(
-    scene: Scene,
-    albedo: LogGaussian,
-    gloss: LogGaussian,
-    light: LightPrior,
-    settings: SolveSettings = SolveSettings(),
-) -> Solution:
-    """The most probable albedo, gloss and light of a scene whose texels are the priors' [t, t]."""
-    seen = scene.trust > 0
-    scale = float((scene.radiance[:, seen].mean(0) * scene.trust[seen]).sum() / scene.trust.sum())
-    if not scale > 0:  # black: no light, and nothing to be said of the face
-        dark = torch.zeros_like(light.mean)
-        return Solution(torch.zeros(len(albedo.modes)), torch.zeros(len(gloss.modes)), dark)
-    problem = _problem(scene, seen, scale, albedo, gloss, light, settings)
-    state = _minimise(problem, settings.steps)
-    _, _, albedo_at, gloss_at = problem.split(state)
-    return Solution(albedo_at.float(), gloss_at.float(), scale * problem.light_of(state).float())
 
 
 def _problem(
@@ -138,18 +172,18 @@ def _problem(
 
 
 def _minimise(problem: _Problem, steps: int) -> Tensor:
-    """The state of least cost, from the mean face in the mean light of the right strength."""
+    """Minimise the cost, starting from the mean face in the mean light of the right strength."""
     size = 1 + len(problem.light.modes) + len(problem.albedo[1]) + len(problem.gloss[1])
     state = torch.zeros(size, dtype=torch.float64)
     image, _ = _synthesise(problem, state, with_slopes=False)
     state[0] = -image.mean().clamp_min(1e-6).log()
     damping = 1e-3
     prior = torch.ones(size, dtype=torch.float64)
-    prior[0] = 0  # any exposure is as likely
+    prior[0] = 0  # all strengths of the light are equally probable
     for step in range(steps):
         image, slopes = _synthesise(problem, state)
         error = image - problem.radiance
-        # Against the greater of the two, or black hair would count for more than the face.
+        # Errors are relative to the greater radiance, or black hair would weigh more than the face.
         reach = torch.maximum(image, problem.radiance) + _FLOOR
         weight = problem.evidence / reach.square()
         if step >= _FIRM_STEPS:
@@ -171,7 +205,7 @@ def _minimise(problem: _Problem, steps: int) -> Tensor:
 
 
 def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> tuple[Tensor, Tensor]:
-    """The picture [3, N] and, for all of the state, its slopes [S, 3, N]."""
+    """Radiance [3, N] at a state, and its derivatives [S, 3, N] by the state's elements."""
     strength, _, albedo_at, gloss_at = problem.split(state)
     light = problem.light_of(state)
     diffuse = (problem.albedo[0] + torch.einsum("q,qcn->cn", albedo_at, problem.albedo[1])).exp()
@@ -192,7 +226,7 @@ def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> t
 
 
 def _robust(relative: Tensor) -> Tensor:
-    """Cauchy weights [N] of the texels' relative errors [3, N], against their median."""
+    """Cauchy weights [N] of the texels' relative errors [3, N], scaled by their median."""
     size = relative.abs().mean(0)
     return 1 / (1 + (size / (_OUTLIER * size.median() + 1e-9)).square())
 

@@ -1,6 +1,6 @@
 """The priors of the baselines, learnt from procedural skins and maps.
 
-`python -m facerf_cli.synth.baseline_priors FILE` writes the asset that `baselines/base.py` loads; no dataset
+`python -m facerf_cli.synth.baseline_priors FILE` writes the asset that `baselines/priors.py` loads; no dataset
 uses its seeds. Light differs by direction: there is more from above than from below, and its colours vary
 together. Its prior has the mean and covariance of procedural maps, turned about the vertical, each of mean
 radiance 1.
@@ -13,13 +13,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines.base import ASSET, SIDE, LightPrior, LogGaussian
+from facerf_cli.baselines.priors import ASSET, SIDE, LightPrior, LogGaussian
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
 from facerf_cli.network.checkpoint import save_checkpoint
 from facerf_cli.synth.appearance.people import draw_people
 from facerf_cli.synth.appearance.skin import paint_skin
-from facerf_cli.synth.random_fields import CHART_SPAN, Window, mask
+from facerf_cli.synth.random_fields import UV_SPAN, Window, mask
 from facerf_cli.synth.sky.skies import draw_sky
 
 SEED = 52017
@@ -39,7 +39,7 @@ def learn_skin(skins: int = SKINS) -> tuple[LogGaussian, LogGaussian]:
     for first in range(0, skins, _AT_ONCE):
         people = draw_people(min(_AT_ONCE, skins - first), generator)
         people = replace(people, random_texture=torch.zeros_like(people.random_texture))
-        skin = paint_skin(people, Window(SIDE, CHART_SPAN), generator, painted_eyes=True)
+        skin = paint_skin(people, Window(SIDE, UV_SPAN), generator, painted_eyes=True)
         shine = _SHINE * torch.randn(len(skin.specular), 1, 1, 1, generator=generator)
         diffuse.append(_with_mouths(skin.albedo, generator).log())
         gloss.append(skin.specular.log() + shine)
@@ -48,7 +48,7 @@ def learn_skin(skins: int = SKINS) -> tuple[LogGaussian, LogGaussian]:
 
 def _with_mouths(albedo: Tensor, generator: torch.Generator) -> Tensor:
     """Lips [B, 3, t, t] as they are when closed, or open on teeth, or on the dark."""
-    inside = mask(Window(SIDE, CHART_SPAN), "mouth", 1.0)
+    inside = mask(Window(SIDE, UV_SPAN), "mouth", 1.0)
     kind = torch.randint(3, (len(albedo), 1, 1, 1), generator=generator)
     between = torch.where(kind == 1, _TEETH, _DARK)
     return torch.where(kind == 0, albedo, albedo + inside * (between - albedo))

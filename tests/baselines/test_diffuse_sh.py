@@ -12,9 +12,10 @@ from facerf_cli.baselines.diffuse_sh import (
     refitted,
 )
 from facerf_cli.errors import InputError
+from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.models import DEFAULT_CHECKPOINT
 from facerf_cli.network.diffuse_sh import shading
-from facerf_cli.pipeline import DEFAULT_CHECKPOINT, FaceTexture
 from facerf_cli.raster.camera import pose_to_rotation
 
 

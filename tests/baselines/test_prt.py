@@ -95,7 +95,7 @@ def test_a_second_run_does_not_bake(
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_damaged_file_is_baked_anew(
+def test_a_damaged_file_is_baked_again(
     vertices: Tensor, transfer: Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(baked, "bake_transfer", lambda *_: transfer)
@@ -130,4 +130,4 @@ def test_a_cache_that_cannot_be_written_is_a_warning(
     (tmp_path / "file").write_text("not a folder")
     caplog.set_level("WARNING")
     assert baked.baked_transfer(vertices, SMALL, tmp_path / "file").isfinite().all()
-    assert "bakes again" in caplog.text
+    assert "the next run bakes the transfer again" in caplog.text

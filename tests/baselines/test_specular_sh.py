@@ -8,23 +8,23 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.baselines import specular_sh
-from facerf_cli.baselines.specular_sh import SpecularSh, Surface, diffuse_transfer, mirror_transfer
+from facerf_cli.baselines.specular_sh import FaceSurface, SpecularSh, diffuse_transfer, mirror_transfer
 from facerf_cli.light.sh import irradiance, rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 
 T = 33
 
 
-def ball(centre_m: float = -1.0, radius_m: float = 0.1) -> Surface:
+def ball(centre_m: float = -1.0, radius_m: float = 0.1) -> FaceSurface:
     """The front of a ball; texels are spread over x and y of its normals."""
     axis = torch.linspace(-0.9, 0.9, T)
     y, x = torch.meshgrid(-axis, axis, indexing="ij")
     normals = F.normalize(torch.stack([x, y, (1 - x * x - y * y).clamp_min(0.01).sqrt()]), dim=0)
     centre = torch.tensor([0.0, 0.0, centre_m])
-    return Surface(normals, centre[:, None, None] + radius_m * normals, centre)
+    return FaceSurface(normals, centre[:, None, None] + radius_m * normals, centre)
 
 
-def shiny(surface: Surface, albedo: float = 0.4, gloss: float = 0.1) -> SpecularSh:
+def shiny(surface: FaceSurface, albedo: float = 0.4, gloss: float = 0.1) -> SpecularSh:
     return SpecularSh(surface, torch.full((3, T, T), albedo), torch.full((1, T, T), gloss))
 
 
@@ -71,7 +71,7 @@ def test_a_ball_that_turns_about_its_middle_looks_as_before() -> None:
     turned = shiny(surface).relit(rig, weights, turn)[0]
     normals = torch.einsum("dc,cij->dij", turn, surface.normals)
     positions = surface.centre_m[:, None, None] + 0.1 * normals
-    wanted = shiny(Surface(normals, positions, surface.centre_m)).relit(rig, weights)[0]
+    wanted = shiny(FaceSurface(normals, positions, surface.centre_m)).relit(rig, weights)[0]
     assert torch.allclose(turned, wanted, atol=1e-5)
     assert not torch.allclose(turned, shiny(surface).relit(rig, weights)[0], atol=0.01)
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.baselines import synthesis
-from facerf_cli.baselines.base import LightPrior, LogGaussian
+from facerf_cli.baselines.priors import LightPrior, LogGaussian
 from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
 
 T, K = 12, 9

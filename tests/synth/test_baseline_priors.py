@@ -2,7 +2,7 @@
 
 import torch
 
-from facerf_cli.baselines.base import ASSET, SIDE, light_prior, skin_prior
+from facerf_cli.baselines.priors import ASSET, SIDE, light_prior, skin_prior
 from facerf_cli.face.topology import region_mask
 from facerf_cli.synth import baseline_priors
 from facerf_cli.synth.baseline_priors import LIGHT_ORDER, learn_light, learn_skin

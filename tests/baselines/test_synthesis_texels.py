@@ -2,9 +2,10 @@
 
 import torch
 
-from facerf_cli.baselines.base import SIDE, coarse, shrunk, with_detail
+from facerf_cli.baselines.priors import SIDE
+from facerf_cli.baselines.synthesis import coarse, shrunk, with_detail
+from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import region_mask
-from facerf_cli.pipeline import FaceTexture
 
 T = 128
 
