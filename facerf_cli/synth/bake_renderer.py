@@ -20,7 +20,7 @@ from torch import Tensor
 from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.synth.appearance.materials import Appearance, Surface, sample
+from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sample
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.shading import Cosines, Strands, strand_cosines, strand_highlights, two_lobes, unit
 from facerf_cli.synth.views import StageCamera
@@ -36,7 +36,7 @@ class Facets:
     part: Tensor  # [N]
     corners: csr_matrix  # [N, W] barycentric weights; rows sum to 1
     tinted: list[csr_matrix]  # [N, V] a channel: those times albedo
-    surface: Surface
+    surface: MaterialPoints
     normals: Tensor  # [N, 3] unit, as are the rest
     bent: Tensor
     views: Tensor
@@ -50,7 +50,7 @@ class Facets:
             self.part[rows],
             self.corners[rows],
             [matrix[rows] for matrix in self.tinted],
-            Surface(*(getattr(self.surface, field.name)[rows] for field in fields(Surface))),
+            MaterialPoints(*(getattr(self.surface, field.name)[rows] for field in fields(MaterialPoints))),
             *(getattr(self, name)[rows] for name in ("normals", "bent", "views", "tangents", "spread")),
         )
 
@@ -95,7 +95,7 @@ def facets_of(
         part=torch.from_numpy(key % len(PARTS)),
         corners=corners,
         tinted=[tinted(channel) for channel in surface.albedo.T],
-        surface=Surface(*(mean(getattr(surface, field.name)) for field in fields(Surface))),
+        surface=MaterialPoints(*(mean(getattr(surface, field.name)) for field in fields(MaterialPoints))),
         normals=unit(mean(smooth), 1),
         bent=unit(bent, 1),
         views=unit(eye_head - torch.from_numpy(corners @ head.vertices[vertices]), 1),

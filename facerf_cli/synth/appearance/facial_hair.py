@@ -1,4 +1,4 @@
-"""Hair that is painted on the skin: brows and beards of single strokes, stubble, the scalp's cover."""
+"""Hair painted on the skin: brows and beards of single strokes, stubble, short hair on the scalp."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.topology import CHART_MM
+from facerf_cli.face.topology import UV_SIZE_MM
 from facerf_cli.synth.appearance.people import People, each
 from facerf_cli.synth.random_fields import (
     LANDMARK_MM,
@@ -22,14 +22,14 @@ from facerf_cli.synth.random_fields import (
     splat,
 )
 
-# Of the brow from its inner to its outer end: half its height in millimetres, where the hairs point (degrees
-# above the way outward), how long they are.
+# The brow from its inner to its outer end: half height, direction of the hairs (degrees above the direction
+# outward) and their length.
 _BROW_HALF_MM = (3.3, 4.2, 3.7, 2.6, 1.1)
 _BROW_RISE_DEG = (74, 48, 26, 10, -6)
 _BROW_LENGTH_MM = (5.0, 7.5, 8.5, 8.0, 6.0)
-_BROW_HAIRS = 420
-_BEARD_HAIRS_MM2 = 0.6  # a square millimetre
-# Upper edge of the beard and of the scalp's hair: (u, v), u from the midline outward.
+_BROW_HAIRS = 420  # per brow
+_BEARD_HAIRS_MM2 = 0.6  # per square millimetre
+# Upper edge of the beard, and lower edge of the scalp's hair: (distance from the midline in u, v) | ...
 _BEARD_EDGE = """
 0 0.80 | 0.05 0.80 | 0.075 0.755 | 0.11 0.72 | 0.14 0.68 | 0.20 0.665 | 0.30 0.60 | 0.38 0.49 | 0.43 0.40 |
 0.47 0.33 | 0.55 0.36 | 0.62 1.2 | 1.0 1.3
@@ -42,7 +42,7 @@ _SCALP_EDGE = """
 
 @dataclass(frozen=True)
 class FacialHair:
-    """Cover by hair [B, 1, T, T] in 0..1, and the shadow of what is cut below the surface, as absorbance."""
+    """Cover by hair [B, 1, T, T] in 0..1; shadow: absorbance of shaved hair below the surface."""
 
     brows: Tensor
     beard: Tensor
@@ -50,27 +50,27 @@ class FacialHair:
 
     @property
     def cover(self) -> Tensor:
-        """All hair together."""
+        """Cover by brows and beard together."""
         return 1 - (1 - self.brows) * (1 - self.beard)
 
 
 def draw_facial_hair(people: People, window: Window, generator: torch.Generator) -> FacialHair:
-    """Brows and beard of every person."""
+    """Draw brows and beard of every person."""
     brows = _brows(people, window, generator)
     beard, shadow = _beards(people, window, generator)
     return FacialHair(brows, beard, shadow)
 
 
 def _coarseness(window: Window) -> float:
-    """How many hairs are drawn as one, where texels are too large to tell them apart."""
+    """Number of hairs drawn as one stroke, because texels are too large to separate them."""
     return max(1.0, min(window.texel_mm) / 0.6)
 
 
 def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor:
-    """Cover [B, 1, T, T] by the brows' single hairs."""
+    """Draw the cover [B, 1, T, T] by the single hairs of the brows."""
     merged = _coarseness(window)
     number = (_BROW_HAIRS * people.brow_fullness / merged).long()
-    sides = torch.stack([number, number], -1).view(-1)  # of every face the right brow, then the left
+    sides = torch.stack([number, number], -1).view(-1)  # for every face the right brow, then the left one
     owner = torch.repeat_interleave(torch.arange(len(sides)), sides)
     face, mirrored = owner // 2, (owner % 2).bool()
     count = len(owner)
@@ -88,7 +88,7 @@ def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor
     bend = torch.deg2rad(-18 - 16 * normal().abs()) * (1 - along)
     length = _lookup(_BROW_LENGTH_MM, along) * (0.75 + 0.4 * torch.rand(count, generator=generator))
     roots = middle + torch.stack([torch.zeros(count), across * half], -1)
-    # A hair begins behind its place, so that it is centred on it.
+    # A hair starts behind its place, so that it is centred there.
     roots = roots - 0.35 * length[:, None] * torch.stack([rise.cos(), -rise.sin()], -1)
     roots = torch.where(mirrored[:, None], roots * torch.tensor([-1.0, 1.0]), roots)
     rise, bend = torch.where(mirrored, torch.pi - rise, rise), torch.where(mirrored, -bend, bend)
@@ -97,7 +97,7 @@ def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor
 
 
 def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
-    """Middle of the right-hand brow [N, 2] at 0 (inner) to 1 (outer end), and its rise there in degrees."""
+    """Middle [N, 2] of the right brow at 0 (inner end) to 1 (outer end), and its slope there in degrees."""
     points = torch.from_numpy(LANDMARK_MM[22:27]).float() + torch.tensor([0.0, 1.8])
     at = along.clamp(0, 1) * 4
     low = at.floor().clamp(max=3).long()
@@ -109,24 +109,25 @@ def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _lookup(values: tuple[float, ...], at: Tensor) -> Tensor:
+    """Values interpolated at positions [N] in 0..1."""
     found = np.interp(at.numpy(), np.linspace(0, 1, len(values)), values)
     return torch.from_numpy(found).float()
 
 
-def below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tensor:
-    """Millimetres [1 or B, 1, T, T] below an edge given from the midline outward, mirrored."""
+def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tensor:
+    """Distance [1 or B, 1, T, T] in millimetres below an edge, the same on both sides of the face."""
     x, y = places_mm(window)
-    out = (x.abs() / float(CHART_MM[0])).clamp(max=1)
+    out = (x.abs() / float(UV_SIZE_MM[0])).clamp(max=1)
     u, v = np.array(edge.replace("|", " ").split(), float).reshape(-1, 2).T
-    edge_mm = torch.from_numpy(np.interp(out.numpy(), u, v) * CHART_MM[1]).float()
+    edge_mm = torch.from_numpy(np.interp(out.numpy(), u, v) * UV_SIZE_MM[1]).float()
     return (y - edge_mm)[None, None] - shift_mm
 
 
 @lru_cache(maxsize=4)
-def beard_ground(window: Window) -> Tensor:
-    """Where a beard grows [1, 1, T, T]: 0..1, thin toward the cheeks and on the neck."""
+def _beard_density(window: Window) -> Tensor:
+    """Density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
     x, y = places_mm(window)
-    lower = smooth(below_edge(window, _BEARD_EDGE) / 20 + 0.5)
+    lower = smooth(_below_edge(window, _BEARD_EDGE) / 20 + 0.5)
     neck = smooth((186 - y) / 36)[None, None]
     moustache = smooth((36 - x.abs()) / 12) * smooth((y - 104) / 8) * smooth((134 - y) / 10)
     chin = 0.6 * blob(window, 8, 16) + 0.8 * blob(window, (0.5, 0.83), 8, 0.8)
@@ -136,24 +137,24 @@ def beard_ground(window: Window) -> Tensor:
 
 
 def _beards(people: People, window: Window, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Cover and shadow [B, 1, T, T]: stubble everywhere it grows, longer hair where it is left."""
+    """Draw cover and shadow [B, 1, T, T]: stubble in the whole beard area, longer hair where it is uncut."""
     count = len(people.age)
     cover, shadow = (torch.zeros(count, 1, window.side, window.side) for _ in "ab")
     grown = (people.stubble_mm > 0).nonzero()[:, 0].tolist()
     if not grown:
         return cover, shadow
     patchy = 1 + 0.25 * noise(len(grown), window, 18, generator, octaves=2)
-    ground = beard_ground(window)
+    ground = _beard_density(window)
     for index, patch in zip(grown, patchy, strict=True):
-        there = ground * patch[None].clamp(0.3, 1.4)
-        cover[index], shadow[index] = _beard(people, index, window, there, generator)
+        density = ground * patch[None].clamp(0.3, 1.4)
+        cover[index], shadow[index] = _beard(people, index, window, density, generator)
     return cover, shadow
 
 
 def _beard(
     people: People, index: int, window: Window, ground: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Cover and shadow [1, 1, T, T] of one lower face."""
+    """Draw cover and shadow [1, 1, T, T] of one person."""
     stubble = float(people.stubble_mm[index])
     x, y = places_mm(window)
     goatee = smooth((38 - x.abs()) / 10)[None, None]
@@ -169,19 +170,19 @@ def _beard(
 def _rooted(
     density: Tensor, window: Window, width_mm: float, length_mm: float, generator: torch.Generator
 ) -> Tensor:
-    """Layers of hairs that grow down and a little outward, as dense as the field [1, 1, T, T] says."""
-    wide, high = 75.0, 115.0  # millimetres from the midline; from cheeks to neck
+    """Draw layers of hairs that grow down and slightly outward, with a density [1, 1, T, T]."""
+    wide, high = 75.0, 115.0  # half width and height of the area in millimetres
     merged = _coarseness(window) ** 1.5
     number = int(_BEARD_HAIRS_MM2 * 2 * wide * high / merged)
     roots = torch.rand(number, 2, generator=generator) * torch.tensor([2 * wide, high])
     roots = roots + torch.tensor([-wide, 85.0])
     at = window.to_texels(roots).round().long()
-    seen = ((at >= 0) & (at < window.side)).all(-1)
+    within = ((at >= 0) & (at < window.side)).all(-1)
     at = at.clamp(0, window.side - 1)
-    kept = seen & (torch.rand(number, generator=generator) < density[0, 0, at[:, 1], at[:, 0]])
+    kept = within & (torch.rand(number, generator=generator) < density[0, 0, at[:, 1], at[:, 0]])
     jitter = torch.randn(number, 2, generator=generator)
     roots, jitter = roots[kept], jitter[kept]
-    if length_mm < 1.5 * min(window.texel_mm):  # a dot
+    if length_mm < 1.5 * min(window.texel_mm):  # a hair is a dot
         area = torch.full((len(roots),), merged * width_mm * max(length_mm, width_mm))
         return splat(window, roots, area * (1 + 0.4 * jitter[:, 0]).clamp_min(0.2))
     down = -torch.pi / 2 + 0.008 * roots[:, 0] + 0.25 * jitter[:, 0]
@@ -191,7 +192,7 @@ def _rooted(
 
 
 def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torch.Generator) -> Tensor:
-    """Cover [B, 1, T, T] by short hair as far above its ragged edge as `above_mm` says."""
+    """Draw the cover [B, 1, T, T] by short hair on the scalp; above_mm [B, 1, T, T]: `above_hairline`."""
     count = len(people.age)
     ragged = 3.0 * noise(count, window, 14, generator, octaves=3)
     strands = noise(count, window, (1.2, 6), generator, octaves=1)
@@ -199,5 +200,5 @@ def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torc
 
 
 def above_hairline(people: People, window: Window) -> Tensor:
-    """Millimetres [B, 1, T, T] above each person's hairline."""
-    return -below_edge(window, _SCALP_EDGE, each(people.hairline_mm))
+    """Distance [B, 1, T, T] in millimetres above each person's hairline."""
+    return -_below_edge(window, _SCALP_EDGE, each(people.hairline_mm))

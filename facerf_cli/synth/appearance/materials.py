@@ -1,4 +1,4 @@
-"""What the parts of a synthetic head are made of: skin on its canvas, eyes, teeth, cloth, hair, frames."""
+"""Materials of the parts of a synthetic head: skin, eyes, mouth, teeth, cloth, hair and frames of glasses."""
 
 from dataclasses import dataclass, replace
 
@@ -8,20 +8,21 @@ from torch import Tensor
 
 from facerf_cli.metrics import ita_deg
 from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.appearance.people import People, draw_people, eyeball, named
+from facerf_cli.synth.appearance.eyes import eyeball_textures
+from facerf_cli.synth.appearance.people import People, draw_people, parameters_of
 from facerf_cli.synth.appearance.pigments import hair_albedo
 from facerf_cli.synth.appearance.skin import bare_skin, paint_skin, scattering_mm
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_noise
 
-_SIDE = 256  # of the textures of small parts
-_HAIR_WISPS = 512
-_OF_CHART_HAIR = ("bald", "hairline_mm")  # parameters of hair painted on the chart; here it is geometry
+_SIDE = 256  # of the textures of eyes and cloth
+_HAIR_WISPS = 512  # different wisps in the texture of hair
+_PAINTED_HAIR = ("bald", "hairline_mm")  # parameters of painted scalp hair; here hair is geometry
 
 
 @dataclass(frozen=True)
 class Material:
-    """Textures of one part, float32, row v = 0 at the top.
+    """Textures of one part, float32, with row v = 0 at the top.
 
     albedo [3, H, W] linear Rec.709; specular [1, H, W] reflectance at normal incidence; roughness [1, H, W]
     (GGX alpha is its square); relief [2, H, W] slopes of fine relief along +u and +v.
@@ -35,9 +36,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Appearance:
-    """Materials by the part's name (skin on the canvas, `CANVAS_SPAN`) and how the person was drawn.
+    """Materials by name of the part, and the traits of the person.
 
-    scattering_mm [3]: the Gaussian's sigma by which light of each channel spreads under the skin.
+    The texture of the skin covers the canvas: the UV map of the face widened to `CANVAS_SPAN`. scattering_mm
+    [3]: sigma of the Gaussian by which light of each channel spreads under the skin.
     """
 
     materials: dict[str, Material]
@@ -46,8 +48,8 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class Surface:
-    """The material at N points: albedo [N, 3], specular [N], roughness [N], relief [N, 2]."""
+class MaterialPoints:
+    """Material at N points: albedo [N, 3], specular [N], roughness [N], relief [N, 2]."""
 
     albedo: Tensor
     specular: Tensor
@@ -56,9 +58,9 @@ class Surface:
 
 
 def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
-    """One person, and what he or she wears; `side`, the canvas's, only sets how fine the skin is."""
+    """Draw one person with clothes and glasses; `side` of the canvas only sets the resolution of the skin."""
     people = draw_people(1, generator)
-    eye, eye_traits = eyeball(_SIDE, people, generator)
+    eye, eye_traits = eyeball_textures(_SIDE, people, generator)
     frame, frame_kind = _frame(generator)
     cloth, cloth_kind = _cloth(generator)
     materials = {
@@ -71,8 +73,8 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     }
     skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
     materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
-    traits = named(people, 0)
-    for name in _OF_CHART_HAIR:
+    traits = parameters_of(people, 0)
+    for name in _PAINTED_HAIR:
         del traits[name]
     traits["random_texture"] = bool(people.random_texture[0])
     traits["ita_deg"] = round(float(ita_deg(bare_skin(people)[0].double().numpy())), 1)
@@ -82,14 +84,14 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
 
 
 def canvas_uv(side: int) -> Tensor:
-    """(u, v) [T, T, 2] of the chart at the centres of the canvas's texels."""
+    """(u, v) [T, T, 2] at the centres of the canvas's texels."""
     return CANVAS_SPAN[0] + (CANVAS_SPAN[1] - CANVAS_SPAN[0]) * texel_centres_uv(side)
 
 
 def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
-    """The same person with a scalp that hair grows on: its short hair, by its share [T, T] of the canvas.
+    """The same person with short hair painted on the scalp, with the cover [T, T] on the canvas.
 
-    The colour is the mean of the hair's roots.
+    Its colour is the mean of the hair's roots.
     """
     skin, hair = appearance.materials["skin"], appearance.materials["hair"]
     colour = hair.albedo[:, :8].mean((1, 2)).view(3, 1, 1)
@@ -104,8 +106,11 @@ def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator
     return replace(appearance, materials=appearance.materials | {"skin": stained})
 
 
-def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Surface:
-    """The materials at points: part [N] as in `mesh.PARTS`, uv [N, 2]; bilinear, clamped at the borders."""
+def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> MaterialPoints:
+    """Sample the materials at points, bilinear and clamped at the borders.
+
+    part [N] is an index into `mesh.PARTS`, uv [N, 2] as in `HeadMesh`.
+    """
     values = torch.zeros(len(uv), 7)
     for index in sorted(set(part.tolist())):
         name = PARTS[index]
@@ -118,11 +123,11 @@ def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Surface:
         grid = (2 * at - 1).view(1, 1, -1, 2)
         found = F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
         values[chosen] = found[0, :, 0].T
-    return Surface(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
+    return MaterialPoints(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
 
 
 def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | None = None) -> Material:
-    """A material of one gloss."""
+    """A material with uniform gloss."""
     one = torch.ones(1, *albedo.shape[1:])
     return Material(
         albedo.clamp(0.003, 0.95),
@@ -133,18 +138,19 @@ def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | No
 
 
 def _uniform(low: float, high: float, generator: torch.Generator) -> float:
+    """Draw a number between two bounds."""
     return float(Uniform(generator)(low, high))
 
 
 def _mouth(generator: torch.Generator) -> Material:
-    """Gums and tongue, wet."""
+    """Draw wet gums and tongue."""
     colour = torch.tensor([0.30, 0.075, 0.065]) * _uniform(0.5, 1.1, generator)
     patches = plain_noise((64, 64), 10, generator)
     return _flat(colour.view(3, 1, 1) * (1 + 0.15 * patches), 0.03, 0.3)
 
 
 def _teeth(people: People, generator: torch.Generator) -> Material:
-    """Enamel, yellower with age."""
+    """Draw enamel, yellower with age."""
     yellow = 0.35 + 0.65 * float(people.age[0] - 18) / 57 * _uniform(0.3, 1, generator)
     white, old = torch.tensor([0.60, 0.57, 0.52]), torch.tensor([0.50, 0.43, 0.31])
     colour = (white + yellow * (old - white)) * _uniform(0.8, 1.1, generator)
@@ -152,7 +158,7 @@ def _teeth(people: People, generator: torch.Generator) -> Material:
 
 
 def _cloth(generator: torch.Generator) -> tuple[Material, str]:
-    """Plain, heathered or striped cloth, woven."""
+    """Draw plain, heathered or striped cloth, and its kind."""
     grey = torch.full((3,), _uniform(0.02, 0.6, generator))
     colour = grey * torch.exp(_uniform(0, 0.9, generator) * torch.randn(3, generator=generator))
     kind = ("plain", "plain", "heather", "stripes")[int(torch.randint(4, (), generator=generator))]
@@ -171,7 +177,7 @@ def _cloth(generator: torch.Generator) -> tuple[Material, str]:
 
 
 def _hair(people: People, generator: torch.Generator) -> Material:
-    """Wisps along u, root to tip along v: each a little different, lighter and drier to the tip."""
+    """Draw slightly different wisps along u; along v, from root to tip, they become lighter."""
     wisps = _HAIR_WISPS
     melanin = torch.exp(0.18 * torch.randn(wisps, generator=generator))
     grey = people.grey[0]
@@ -184,7 +190,7 @@ def _hair(people: People, generator: torch.Generator) -> Material:
 
 
 def _hair_name(people: People) -> str:
-    """How a person would call the colour."""
+    """The common name of a person's hair colour."""
     eumelanin, pheomelanin = float(people.hair_eumelanin[0]), float(people.hair_pheomelanin[0])
     if people.grey[0] > 0.5:
         return "grey"
@@ -195,7 +201,7 @@ def _hair_name(people: People) -> str:
 
 
 def _frame(generator: torch.Generator) -> tuple[Material, str]:
-    """Of glasses: metal, acetate of one colour, or tortoiseshell."""
+    """Draw a frame of glasses (metal, acetate of one colour, or tortoiseshell), and its kind."""
     kind = ("metal", "acetate", "acetate", "tortoise")[int(torch.randint(4, (), generator=generator))]
     flat = torch.ones(3, 64, 64)
     if kind == "metal":

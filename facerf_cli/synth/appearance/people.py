@@ -1,27 +1,22 @@
-"""Who is painted: the named physical parameters of people, drawn at random.
+"""Physical parameters of synthetic people, drawn at random."""
 
-Eyes: the texture of a separate eyeball, and eyes painted flat between the lids of the chart.
-"""
-
-import math
 from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
 
-from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, places_mm, plain_noise
+from facerf_cli.synth.random_fields import Uniform
 
-DARKEST, LIGHTEST = 0.23, 0.0075  # melanin
-RANDOM_TEXTURES = 0.06  # the share of people who wear random colours
+DARKEST, LIGHTEST = 0.23, 0.0075  # melanin fractions of the darkest and of the lightest skin
+RANDOM_TEXTURES = 0.06  # fraction of people with random colours instead of skin tones
 
 
 @dataclass(frozen=True)
 class People:
-    """Parameters [B] of B people; fractions and strengths in 0..1 where nothing else is said.
+    """Parameters [B] of B people; fractions and strengths in 0..1 unless stated otherwise.
 
-    melanin and haemoglobin as in `pigments`: fractions of the epidermis's volume that is melanosomes,
-    and of the dermis's that is blood. Hair's melanins are in the units of `pigments.hair_albedo`.
+    melanin is the fraction of the epidermis's volume that is melanosomes, and haemoglobin the fraction of the
+    dermis's volume that is blood, as in `pigments`. The melanins of hair have the units of `hair_albedo`.
     """
 
     melanin: Tensor
@@ -37,26 +32,27 @@ class People:
     grey: Tensor  # share of white hair
     brow_fullness: Tensor
     stubble_mm: Tensor  # hair left on the lower face; 0 where none grows
-    beard: Tensor  # cover of the beard's area by its hair; 0 where none grows
+    beard: Tensor  # cover of the beard's area by hair; 0 where none grows
     moustache: Tensor
     goatee: Tensor  # 1 where the beard leaves the cheeks free
     bald: Tensor  # 0 or 1
-    hairline_mm: Tensor  # how far it lies below its usual place
+    hairline_mm: Tensor  # distance below the usual hairline
     lipstick: Tensor  # cover
     lipstick_red: Tensor  # its colour, linear Rec.709
     lipstick_green: Tensor
     lipstick_blue: Tensor
     eye_shadow: Tensor  # cover
     eyeliner: Tensor
-    foundation: Tensor  # how far it evens the skin
+    foundation: Tensor  # strength by which it evens out the skin
     random_texture: Tensor  # 0 or 1
 
 
 def draw_people(count: int, generator: torch.Generator) -> People:
-    """Draw people: lightness from very light to dark evenly, the rest in proportion to what is common."""
+    """Draw people: skin evenly from very light to dark, the other traits as common as in reality."""
     uniform = Uniform(generator, (count,))
 
     def share(part: float) -> Tensor:
+        """1 for a random part of the people, 0 for the others."""
         return (torch.rand(count, generator=generator) < part).float()
 
     tone = uniform(0, 1)
@@ -100,105 +96,11 @@ def draw_people(count: int, generator: torch.Generator) -> People:
     )
 
 
-def named(people: People, index: int) -> dict[str, float | str | bool]:
-    """The parameters of one of them, for a record."""
+def parameters_of(people: People, index: int) -> dict[str, float | str | bool]:
+    """The parameters of one person by name, rounded, for a record."""
     return {field.name: round(float(getattr(people, field.name)[index]), 4) for field in fields(people)}
 
 
 def each(values: Tensor) -> Tensor:
-    """A parameter [B] as [B, 1, 1, 1], to go with fields [B, C, T, T]."""
+    """A parameter [B] as [B, 1, 1, 1], to combine with textures [B, C, T, T]."""
     return values.view(-1, 1, 1, 1)
-
-
-_CORNERS = ((36, 39), (42, 45))
-_IRIS_DEG, _RADIUS_MM = 29.0, 12.0  # of the iris, from the gaze axis; of the ball
-_BROWN, _AMBER = (0.055, 0.026, 0.012), (0.16, 0.085, 0.030)
-_GREEN, _BLUE, _GREY = (0.11, 0.115, 0.055), (0.10, 0.155, 0.22), (0.15, 0.17, 0.18)
-_IRISES = {"brown": _BROWN, "amber": _AMBER, "green": _GREEN, "blue": _BLUE, "grey": _GREY}
-_FAIR_SHARES = (0.35, 0.15, 0.15, 0.25, 0.10)  # of the irises among the fairest; the others are brown
-
-
-def draw_irises(people: People, generator: torch.Generator) -> tuple[Tensor, list[str]]:
-    """Colours [B, 3] linear Rec.709, and their names."""
-    count = len(people.melanin)
-    names = list(_IRISES)
-    fair = torch.multinomial(torch.tensor(_FAIR_SHARES), count, True, generator=generator)
-    dark = (people.melanin > 0.035) | (people.hair_eumelanin > 4)
-    index = torch.where(dark, 0, fair)
-    palette = torch.tensor(list(_IRISES.values()))
-    shade = torch.exp(0.25 * torch.randn(count, 1, generator=generator))
-    return palette[index] * shade, [names[int(i)] for i in index]
-
-
-def eyeball(
-    side: int, people: People, generator: torch.Generator
-) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], dict[str, float | str | bool]]:
-    """Albedo, specular, roughness and relief [C, T, T] of the first person's eyes, and what they are.
-
-    (u, v) is the unit disc about the gaze axis, azimuthal equidistant to 90 degrees.
-    """
-    colours, names = draw_irises(people, generator)
-    offset = (texel_centres_uv(side) - 0.5) * 180  # degrees
-    angle = offset.norm(dim=-1)
-    turn = torch.atan2(offset[..., 1], offset[..., 0])
-    pupil_deg = float(7.5 + 3.5 * torch.rand((), generator=generator))
-    redness = float(torch.rand((), generator=generator) ** 2)
-    sclera = _sclera(side, angle, redness, float(people.age[0]), generator)
-    iris = _iris(angle, turn, pupil_deg, colours[0], generator)
-    edge = torch.sigmoid((_IRIS_DEG - angle) / 0.7)
-    albedo = sclera + edge * (iris - sclera)
-    wet = torch.ones(1, side, side)
-    relief = 0.01 * torch.cat([plain_noise((side, side), 14, generator) for _ in range(2)])
-    relief = relief * (angle > _IRIS_DEG)
-    pupil_mm = 2 * _RADIUS_MM * math.radians(pupil_deg)
-    traits: dict[str, float | str | bool] = {"iris": names[0], "pupil_mm": round(pupil_mm, 2)}
-    roughness = torch.where(angle < _IRIS_DEG, 0.08, 0.14)[None]
-    return (albedo.clamp(0.003, 0.9), 0.03 * wet, roughness, relief), traits
-
-
-def _sclera(side: int, angle: Tensor, redness: float, age: float, generator: torch.Generator) -> Tensor:
-    """Off-white, yellower with age, pinker and with more veins away from the iris [3, T, T]."""
-    young, old = torch.tensor([0.50, 0.46, 0.44]), torch.tensor([0.47, 0.41, 0.33])
-    base = (young + (old - young) * (age - 18) / 57 * 0.8).view(3, 1, 1)
-    ridges = 1 - plain_noise((side, side), 26, generator).abs() * 3
-    veins = ridges.clamp(0, 1) ** 3 * torch.sigmoid((angle - 45) / 7)
-    pink = (0.10 + 0.35 * redness) * torch.sigmoid((angle - 58) / 9) + (0.25 + 0.5 * redness) * veins
-    return base * (1 - pink * torch.tensor([0.12, 0.75, 0.70]).view(3, 1, 1))
-
-
-def _iris(
-    angle: Tensor, turn: Tensor, pupil_deg: float, colour: Tensor, generator: torch.Generator
-) -> Tensor:
-    """Radial fibres, a collarette, a limbal ring and the pupil [3, T, T]."""
-    fibres = torch.zeros_like(angle)
-    for waves in (17, 31, 53, 89):
-        phase = 2 * torch.pi * torch.rand((), generator=generator)
-        bend = float(torch.randn((), generator=generator)) * 0.04
-        fibres = fibres + torch.cos(waves * turn + phase + bend * angle) * (31 / waves) ** 0.5
-    fibres = 1 + 0.14 * fibres
-    out = ((angle - pupil_deg) / (_IRIS_DEG - pupil_deg)).clamp(0, 1)
-    collarette = 0.35 * torch.exp(-(((out - 0.25) / 0.15) ** 2))
-    rim = 1 - 0.75 * torch.sigmoid((out - 0.86) * 22)
-    warm = torch.tensor([1.25, 1.0, 0.75]).view(3, 1, 1)
-    coloured = colour.view(3, 1, 1) * (1 + collarette * (warm - 0.6)) * fibres.clamp_min(0.3) * rim
-    pupil = torch.sigmoid((pupil_deg - angle) / 0.5)
-    return coloured * (1 - pupil) + 0.004 * pupil
-
-
-def paint_eyes(albedo: Tensor, people: People, window: Window, generator: torch.Generator) -> Tensor:
-    """The chart's albedo [B, 3, T, T] with eyes between the lids, of one gaze for both."""
-    uniform = Uniform(generator, (len(albedo), 1, 1, 1))
-    between = mask(window, "eyes", 1.0)
-    colours, _ = draw_irises(people, generator)
-    x, y = places_mm(window)
-    shift_x, shift_y = uniform(-3, 3), uniform(-1, 1)
-    eye = uniform(0.32, 0.58) * torch.tensor([1.0, 0.93, 0.88]).view(1, 3, 1, 1)
-    eye = eye.expand(-1, 3, window.side, window.side)
-    for inner, outer in _CORNERS:
-        centre_x, centre_y = (float(mm) for mm in LANDMARK_MM[[inner, outer]].mean(0))
-        out = (((x - centre_x - shift_x) / 6.4) ** 2 + ((y - centre_y - shift_y) / 6.0) ** 2).sqrt()
-        iris, pupil = torch.sigmoid(14 * (1 - out)), torch.sigmoid(14 * (0.38 - out))
-        eye = eye * (1 - iris) + iris * colours.view(-1, 3, 1, 1) * (1 - 0.9 * pupil)
-    lashes = 4 * between * (1 - between)
-    eye = eye * (1 - 0.7 * lashes)
-    return albedo * (1 - between) + between * eye

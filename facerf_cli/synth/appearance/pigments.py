@@ -1,11 +1,13 @@
-"""What pigments make of light: the colour of skin from melanin and blood, of hair from its two melanins.
+"""Colours from pigments: skin from melanin and blood, hair from its two melanins.
 
-Skin is two layers of Kubelka and Munk, an epidermis with melanin over an endless dermis with blood (after
-Cotton and Claridge, *Developing a predictive model of human skin colouring*, 1996), seen through a boundary
-by Saunderson's correction (1942). Absorption: melanosomes 6.6e11 nm^-3.33 /cm and bloodless skin by S.
-Jacques (*Skin optics summary*, 1998); pheomelanin 2.9e15 nm^-4.75 /cm by Donner and Jensen (2006); its share
-of all melanin, the same in all skins, by Del Bino et al. (2015); haemoglobin by S. Prahl's table (omlc.org,
-after Gratzer and Kollias). Scattering: Jacques, *Optical properties of biological tissues: a review* (2013).
+Skin has two layers in the model of Kubelka and Munk, an epidermis with melanin over an infinitely deep dermis
+with blood (after Cotton and Claridge, *Developing a predictive model of human skin colouring*, 1996).
+Saunderson's correction (1942) accounts for the boundary to the air.
+
+Absorption: melanosomes (6.6e11 nm^-3.33 /cm) and bloodless skin after S. Jacques (*Skin optics summary*,
+1998); pheomelanin (2.9e15 nm^-4.75 /cm) after Donner and Jensen (2006); its fraction of all melanin, the same
+in all skins, after Del Bino et al. (2015); haemoglobin from S. Prahl's table (omlc.org, after Gratzer and
+Kollias). Scattering: Jacques, *Optical properties of biological tissues: a review* (2013).
 """
 
 from functools import lru_cache
@@ -38,20 +40,20 @@ _OBSERVER = """
 2.148 0.81 0 | 1.253 0.463 0 | 0.681 0.249 0 | 0.347 0.126 0 | 0.15 0.054 0 | 0.077 0.028 0 |
 0.041 0.015 0 | 0.017 0.006 0
 """
-_BLOOD_G_PER_L, _HAEMOGLOBIN_G_PER_MOL = 150.0, 64500.0
-_OXYGENATION = 0.70
-_PHEOMELANIN_SHARE = 0.26
+_BLOOD_G_PER_L, _HAEMOGLOBIN_G_PER_MOL = 150.0, 64500.0  # haemoglobin in blood; its molar mass
+_OXYGENATION = 0.70  # fraction of haemoglobin
+_PHEOMELANIN_SHARE = 0.26  # fraction of melanin
 _EPIDERMIS_CM = 0.006
-_OUTSIDE_REFLECTION, _INSIDE_REFLECTION = 0.028, 0.5  # of diffuse light, at an index of 1.4
-
-MELANIN_MOST, BLOOD_MOST = 0.6, 0.2  # fractions of volume, at the ends of the table
-_STEPS = 64
+_OUTSIDE_REFLECTION, _INSIDE_REFLECTION = 0.028, 0.5  # of diffuse light, at refractive index 1.4
+MELANIN_MOST, BLOOD_MOST = 0.6, 0.2  # volume fractions at the ends of the table
+_STEPS = 64  # of the table along each axis
 
 
 def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
-    """Diffuse reflectance [..., 33] at `WAVELENGTHS_NM`, the surface's own gloss left out.
+    """Diffuse reflectance [..., 33] at `WAVELENGTHS_NM`, without the gloss of the surface.
 
-    melanin: fraction of the epidermis's volume that is melanosomes; blood: fraction of the dermis's.
+    melanin [...]: fraction of the epidermis's volume that is melanosomes; blood [...]: fraction of the
+    dermis's volume that is blood.
     """
     nm = WAVELENGTHS_NM
     melanin, blood = melanin[..., None], blood[..., None]
@@ -60,7 +62,7 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
     pigment = (1 - _PHEOMELANIN_SHARE) * eumelanin + _PHEOMELANIN_SHARE * pheomelanin
     epidermis = melanin * pigment + (1 - melanin) * bloodless
     dermis = blood * _blood_absorption() + (1 - blood) * bloodless
-    below = _endless(dermis, 43.6 * (0.41 * (nm / 500) ** -4 + 0.59 * (nm / 500) ** -0.562))
+    below = _infinite_layer(dermis, 43.6 * (0.41 * (nm / 500) ** -4 + 0.59 * (nm / 500) ** -0.562))
     reflected, passed = _layer(
         epidermis, 66.7 * (0.29 * (nm / 500) ** -4 + 0.71 * (nm / 500) ** -0.689), _EPIDERMIS_CM
     )
@@ -69,14 +71,14 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
 
 
 def _blood_absorption() -> np.ndarray:
-    """Absorption of whole blood, /cm."""
+    """Absorption [33] of whole blood, per cm."""
     oxy, deoxy = (np.array(text.split(), float) for text in (_OXYHAEMOGLOBIN, _DEOXYHAEMOGLOBIN))
     molar = _OXYGENATION * oxy + (1 - _OXYGENATION) * deoxy
     return np.log(10) * molar * _BLOOD_G_PER_L / _HAEMOGLOBIN_G_PER_MOL
 
 
-def _endless(absorption: np.ndarray, scattering: np.ndarray) -> np.ndarray:
-    """Kubelka-Munk reflectance of a layer without end; K = 2 mu_a, S = 3/4 mu_s'."""
+def _infinite_layer(absorption: np.ndarray, scattering: np.ndarray) -> np.ndarray:
+    """Kubelka-Munk reflectance of an infinitely deep layer; K = 2 mu_a, S = 3/4 mu_s'."""
     ratio = 2 * absorption / (0.75 * scattering)
     return 1 + ratio - np.sqrt(ratio * (ratio + 2))
 
@@ -92,13 +94,13 @@ def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> t
 
 @lru_cache(maxsize=1)
 def observer_weights() -> np.ndarray:
-    """[33, 3] from a reflectance at `WAVELENGTHS_NM` to XYZ under D65; white has the colour of D65."""
+    """Matrix [33, 3] from reflectance at `WAVELENGTHS_NM` to XYZ under D65; white has the colour of D65."""
     return np.array(_OBSERVER.replace("|", " ").split(), float).reshape(-1, 3) / 100
 
 
 @lru_cache(maxsize=1)
 def _skin_table() -> Tensor:
-    """[1, 3, steps of blood, steps of melanin] linear Rec.709; axes by the square root."""
+    """Table [1, 3, steps of blood, steps of melanin] of linear Rec.709; steps are even in the square root."""
     step = np.linspace(0, 1, _STEPS) ** 2
     blood, melanin = np.meshgrid(step * BLOOD_MOST, step * MELANIN_MOST, indexing="ij")
     xyz = skin_reflectance(melanin, blood) @ observer_weights()
@@ -107,18 +109,18 @@ def _skin_table() -> Tensor:
 
 
 def skin_albedo(melanin: Tensor, blood: Tensor) -> Tensor:
-    """Linear Rec.709 [B, 3, H, W] of fields [B, 1, H, W] of melanin and blood fractions."""
+    """Colour [B, 3, H, W] of skin, linear Rec.709, from melanin and blood fractions [B, 1, H, W]."""
     at = torch.stack([melanin[:, 0] / MELANIN_MOST, blood[:, 0] / BLOOD_MOST], -1)
     at = 2 * at.clamp(0, 1).sqrt() - 1
     return F.grid_sample(_skin_table().expand(len(at), -1, -1, -1), at, align_corners=True)
 
 
 def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
-    """Colour of much hair together, linear Rec.709 [..., 3], of melanins [...] in the units of d'Eon et al.
+    """Colour [..., 3] of dense hair, linear Rec.709, from melanins [...] in the units of d'Eon et al.
 
-    Absorption by d'Eon et al. (*An energy-conserving hair reflectance model*, 2011), colour of many fibres
-    by Chiang et al. (*A practical and controllable hair and fur model*, 2016), over a little that the
-    cuticles return. Eumelanin 0.3 is blond, 1.3 brown, 8 black; grey in 0..1 is the share of white hair.
+    Absorption after d'Eon et al. (*An energy-conserving hair reflectance model*, 2011), colour of many fibres
+    after Chiang et al. (*A practical and controllable hair and fur model*, 2016), plus a small reflection at
+    the cuticles. Eumelanin 0.3 is blond, 1.3 brown, 8 black; grey in 0..1 is the fraction of white hair.
     """
     absorbed = eumelanin[..., None] * torch.tensor([0.419, 0.697, 1.37])
     absorbed = absorbed + pheomelanin[..., None] * torch.tensor([0.187, 0.4, 1.05])

@@ -1,169 +1,43 @@
-"""Make-up: lipstick, eye shadow and eyeliner laid over the skin's albedo.
+"""Procedural skin: from people's pigments, region by region, to albedo, gloss and fine relief.
 
-Fine relief of skin: pores and their net of furrows, wrinkles with age, the lines of the lips.
-
-Procedural skin: people's pigments, region by region, to albedo, gloss and fine relief.
-
-The same code paints the plain chart, for the training bank, and the wider canvas of the stage's whole heads.
+The same code paints the UV map of the face, for the training bank, and the wider canvas of whole heads.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
-import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
-from scipy.linalg import block_diag
 from torch import Tensor
 
+from facerf_cli.synth.appearance.eyes import paint_eyes
 from facerf_cli.synth.appearance.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
-from facerf_cli.synth.appearance.people import People, draw_people, each, paint_eyes
+from facerf_cli.synth.appearance.people import People, draw_people, each
 from facerf_cli.synth.appearance.pigments import hair_albedo, skin_albedo
-from facerf_cli.synth.head.mesh import arc_lengths
+from facerf_cli.synth.appearance.relief import draw_relief
 from facerf_cli.synth.random_fields import (
-    CHART_SPAN,
-    LANDMARK_MM,
+    UV_SPAN,
     Uniform,
     Window,
     blob,
     blobs,
-    blurred,
     inside,
     mask,
     noise,
     places_mm,
-    slopes,
     smooth,
-    splat,
 )
 
-
-def make_up(albedo: Tensor, people: People, window: Window) -> Tensor:
-    """The albedo [B, 3, T, T] with what each person wears."""
-    colour = torch.stack([people.lipstick_red, people.lipstick_green, people.lipstick_blue], -1)
-    cover = 0.8 * each(people.lipstick) * mask(window, "lips", 1.6, -0.3)
-    own = albedo.mean(1, keepdim=True) / albedo.mean((1, 2, 3), keepdim=True).clamp_min(0.02)
-    albedo = albedo + cover * (colour[..., None, None] * own.clamp(0.5, 1.2) - albedo)
-    lids = blobs(window, 0.355, 0.285, 17, 0.42) * (1 - mask(window, "brows", 4.0))
-    shade = each(colour.mean(-1)) * torch.tensor([0.55, 0.42, 0.45]).view(1, 3, 1, 1)
-    cover = 0.8 * each(people.eye_shadow) * lids.clamp(0, 1)
-    albedo = albedo + cover * (shade - albedo)
-    beyond = inside(window, "eyes")
-    line = smooth((beyond + 1.7) / 0.9) * smooth((0.8 - beyond) / 0.9)
-    return albedo * (1 - 0.8 * each(people.eyeliner) * line)
-
-
-_WRINKLE_WIDTH_MM = 0.9
-_STEP_MM = 0.4  # between the places along a line
-# Wrinkles on the picture's right and their mirror images: name, depth at 75 years in millimetres, points in
-# millimetres as offsets from a landmark.
-_FOLDS: dict[str, tuple[float, tuple[tuple[int, float, float], ...]]] = {
-    "nasolabial": (0.50, ((35, 5, -6), (35, 10, 2), (54, 6, -9), (54, 8.5, 0), (54, 8, 7))),
-    "marionette": (0.28, ((54, 3, 3), (54, 5, 9), (54, 6, 17))),
-    "crow's foot, upper": (0.22, ((45, 6, -3), (45, 14, -8), (45, 22, -11))),
-    "crow's foot, middle": (0.24, ((45, 6, 0), (45, 15, 0), (45, 24, 1))),
-    "crow's foot, lower": (0.22, ((45, 5, 4), (45, 13, 8), (45, 21, 14))),
-    "under the eye": (0.25, ((42, -1, 6), (47, 0, 9), (46, 2, 9.5), (45, 2, 7))),
-    "tear trough": (0.22, ((42, -2, 5), (42, 2, 11), (47, 4, 16))),
-    "frown": (0.28, ((22, -5, 8), (22, -4, 1), (22, -5, -7))),
-    "cheek": (0.16, ((54, 20, -14), (54, 24, 0), (54, 22, 14))),
-}
-_FOREHEAD_MM, _FOREHEAD_HALF_MM = (-12.0, 0.0, 11.0), 46.0  # heights about a line above the brows
-_FOREHEAD_DEPTH_MM = 0.3
-
-
-def draw_relief(
-    people: People, window: Window, pores: Tensor, bare: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Slopes [B, 2, T, T], and how deep each place lies in a wrinkle [B, 1, T, T], about 0..1.
-
-    `pores` [B, 1, T, T] is noise whose bumps are pores and what lies between them; `bare` [B, 1, T, T] is 1
-    where skin is bare and 0 where hair covers it.
-    """
-    count = len(people.melanin)
-    age = each((people.age - 18) / 57)
-    grain = torch.randn(count, 1, window.side, window.side, generator=generator)
-    dents = noise(count, window, 6.0, generator, octaves=1)
-    coarse = 0.6 + 0.5 * age + 0.4 * each(people.oiliness)
-    grain = 0.03 * min(1.0, min(window.texel_mm)) * grain
-    height = coarse * (_pore_places(window) * (grain + 0.022 * pores) + 0.014 * dents)
-    lips = mask(window, "lips", 1.5)
-    lines = noise(count, window, (1.7, 9.0), generator, octaves=1)
-    height = height * (1 - lips) + lips * 0.07 * lines
-    wrinkles = _wrinkles(people, window, generator)
-    relief = slopes(height * bare - wrinkles * (1 - lips), window)
-    return relief.clamp(-0.8, 0.8), (wrinkles / 0.6).clamp(0, 1.2)
-
-
-def _pore_places(window: Window) -> Tensor:
-    """Pores are large on nose, inner cheeks and chin, hardly there beside the eyes."""
-    cheeks = blobs(window, 0.37, 0.52, 22)
-    return 0.55 + (0.9 * blob(window, 30, 15) + 0.7 * cheeks + 0.4 * blob(window, 8, 14)).clamp(0, 1)
-
-
-@lru_cache(maxsize=1)
-def _fold_lines() -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """All folds as one: points [P, 2], basis [N, P] (its product with points is places), taper [N], fold [N].
-
-    And each fold's depth [K]. A fold's mirror image is a fold of its own, and follows it.
-    """
-    folds = [
-        np.array([LANDMARK_MM[index] + [dx, dy] for index, dx, dy in points]) for _, points in _FOLDS.values()
-    ]
-    depths = [depth for depth, _ in _FOLDS.values()]
-    folds = [fold * [side, 1] for fold in folds for side in (1, -1)]
-    depths = [depth for depth in depths for _ in "ab"]
-    x = np.linspace(-_FOREHEAD_HALF_MM, _FOREHEAD_HALF_MM, 7)
-    folds += [np.stack([x, 6 + above - 0.0015 * x**2], -1) for above in _FOREHEAD_MM]
-    depths += [_FOREHEAD_DEPTH_MM] * len(_FOREHEAD_MM)
-    bases, tapers, numbers = [], [], []
-    for number, points in enumerate(folds):
-        length = arc_lengths(points)
-        at = np.arange(0, length[-1], _STEP_MM)
-        bases.append(CubicSpline(length, np.eye(len(points)))(at))
-        tapers.append(np.sin(np.pi * (0.1 + 0.8 * at / length[-1])) ** 1.5)
-        numbers.append(np.full(len(at), number))
-    return (
-        torch.from_numpy(np.concatenate(folds)).float(),
-        torch.from_numpy(block_diag(*bases)).float(),
-        torch.from_numpy(np.concatenate(tapers)).float(),
-        torch.from_numpy(np.concatenate(numbers)),
-        torch.tensor(depths),
-    )
-
-
-def _wrinkles(people: People, window: Window, generator: torch.Generator) -> Tensor:
-    """Depth [B, 1, T, T] in millimetres of every fold and line at each person's age."""
-    points, basis, taper, fold, depth = _fold_lines()
-    count, folds = len(people.age), len(depth)
-    grown = ((people.age - 22) / 53).clamp_min(0)[:, None] ** 1.4
-    jitter = 0.8 * torch.randn(count, *points.shape, generator=generator)
-    pairs = (folds - len(_FOREHEAD_MM)) // 2
-    common = torch.rand(count, pairs + 1, generator=generator)  # a side is much like the other
-    common = torch.cat(
-        [common[:, :-1].repeat_interleave(2, 1), common[:, -1:].expand(-1, folds - 2 * pairs)], 1
-    )
-    own = 0.7 + 0.6 * torch.rand(count, folds, generator=generator)
-    strength = depth * (0.08 + 1.8 * grown) * (0.25 + common) * own
-    places = basis @ (points + jitter)  # [B, N, 2]
-    amount = strength[:, fold] * taper * _STEP_MM
-    face = torch.arange(count).repeat_interleave(len(fold))
-    layers = splat(window, places.view(-1, 2), amount.reshape(-1), face, count)
-    # A line of amount a per millimetre, spread by a Gaussian of sigma s, is a / (s sqrt(2 pi)) deep.
-    return blurred(layers, window, _WRINKLE_WIDTH_MM) * (_WRINKLE_WIDTH_MM * (2 * np.pi) ** 0.5)
-
-
-# Root mean square reach of the sum of Gaussians that d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
+# Sigma by which light of each channel spreads under the skin: root mean square of the sum of Gaussians that
+# d'Eon and Luebke fitted to skin (*GPU Gems 3*, ch. 14).
 _SCATTERING_MM = (1.18, 0.26, 0.16)
 
 
 @dataclass(frozen=True)
 class Skin:
-    """Material maps in UV of B faces.
+    """Material textures of B faces.
 
     albedo [B, 3, T, T] linear Rec.709; specular [B, 1, T, T] reflectance at normal incidence; roughness
     [B, 1, T, T] (GGX alpha is its square); relief [B, 2, T, T] slopes of the surface along u and v;
-    scattering_texels [B, 3]: how far each channel's light spreads under the surface.
+    scattering_texels [B, 3]: sigma by which light of each channel spreads under the surface.
     """
 
     albedo: Tensor
@@ -174,16 +48,16 @@ class Skin:
 
 
 def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
-    """Draw B skins on a chart of `side` texels, eyes painted; tones from light to dark evenly.
+    """Draw B people's skins as textures of `side` texels with painted eyes, evenly from light to dark.
 
-    Their gloss differs more than that of `paint_skin`: photographs' highlights do.
+    Their gloss varies more than that of `paint_skin`, because the highlights of photos vary as much.
     """
     people = draw_people(faces, generator)
-    window = Window(side, CHART_SPAN)
+    window = Window(side, UV_SPAN)
     skin = paint_skin(people, window, generator, painted_eyes=True)
     scalp = scalp_hair(people, window, above_hairline(people, window), generator)
     scalp = scalp * each(1 - people.bald) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.8)
-    skin = with_scalp(skin, people, scalp, generator)
+    skin = _with_scalp(skin, people, scalp, generator)
     clothed = mask(window, "neck", 5.0) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.4)
     cloth = 0.02 + 0.58 * torch.rand(faces, 3, 1, 1, generator=generator)
     slit = torch.where(torch.rand(faces, 1, 1, 1, generator=generator) < 0.5, 0.5, 0.06)
@@ -197,35 +71,49 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
 
 
+def _with_scalp(skin: Skin, people: People, cover: Tensor, generator: torch.Generator) -> Skin:
+    """The skin under short hair with the cover [B, 1, T, T], in the colour of the hair."""
+    colour = hair_albedo(people.hair_eumelanin, people.hair_pheomelanin, people.grey)[..., None, None]
+    streaks = (1 + 0.2 * torch.randn(cover.shape, generator=generator)).clamp(0.3, 1.8)
+    return Skin(
+        skin.albedo + cover * (colour * streaks - skin.albedo).clamp(-1, 1),
+        skin.specular * (1 - 0.5 * cover),
+        (skin.roughness + 0.15 * cover).clamp(max=0.85),
+        skin.relief * (1 - cover),
+        skin.scattering_texels,
+    )
+
+
 def bare_skin(people: People) -> Tensor:
-    """Mean albedo [B, 3] of their skin, linear Rec.709, without features."""
+    """Mean albedo [B, 3] of people's skin, linear Rec.709, without features."""
     return skin_albedo(each(people.melanin), each(people.haemoglobin))[:, :, 0, 0]
 
 
 def scattering_mm(people: People) -> Tensor:
-    """How far light of each channel spreads under their skin [B, 3], a Gaussian's sigma."""
+    """Sigma [B, 3] of the Gaussian by which light of each channel spreads under people's skin."""
     return torch.tensor(_SCATTERING_MM).expand(len(people.melanin), 3).clone()
 
 
 def paint_skin(people: People, window: Window, generator: torch.Generator, painted_eyes: bool) -> Skin:
-    """Paint people's skin on a window; without painted eyes, lids go on where eyeballs will show."""
+    """Paint people's skin on a window; without painted eyes, paint lid rims around separate eyeballs."""
     count = len(people.melanin)
     coarse = noise(count, window, 38, generator)
     middle = noise(count, window, 9, generator)
     fine = torch.randn(count, 1, window.side, window.side, generator=generator)
     pores = noise(count, window, 2.0, generator, octaves=2)
-    grain = (0.7 * pores + 0.3 * fine) * min(1.0, 2 / sum(window.texel_mm)) ** 1.5  # texels average over it
+    averaging = min(1.0, 2 / sum(window.texel_mm)) ** 1.5  # large texels average the grain out
+    grain = (0.7 * pores + 0.3 * fine) * averaging
     melanin, blood = _pigments(people, window, coarse, middle, grain, generator)
     hair = draw_facial_hair(people, window, generator)
     relief, depth = draw_relief(people, window, pores, 1 - hair.cover, generator)
     melanin, blood = melanin * (1 + 0.3 * depth), blood * (1 + 0.4 * depth)
     albedo = skin_albedo(melanin, blood)
-    cast = torch.tensor([1.0, 0.84, 0.70]).view(1, 3, 1, 1)  # hair under the skin takes more of the red
+    cast = torch.tensor([1.0, 0.84, 0.70]).view(1, 3, 1, 1)  # hair under the skin absorbs more red
     albedo = albedo * torch.exp(-hair.shadow * _darkness(people) * cast)
     odd = people.random_texture > 0
     if bool(odd.any()):
         albedo[odd] = _random_colours(int(odd.sum()), window, coarse[odd], middle[odd], generator)
-    albedo = make_up(albedo, people, window)
+    albedo = _make_up(albedo, people, window)
     albedo = _with_hair(albedo, people, hair, fine, middle)
     albedo = _openings(albedo, window)
     if painted_eyes:
@@ -238,19 +126,6 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
     return Skin(albedo.clamp(0.005, 0.95), specular, roughness, relief * (1 - eyes), sigma)
 
 
-def with_scalp(skin: Skin, people: People, cover: Tensor, generator: torch.Generator) -> Skin:
-    """The skin under short hair of that cover [B, 1, T, T], in the hair's colour."""
-    colour = hair_albedo(people.hair_eumelanin, people.hair_pheomelanin, people.grey)[..., None, None]
-    streaks = (1 + 0.2 * torch.randn(cover.shape, generator=generator)).clamp(0.3, 1.8)
-    return Skin(
-        skin.albedo + cover * (colour * streaks - skin.albedo).clamp(-1, 1),
-        skin.specular * (1 - 0.5 * cover),
-        (skin.roughness + 0.15 * cover).clamp(max=0.85),
-        skin.relief * (1 - cover),
-        skin.scattering_texels,
-    )
-
-
 def _pigments(
     people: People,
     window: Window,
@@ -259,7 +134,7 @@ def _pigments(
     fine: Tensor,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Melanin and blood [B, 1, T, T], with the face's regions, blotches, freckles and moles."""
+    """Draw melanin and blood [B, 1, T, T], with facial regions, blotches, freckles and moles."""
     count = len(people.melanin)
     even = 1 - 0.6 * each(people.foundation)
     uneven = each(people.blotches) * even
@@ -290,7 +165,7 @@ def _pigments(
 
 
 def _around_eyes(window: Window) -> Tensor:
-    """Lids and the hollows under them [1, 1, T, T]."""
+    """Mask [1, 1, T, T] of the lids and the hollows under them."""
     near = smooth((inside(window, "eyes") + 13) / 13)
     under = blobs(window, 0.375, 0.385, 16, 0.5)
     return (0.7 * near + 0.6 * under).clamp(0, 1)
@@ -299,7 +174,7 @@ def _around_eyes(window: Window) -> Tensor:
 def _spots(
     people: People, window: Window, middle: Tensor, fine: Tensor, age: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """Freckles, age spots and moles, as melanin of their own [B, 1, T, T]."""
+    """Draw the additional melanin [B, 1, T, T] of freckles, age spots and moles."""
     count = len(people.melanin)
     if bool((people.freckles > 0).any()):
         dots = noise(count, window, 1.8, generator, octaves=1)
@@ -328,7 +203,7 @@ def _spots(
 
 
 def _darkness(people: People) -> Tensor:
-    """How dark their hair is, against brown."""
+    """Darkness [B, 1, 1, 1] of people's hair relative to brown."""
     dark = (people.hair_eumelanin / 3).clamp(0.15, 1.6) * (1 - 0.6 * people.grey)
     return each(dark)
 
@@ -336,14 +211,29 @@ def _darkness(people: People) -> Tensor:
 def _random_colours(
     count: int, window: Window, coarse: Tensor, middle: Tensor, generator: torch.Generator
 ) -> Tensor:
-    """A share of faces wears random colours, so that nothing is read off skin tone alone."""
+    """Draw random albedo [B, 3, T, T], so that a network does not rely on skin tones alone."""
     coloured = torch.cat([noise(count, window, 45, generator, octaves=2) for _ in range(3)], 1)
     mean = 0.15 + 0.4 * torch.rand(count, 3, 1, 1, generator=generator)
     return (mean * torch.exp(0.35 * coloured + 0.12 * middle + 0.1 * coarse)).clamp(0.02, 0.85)
 
 
+def _make_up(albedo: Tensor, people: People, window: Window) -> Tensor:
+    """The albedo [B, 3, T, T] with lipstick, eye shadow and eyeliner."""
+    colour = torch.stack([people.lipstick_red, people.lipstick_green, people.lipstick_blue], -1)
+    cover = 0.8 * each(people.lipstick) * mask(window, "lips", 1.6, -0.3)
+    own = albedo.mean(1, keepdim=True) / albedo.mean((1, 2, 3), keepdim=True).clamp_min(0.02)
+    albedo = albedo + cover * (colour[..., None, None] * own.clamp(0.5, 1.2) - albedo)
+    lids = blobs(window, 0.355, 0.285, 17, 0.42) * (1 - mask(window, "brows", 4.0))
+    shade = each(colour.mean(-1)) * torch.tensor([0.55, 0.42, 0.45]).view(1, 3, 1, 1)
+    cover = 0.8 * each(people.eye_shadow) * lids.clamp(0, 1)
+    albedo = albedo + cover * (shade - albedo)
+    beyond = inside(window, "eyes")
+    line = smooth((beyond + 1.7) / 0.9) * smooth((0.8 - beyond) / 0.9)
+    return albedo * (1 - 0.8 * each(people.eyeliner) * line)
+
+
 def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, middle: Tensor) -> Tensor:
-    """Brows and beard over the skin; brows grey later than the rest."""
+    """The albedo with brows and beard; brows turn grey later than other hair."""
     streaks = (1 + 0.25 * fine + 0.12 * middle).clamp(0.3, 1.8)
     beard_grey, brow_grey = 0.7 * people.grey**1.5, 0.45 * (people.grey - 0.5).clamp_min(0)
     for cover, melanin, grey in ((hair.beard, 0.8, beard_grey), (hair.brows, 1.3, brow_grey)):
@@ -353,7 +243,7 @@ def _with_hair(albedo: Tensor, people: People, hair: FacialHair, fine: Tensor, m
 
 
 def _openings(albedo: Tensor, window: Window) -> Tensor:
-    """Nostrils and the line between the lips are dark."""
+    """The albedo with dark nostrils and a dark line between the lips."""
     nostrils = mask(window, "nostrils", 2.5)
     slit = mask(window, "mouth", 1.2, 0.5)
     dark = torch.tensor([0.80, 0.93, 0.93]).view(1, 3, 1, 1)
@@ -361,7 +251,7 @@ def _openings(albedo: Tensor, window: Window) -> Tensor:
 
 
 def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
-    """The wet pink rim of the lids, and the lashes' roots along their edge."""
+    """The albedo with the wet pink rim of the lids and the roots of the lashes along their edge."""
     beyond = inside(window, "eyes")
     upper = smooth((62.5 - places_mm(window)[1]) / 5)[None, None]
     rim = smooth((beyond + 0.6) / 1.2)
@@ -375,7 +265,7 @@ def _lid_rims(albedo: Tensor, people: People, window: Window) -> Tensor:
 def _gloss(
     people: People, window: Window, hair: Tensor, middle: Tensor, fine: Tensor, painted_eyes: bool
 ) -> tuple[Tensor, Tensor]:
-    """Reflectance at normal incidence and roughness [B, 1, T, T]; the same for all tones of skin."""
+    """Reflectance at normal incidence and roughness [B, 1, T, T]; they do not depend on the skin tone."""
     oil = each(people.oiliness)
     powder = each(people.foundation)
     t_zone = blob(window, 30, 15) + blob(window, 27, 20) + 0.8 * blob(window, (0.5, 0.06), 36, 0.7)

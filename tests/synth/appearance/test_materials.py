@@ -38,7 +38,7 @@ def test_the_same_seed_draws_the_same_person(people: list[Appearance]) -> None:
     assert people[1].traits != people[0].traits
 
 
-def test_the_side_changes_how_fine_and_not_who() -> None:
+def test_the_side_changes_the_resolution_and_not_the_person() -> None:
     for seed in range(3):
         coarse, fine = (draw_appearance(side, torch.Generator().manual_seed(seed)) for side in (96, 192))
         assert coarse.traits == fine.traits
@@ -114,7 +114,7 @@ def test_a_scalp_is_stained_where_hair_grows(people: list[Appearance]) -> None:
     assert torch.equal(stained.albedo[:, SIDE // 4 :], bare.albedo[:, SIDE // 4 :])
 
 
-def test_two_hundred_thousand_points_take_no_time(people: list[Appearance]) -> None:
+def test_sampling_two_hundred_thousand_points_is_fast(people: list[Appearance]) -> None:
     generator = torch.Generator().manual_seed(0)
     uv = torch.rand(200_000, 2, generator=generator)
     part = torch.randint(len(PARTS), (200_000,), generator=generator, dtype=torch.uint8)

@@ -20,7 +20,7 @@ from facerf_cli.synth.appearance.skin import bare_skin, draw_skin, paint_skin
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Window, blurred, inside, mask, noise, slopes, splat
 
 with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there
+    warnings.simplefilter("ignore")  # colour-science warns about missing optional packages
     import colour as oracle
 
 CLASSES_DEG = (-90, -30, 10, 28, 41, 55, 90)  # Chardon: dark, brown, tan, intermediate, light, very light
@@ -51,7 +51,7 @@ def test_colours_are_those_that_colour_science_integrates() -> None:
         m, b = melanin[::4][index[0], ::5][index[1]], blood[::4][index[0], ::5][index[1]]
         spectrum = oracle.SpectralDistribution(skin_reflectance(m, b), WAVELENGTHS_NM)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of interpolating them to its own steps
+            warnings.simplefilter("ignore")  # it interpolates the spectrum
             xyz = oracle.sd_to_XYZ(spectrum, illuminant=oracle.SDS_ILLUMINANTS["D65"]) / 100
         rgb = oracle.XYZ_to_RGB(xyz, oracle.RGB_COLOURSPACES["sRGB"])
         ours = colours(np.array([[m]]), np.array([[b]]))[0, 0]
@@ -64,7 +64,7 @@ def test_melanin_darkens_and_blood_reddens() -> None:
     melanin, blood = grid_of_pigments()
     found = colours(melanin, blood)
     assert (np.diff(found, axis=0) < 0).all()
-    assert (np.diff(found[:9], axis=1) < 0).all()  # in the darkest skins blood hardly shows
+    assert (np.diff(found[:9], axis=1) < 0).all()  # in the darkest skins blood is hardly visible
     red_over_green = found[..., 0] / found[..., 1]
     assert (np.diff(red_over_green[:9], axis=1) > 0).all()
     reflectance = skin_reflectance(melanin, blood)
@@ -97,15 +97,15 @@ def test_hair_goes_from_black_to_blond_and_grey() -> None:
     assert grey.min() > 0.3
 
 
-def test_the_canvas_and_the_chart_show_the_same_regions() -> None:
-    chart, canvas = Window(64), Window(128, CANVAS_SPAN)
+def test_the_canvas_and_the_uv_map_show_the_same_regions() -> None:
+    uv_map, canvas = Window(64), Window(128, CANVAS_SPAN)
     for name in ("eyes", "lips", "nostrils", "neck"):
         inner = inside(canvas, name)[..., 32:96, 32:96]
-        assert (inner - inside(chart, name)).abs().max() < 2.5
+        assert (inner - inside(uv_map, name)).abs().max() < 2.5
         assert torch.allclose(mask(canvas, name, 3.0), mask(canvas, name, 3.0).flip(-1), atol=1e-5)
 
 
-def test_noise_is_as_wide_as_told_at_every_size() -> None:
+def test_noise_has_the_given_width_at_every_size() -> None:
     for span, side in (((0.0, 1.0), 128), (CANVAS_SPAN, 512)):
         field = noise(4, Window(side, span), 20.0, generator(), octaves=1)
         assert 0.7 < field.std() < 1.3
@@ -164,7 +164,7 @@ def test_features_lie_where_the_face_has_them() -> None:
     assert at_landmark(worn, 57, (0, -0.02))[1] < 0.6 * lip[1]
 
 
-def test_freckles_and_wrinkles_come_when_asked_for() -> None:
+def test_freckles_and_wrinkles_appear_with_their_parameters() -> None:
     assert painted(freckles=1.0).std((1, 2)).mean() > 1.05 * painted().std((1, 2)).mean()
     person = picked(draw_people(1, generator()), 0)
     young, old = (
