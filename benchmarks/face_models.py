@@ -24,9 +24,9 @@ from scipy import sparse
 
 from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
-from facerf_cli.face.importers.carry import landmarks_of
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
+from facerf_cli.face.importers.resample import landmarks_of
 
 # The kernel's own count, for getrusage begins with what the parent held.
 IMPORT = """

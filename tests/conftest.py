@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.face.importers.carry import carry_over
+from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
@@ -40,7 +40,7 @@ def ict_source(shared_data: Path) -> SourceModel:
 @pytest.fixture(scope="session")
 def ict_model(ict_source: SourceModel) -> MorphableModel:
     """What an import makes of `ict_source`."""
-    return carry_over(ict_source)
+    return resample_model(ict_source)
 
 
 @pytest.fixture(autouse=True)

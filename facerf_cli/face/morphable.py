@@ -1,12 +1,8 @@
-"""A morphable model's whole head in the topology of its authors: what lies around and inside the chart.
+"""Morphable models on the canonical topology (paper, 'Reflectance Field Representation'), and their files.
 
-The canonical mesh of `face.topology` ends at the forehead, the cheeks and the chin and runs flat over eyes
-and lips. A synthetic light stage needs ears, a skull, eyeballs and teeth; this keeps them, driven by the same
-coefficients.
-
-Morphable models on the canonical topology (paper, 'Reflectance Field Representation').
-
-What a face model's file says of itself, without reading its shapes.
+The canonical mesh of `face.topology` ends at the forehead, the cheeks and the chin and is flat over eyes and
+mouth. A synthetic light stage also needs ears, a skull, eyeballs and teeth: a model can have a whole head in
+its authors' topology, driven by the same coefficients.
 """
 
 import math
@@ -25,20 +21,28 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
 from facerf_cli.logs import one_line
 
-HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # of HeadModel.part, by index
-_MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000
-_KEYS = ("mean", "identity", "expression", "triangles", "part", "uv")
-_PREFIX = "head_"  # of the arrays in a face model's file
+BUILTIN = "builtin"
+BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
+HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by index
+# Errors that reading a damaged .npz can raise.
+_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
+NPZ_ERRORS = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, *_ZIP_ERRORS)
+_HEAD_KEYS = ("mean", "identity", "expression", "triangles", "part", "uv")
+_HEAD_PREFIX = "head_"  # of the head's arrays in a face model's file
+_MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head
+_MAX_COEFFICIENTS = 500
+_MAX_LETTERS = 2000  # of a name or a licence
+_MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
 
 
 @dataclass(frozen=True, eq=False)
 class HeadModel:
-    """A linear model of a whole head; metres, head frame, bases scaled as those of the canonical mesh.
+    """A linear model of a whole head; metres, head frame, bases scaled like those of the canonical mesh.
 
     mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3] float32; triangles [F, 3] int64, counter-clockwise
-    seen from outside; part [N] uint8, an index into `HEAD_PARTS`: a triangle belongs to the largest of its
-    corners'; uv [N, 2]: of skin the chart of `face.topology`, left on all sides, u jumping by a full turn at
-    the back of the head; of an eye the unit disc about its gaze axis (radius 1 at 90 degrees).
+    seen from outside; part [N] uint8, an index into `HEAD_PARTS`; a triangle has the largest part of its
+    corners. uv [N, 2]: skin has the (u, v) of `face.topology`, continued on all sides, with a jump of u by a
+    full turn at the back of the head; an eye has the unit disc about its gaze axis (radius 1 at 90 degrees).
     """
 
     mean: Tensor
@@ -49,34 +53,142 @@ class HeadModel:
     uv: Tensor
 
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """mean + M_id alpha + M_exp beta, for alpha [Ki] and beta [Ke], as [N, 3]."""
+        """The vertices mean + M_id alpha + M_exp beta [N, 3] for alpha [Ki] and beta [Ke]."""
         offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
         return self.mean + offset.view(-1, 3)
 
     def to(self, device: torch.device | str) -> "HeadModel":
         """The same model with its arrays on `device`."""
-        return replace(self, **{key: getattr(self, key).to(device) for key in _KEYS})
+        return replace(self, **{key: getattr(self, key).to(device) for key in _HEAD_KEYS})
 
 
-def head_to_arrays(head: HeadModel | None) -> dict[str, Any]:
-    """Arrays for a face model's file; bases in half precision. None for no head."""
+@dataclass(frozen=True, eq=False)  # caches compare models by identity
+class MorphableModel:
+    """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
+
+    mean [V, 3], identity [Ki, V, 3], expression [Ke, V, 3]; every coefficient has a standard normal prior
+    and zeros give the neutral mean. `head` is the whole head in the authors' topology, if they publish one.
+    """
+
+    name: str
+    licence: str
+    mean: Tensor
+    identity: Tensor
+    expression: Tensor
+    expression_names: tuple[str, ...]
+    head: HeadModel | None = None
+
+    @property
+    def stamp(self) -> dict[str, str]:
+        """Name and licence as metadata of everything made with the model."""
+        return {"face_model": self.name, "face_model_licence": self.licence}
+
+    @property
+    def credit(self) -> str:
+        """Name and licence in one text."""
+        return f"{self.name} ({self.licence})"
+
+    def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
+        """The vertices mean + M_id alpha + M_exp beta [B, V, 3] for alpha [B, Ki] and beta [B, Ke]."""
+        offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
+        return self.mean + offset.view(len(offset), -1, 3)
+
+    def landmarks(self, vertices: Tensor) -> Tensor:
+        """The 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
+        corners, weights = landmark_weights()
+        return (vertices[:, corners] * weights[..., None].to(vertices)).sum(2)
+
+    def pose_only(self) -> "MorphableModel":
+        """The model with shapes of zero, so that its fit is a pose alone (paper, 'Ablative Study')."""
+        return replace(
+            self,
+            name=f"{self.name}-mean",
+            identity=self.identity[:1] * 0,
+            expression=self.expression[:1] * 0,
+            expression_names=self.expression_names[:1],
+            head=None,
+        )
+
+    def to(self, device: torch.device | str) -> "MorphableModel":
+        """The same model with its arrays on `device`."""
+        mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
+        head = self.head and self.head.to(device)
+        return replace(self, mean=mean, identity=identity, expression=expression, head=head)
+
+
+def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
+    """Load the built-in model (once a process) or a file of `facerf face-model import`.
+
+    Raises InputError for a missing or a different file.
+    """
+    return _builtin() if str(name_or_path) == BUILTIN else _read(Path(name_or_path))
+
+
+@cache
+def _builtin() -> MorphableModel:
+    return _read(BUILTIN_PATH)
+
+
+def _read(path: Path) -> MorphableModel:
+    if not path.is_file():
+        raise InputError(
+            f"{path}: no such face model; give '{BUILTIN}' or a file of `facerf face-model import`"
+        )
+    try:
+        if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
+            raise ValueError("it is not an .npz")
+        check_npz_sizes(path)
+        with np.load(path, allow_pickle=False) as file:
+            return _from_arrays(path, {key: file[key] for key in file.files})
+    except NPZ_ERRORS as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
+        raise InputError(
+            f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
+        ) from None
+
+
+def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
+    if int(arrays["layout_version"]) != LAYOUT_VERSION:
+        raise InputError(
+            f"{path}: it has another UV layout; import the face model again with this version of facerf"
+        )
+    vertices = GRID * GRID
+    for key in ("identity", "expression"):
+        shape = arrays[key].shape
+        if len(shape) != 3 or shape[1:] != (vertices, 3) or shape[0] > _MAX_COEFFICIENTS:
+            raise ValueError(f"{key} has shape {shape}, not [K, {vertices}, 3]")
+    if arrays["mean"].shape != (vertices, 3):
+        raise ValueError(f"mean has shape {arrays['mean'].shape}, not [{vertices}, 3]")
+    mean, identity, expression = (
+        torch.from_numpy(arrays[key].astype(np.float32)) for key in ("mean", "identity", "expression")
+    )
+    if not all(tensor.isfinite().all() for tensor in (mean, identity, expression)):
+        raise ValueError("it holds values that are not finite")
+    names = tuple(str(name) for name in arrays["expression_names"])
+    head = _head_from_arrays(arrays, len(identity), len(expression))
+    name, licence = (_printable(arrays[key]) for key in ("name", "licence"))
+    return MorphableModel(name, licence, mean, identity, expression, names, head)
+
+
+def _head_to_arrays(head: HeadModel | None) -> dict[str, Any]:
+    """Convert a head to arrays for a face model's file, bases in half precision; {} for None."""
     if head is None:
         return {}
     kinds = (np.float32, np.float16, np.float16, np.int32, np.uint8, np.float32)
-    return {
-        _PREFIX + key: getattr(head, key).numpy().astype(kind) for key, kind in zip(_KEYS, kinds, strict=True)
-    }
+    pairs = zip(_HEAD_KEYS, kinds, strict=True)
+    return {_HEAD_PREFIX + key: getattr(head, key).numpy().astype(kind) for key, kind in pairs}
 
 
-def head_from_arrays(arrays: dict[str, np.ndarray], identities: int, expressions: int) -> HeadModel | None:
-    """The head among a face model's arrays, if one is there; ValueError or KeyError if it is not whole."""
-    if not any(_PREFIX + key in arrays for key in _KEYS):
+def _head_from_arrays(arrays: dict[str, np.ndarray], identities: int, expressions: int) -> HeadModel | None:
+    """The head of a face model's arrays, or None; raises ValueError or KeyError for a damaged head."""
+    if not any(_HEAD_PREFIX + key in arrays for key in _HEAD_KEYS):
         return None
-    found = {key: arrays[_PREFIX + key] for key in _KEYS}
+    found = {key: arrays[_HEAD_PREFIX + key] for key in _HEAD_KEYS}
     _require_shapes(found, identities, expressions)
     _require_indices(found)
     kinds = (np.float32, np.float32, np.float32, np.int64, np.uint8, np.float32)
-    tensors = {key: torch.from_numpy(found[key].astype(kind)) for key, kind in zip(_KEYS, kinds, strict=True)}
+    pairs = zip(_HEAD_KEYS, kinds, strict=True)
+    tensors = {key: torch.from_numpy(found[key].astype(kind)) for key, kind in pairs}
     if not all(tensor.isfinite().all() for tensor in tensors.values()):
         raise ValueError("its head holds values that are not finite")
     return HeadModel(**tensors)
@@ -96,80 +208,37 @@ def _require_shapes(found: dict[str, np.ndarray], identities: int, expressions: 
     }
     for key, shape in expected.items():
         if found[key].shape != shape:
-            raise ValueError(f"{_PREFIX}{key} has shape {found[key].shape}, not {list(shape)}")
+            raise ValueError(f"{_HEAD_PREFIX}{key} has shape {found[key].shape}, not {list(shape)}")
 
 
 def _require_indices(found: dict[str, np.ndarray]) -> None:
     for key, count in (("triangles", len(found["mean"])), ("part", len(HEAD_PARTS))):
         values = found[key]
         if values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= count:
-            raise ValueError(f"{_PREFIX}{key} holds indices out of range")
+            raise ValueError(f"{_HEAD_PREFIX}{key} holds indices out of range")
 
 
-BUILTIN = "builtin"
-BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
-_MAX_COEFFICIENTS = 500
-_MAX_WORDS = 2000  # letters of a name or a licence
-_MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
-DAMAGED = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, zlib.error, zipfile.BadZipFile)
+def check_npz_sizes(path: Path) -> None:
+    """Check the array sizes in an .npz before memory is allocated; raises ValueError for too large ones."""
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                version = np.lib.format.read_magic(file)
+                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
+                if read is None:
+                    raise ValueError(f"{entry.filename} is not an array of version 1.0")
+                shape, _, dtype = read(file)
+            if max(entry.file_size, math.prod(shape) * dtype.itemsize) > _MAX_ARRAY_BYTES:
+                raise ValueError(f"{entry.filename} is too large")
 
 
-@dataclass(frozen=True, eq=False)  # caches know it by identity
-class MorphableModel:
-    """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
-
-    mean [V, 3], identity [Ki, V, 3], expression [Ke, V, 3]; every coefficient has a standard normal prior
-    and zeros give the neutral mean. `head` is the whole head in the authors' topology, where they give one.
-    """
-
-    name: str
-    licence: str
-    mean: Tensor
-    identity: Tensor
-    expression: Tensor
-    expression_names: tuple[str, ...]
-    head: HeadModel | None = None
-
-    @property
-    def stamp(self) -> dict[str, str]:
-        """Its name and licence, for whatever is made with it."""
-        return {"face_model": self.name, "face_model_licence": self.licence}
-
-    @property
-    def credit(self) -> str:
-        """The same in one text."""
-        return f"{self.name} ({self.licence})"
-
-    def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """v = mean + M_id alpha + M_exp beta, for alpha [B, Ki] and beta [B, Ke], as [B, V, 3]."""
-        offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
-        return self.mean + offset.view(len(offset), -1, 3)
-
-    def landmarks(self, vertices: Tensor) -> Tensor:
-        """The 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
-        corners, weights = landmark_weights()
-        return (vertices[:, corners] * weights[..., None].to(vertices)).sum(2)
-
-    def pose_only(self) -> "MorphableModel":
-        """The same model with shapes that do nothing: its fit is a pose (paper, 'Ablative Study')."""
-        return replace(
-            self,
-            name=f"{self.name}-mean",
-            identity=self.identity[:1] * 0,
-            expression=self.expression[:1] * 0,
-            expression_names=self.expression_names[:1],
-            head=None,
-        )
-
-    def to(self, device: torch.device | str) -> "MorphableModel":
-        """The same model with its arrays on `device`."""
-        mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
-        head = self.head and self.head.to(device)
-        return replace(self, mean=mean, identity=identity, expression=expression, head=head)
+def _printable(array: np.ndarray) -> str:
+    """A name or licence as one line of limited length, safe for metadata and the terminal."""
+    return "".join(letter for letter in one_line(str(array))[:_MAX_LETTERS] if letter.isprintable())
 
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
-    """Write `model` as an .npz without pickles; bases in half precision (steps under 0.02 mm)."""
+    """Write a model as .npz without pickles; bases in half precision (steps below 0.02 mm)."""
     with path.open("wb") as file:
         np.savez_compressed(
             file,
@@ -180,83 +249,13 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             identity=model.identity.numpy().astype(np.float16),
             expression=model.expression.numpy().astype(np.float16),
             expression_names=np.array(model.expression_names, dtype=np.str_),
-            **head_to_arrays(model.head),
+            **_head_to_arrays(model.head),
         )
-
-
-def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
-    """The built-in model, read once a process, or one written by `facerf face-model import`."""
-    return _builtin() if str(name_or_path) == BUILTIN else _read(Path(name_or_path))
-
-
-@cache
-def _builtin() -> MorphableModel:
-    return _read(BUILTIN_PATH)
-
-
-def _read(path: Path) -> MorphableModel:
-    if not path.is_file():
-        raise InputError(
-            f"{path}: no such face model; give '{BUILTIN}' or a file that `facerf face-model import` wrote"
-        )
-    try:
-        if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
-            raise ValueError("it is no .npz")
-        require_bounded(path)
-        with np.load(path, allow_pickle=False) as file:
-            return _from_arrays(path, {key: file[key] for key in file.files})
-    except DAMAGED as error:
-        reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
-        raise InputError(
-            f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
-        ) from None
-
-
-def require_bounded(path: Path) -> None:
-    """Look at what an .npz's arrays claim before room is made for them; a ValueError where it is too much."""
-    with zipfile.ZipFile(path) as archive:
-        for entry in archive.infolist():
-            with archive.open(entry) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-                if read is None:
-                    raise ValueError(f"{entry.filename} is no array of version 1.0")
-                shape, _, dtype = read(file)
-            if max(entry.file_size, math.prod(shape) * dtype.itemsize) > _MAX_ARRAY_BYTES:
-                raise ValueError(f"{entry.filename} is too large")
-
-
-def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
-    if int(arrays["layout_version"]) != LAYOUT_VERSION:
-        raise InputError(
-            f"{path}: made for another UV layout; import the face model again with this version of facerf"
-        )
-    vertices = GRID * GRID
-    for key in ("identity", "expression"):
-        shape = arrays[key].shape
-        if len(shape) != 3 or shape[1:] != (vertices, 3) or shape[0] > _MAX_COEFFICIENTS:
-            raise ValueError(f"{key} has shape {shape}, not [K, {vertices}, 3]")
-    if arrays["mean"].shape != (vertices, 3):
-        raise ValueError(f"mean has shape {arrays['mean'].shape}, not [{vertices}, 3]")
-    mean, identity, expression = (
-        torch.from_numpy(arrays[key].astype(np.float32)) for key in ("mean", "identity", "expression")
-    )
-    if not all(tensor.isfinite().all() for tensor in (mean, identity, expression)):
-        raise ValueError("it holds values that are not finite")
-    names = tuple(str(name) for name in arrays["expression_names"])
-    head = head_from_arrays(arrays, len(identity), len(expression))
-    name, licence = (words_of(arrays[key]) for key in ("name", "licence"))
-    return MorphableModel(name, licence, mean, identity, expression, names, head)
-
-
-def words_of(array: np.ndarray) -> str:
-    """A name or a licence in a face model's file, to be stamped: one line of letters, and not too long."""
-    return "".join(letter for letter in one_line(str(array))[:_MAX_WORDS] if letter.isprintable())
 
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """A face model's name, its licence, and how many shapes it has of each kind."""
+    """A face model's name, licence and number of shapes, and the presence of a head."""
 
     name: str
     licence: str
@@ -266,23 +265,23 @@ class ModelFacts:
 
 
 def read_model_facts(path: Path) -> ModelFacts | None:
-    """The facts of a file that `facerf face-model import` wrote; None for any other .npz."""
+    """Read the facts of a file of `facerf face-model import` without its shapes; None for any other file."""
     try:
         if not zipfile.is_zipfile(path):
             return None
-        require_bounded(path)
+        check_npz_sizes(path)
         with np.load(path, allow_pickle=False) as file:
             if not {"layout_version", "name", "licence", "identity", "expression"} <= set(file.files):
                 return None
-            name, licence = (words_of(file[key]) for key in ("name", "licence"))
+            name, licence = (_printable(file[key]) for key in ("name", "licence"))
             has_head = "head_mean" in file.files
         return ModelFacts(name, licence, _count(path, "identity"), _count(path, "expression"), has_head)
-    except (*DAMAGED, InputError):
+    except (*NPZ_ERRORS, InputError):
         return None
 
 
 def _count(path: Path, key: str) -> int:
-    """The first length of an array, from its header alone."""
+    """The length of an array in an .npz, from its header alone."""
     with zipfile.ZipFile(path) as archive, archive.open(f"{key}.npy") as file:
         np.lib.format.read_magic(file)
         shape, _, _ = np.lib.format.read_array_header_1_0(file)

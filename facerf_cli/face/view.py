@@ -71,9 +71,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     coverage = fragments.covered.float()
     mask = sample_texture(region_mask("face", _MASK_SIDE)[None], uv)[..., 0]
     inside = (mask * coverage > 0.02).numpy()
-    if (
-        not inside.all()
-    ):  # where the face turns away the UV mask is steep in the image, so soften it in pixels
+    if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
         mask = mask * smooth(edge_px / max(FEATHER * side_px, 1))
     unit = F.normalize(normal, dim=-1)

@@ -6,9 +6,9 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
-from facerf_cli.face.importers.carry import carry_over
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
+from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.logs import one_line
@@ -23,7 +23,7 @@ def import_face_model(kind: str, path: Path, landmarks: Path | None = None) -> M
     """
     source = _read(kind, path, landmarks)
     try:
-        return carry_over(source)
+        return resample_model(source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

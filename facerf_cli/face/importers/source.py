@@ -1,7 +1,4 @@
-"""Arrays of other people's .npz files, without pickles and with bounds.
-
-What an importer makes of a publisher's files, before it is carried to the canonical topology.
-"""
+"""Source models: face models in their publishers' topology, before the canonical grid is laid on them."""
 
 import zipfile
 from dataclasses import dataclass, field
@@ -10,35 +7,20 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.morphable import DAMAGED, require_bounded
+from facerf_cli.face.morphable import NPZ_ERRORS, check_npz_sizes
 from facerf_cli.files.inert_arrays import InertArray
 from facerf_cli.logs import one_line
 
-
-def read_npz(path: Path) -> dict[str, InertArray]:
-    """Every array of an .npz by its name, as an inert pickle gives them; an InputError for what is none."""
-    try:
-        if not zipfile.is_zipfile(path):
-            raise ValueError("it is no .npz")
-        require_bounded(path)
-        with np.load(path, allow_pickle=False) as file:
-            return {key: InertArray(file[key]) for key in file.files}
-    except DAMAGED as error:
-        raise InputError(
-            f"{path}: cannot be read ({one_line(str(error))[:160]}); an .npz of plain arrays is wanted"
-        ) from None
-
-
-EXPRESSION_STD = 0.3  # of a full blendshape: the spread that a coefficient of 1 stands for
+EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means
 _MAX_VERTICES, _MAX_TRIANGLES = 120_000, 240_000
 
 
 @dataclass(frozen=True)
 class SourceHead:
-    """What of a model's own mesh makes its whole head.
+    """The part of a model's mesh that is its whole head.
 
-    triangles [F, 3] in the source's vertex ids; part [N] uint8 into `HEAD_PARTS`; eyes: the vertex ids of
-    each ball, a closed surface whose cornea looks along the gaze.
+    triangles [F, 3] of the source's vertex ids; part [N] uint8, an index into `HEAD_PARTS`; eyes: the vertex
+    ids of each eyeball, a closed surface whose cornea points along the gaze.
     """
 
     triangles: np.ndarray
@@ -50,8 +32,8 @@ class SourceHead:
 class SourceModel:
     """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
 
-    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface; known:
-    where those of the 68 landmarks that the publisher names lie on the mean, by number.
+    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface; known: the
+    points on the mean of those of the 68 landmarks that the publisher names, by number.
     """
 
     name: str
@@ -66,7 +48,7 @@ class SourceModel:
 
 
 def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:
-    """A ValueError unless these are a mesh: mean [N, 3], finite, and triangles [F, 3] of its vertices."""
+    """Raise ValueError unless mean [N, 3] is finite and triangles [F, 3] name its vertices."""
     if mean.ndim != 2 or mean.shape[1] != 3 or not 100 <= len(mean) <= _MAX_VERTICES:
         raise ValueError(f"its mean has shape {list(mean.shape)}, not [N, 3]")
     if not np.isfinite(mean).all():
@@ -75,3 +57,20 @@ def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:
         raise ValueError(f"its triangles have shape {list(triangles.shape)}, not [F, 3]")
     if triangles.min() < 0 or triangles.max() >= len(mean):
         raise ValueError("its triangles name vertices that it does not have")
+
+
+def read_npz(path: Path) -> dict[str, InertArray]:
+    """Read the arrays of an .npz by name, without pickles and with bounds, as `read_inert_pickle` does.
+
+    Raises InputError for any other file.
+    """
+    try:
+        if not zipfile.is_zipfile(path):
+            raise ValueError("it is not an .npz")
+        check_npz_sizes(path)
+        with np.load(path, allow_pickle=False) as file:
+            return {key: InertArray(file[key]) for key in file.files}
+    except NPZ_ERRORS as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))[:160]}); give an .npz of plain arrays"
+        ) from None

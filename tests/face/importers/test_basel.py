@@ -14,9 +14,9 @@ import scipy.io
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face.importers import basel
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
-from facerf_cli.face.importers.carry import carry_over, landmarks_of
 from facerf_cli.face.importers.find_landmarks import rigid_alignment
 from facerf_cli.face.importers.import_model import import_face_model
+from facerf_cli.face.importers.resample import landmarks_of, resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
@@ -164,7 +164,7 @@ def test_basel_2017_s_names_help_to_find_the_other_landmarks(tmp_path: Path) -> 
     off = 1000 * np.linalg.norm(landmarks_of(source) - face.landmarks, axis=-1)
     others = [number for number in range(68) if number not in NAMES]
     assert off[others].mean() < 1.0 and off[others].max() < 2.5
-    model = carry_over(source)
+    model = resample_model(source)
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
     assert model.identity.shape[0] == SHAPES and model.expression.shape[0] == EXPRESSIONS + 1
 
@@ -181,14 +181,14 @@ def test_a_surface_that_ends_early_goes_on_as_the_built_in_face(tmp_path: Path) 
     part = oval(0.070, 0.105)  # without the chart's corners, and without the contour's ends
     off = 1000 * np.linalg.norm(landmarks_of(part) - whole.landmarks, axis=-1)
     assert off[:17].max() < 2.5  # also of those that are cut away
-    model = carry_over(part)
+    model = resample_model(part)
     off = off_mm(model, whole)
     assert np.median(off) < 0.5 and off.max() < 12
     moved = model.identity[0].norm(dim=-1)
     corners = moved.reshape(129, 129)[[0, 0, -1, -1], [0, -1, 0, -1]]
     assert 0.5 * moved.mean() < corners.mean() < 2 * moved.mean()
     with pytest.raises(InputError, match=r"covers \d+ % of the face"):
-        carry_over(oval(0.060, 0.085))
+        resample_model(oval(0.060, 0.085))
 
 
 def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
-from facerf_cli.face.importers.find_landmarks import _missed, find_landmarks
+from facerf_cli.face.importers.find_landmarks import _correction, find_landmarks
 from facerf_cli.face.importers.ict import LANDMARK_IDS
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.topology import LANDMARKS_M, MIRROR_68
@@ -35,10 +35,10 @@ def test_they_lie_where_the_authors_see_them(
 
 def test_what_the_known_ones_are_missed_by_moves_their_neighbours_too() -> None:
     points, shift = LANDMARKS_M, np.array([0.002, -0.001, 0.001])
-    everywhere = _missed(points, {number: points[number] + shift for number in (8, 30, 36, 45, 51)})
+    everywhere = _correction(points, {number: points[number] + shift for number in (8, 30, 36, 45, 51)})
     np.testing.assert_allclose(everywhere, np.broadcast_to(shift, (68, 3)), atol=1e-9)
     lips = {number: points[number] + shift * (number == 51) for number in (8, 30, 36, 45, 51)}
-    moved = np.linalg.norm(_missed(points, lips), axis=-1) / np.linalg.norm(shift)
+    moved = np.linalg.norm(_correction(points, lips), axis=-1) / np.linalg.norm(shift)
     assert moved[51] == pytest.approx(1) and moved[62] > 0.7 and moved[19] < 0.2
 
 

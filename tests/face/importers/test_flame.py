@@ -13,10 +13,10 @@ import trimesh
 from scipy import sparse
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.carry import carry_over, landmarks_of
 from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.import_model import import_face_model
+from facerf_cli.face.importers.resample import landmarks_of, resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LANDMARKS_M
@@ -136,7 +136,7 @@ def test_an_import_reproduces_the_mesh(source: SourceModel, face: Head, tmp_path
     found = landmarks_of(source)
     off = 1000 * np.linalg.norm(found - face.landmarks, axis=-1)
     assert off.mean() < 0.8 and off.max() < 2.0  # without an embedding
-    model = carry_over(source)
+    model = resample_model(source)
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
     assert model.identity.shape[0] == 300 and model.expression.shape[0] == 103
     save_face_model(tmp_path / "flame.npz", model)

@@ -5,7 +5,7 @@ import pytest
 import torch
 import trimesh
 
-from facerf_cli.face.importers.carry import skin_uv
+from facerf_cli.face.importers.resample import skin_uv
 from facerf_cli.face.importers.find_landmarks import nearest_on_mesh
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV

@@ -1,0 +1,223 @@
+"""Resampling of a model in its own topology to the canonical grid (DESIGN, 'One topology inside').
+
+The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface. A whole
+head stays in its publisher's topology, in the head frame, with (u, v) that match the canonical grid.
+"""
+
+import numpy as np
+import torch
+import trimesh
+from scipy.interpolate import RBFInterpolator
+from scipy.ndimage import binary_dilation, median_filter
+from scipy.sparse import csr_matrix
+from scipy.spatial.distance import cdist
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.importers.find_landmarks import find_landmarks, nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.source import SourceHead, SourceModel
+from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel, load_face_model
+from facerf_cli.face.topology import (
+    GRID,
+    LANDMARK_UV,
+    LANDMARKS_M,
+    OUTER_EYE_CORNERS,
+    cylinder_rays,
+    cylinder_uv,
+    grid_triangles,
+    grid_uv,
+    landmark_weights,
+)
+
+_HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # a length outside these ranges is in another unit
+_SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
+_PULL_M = 0.005  # radius around a landmark in which the grid is pulled onto it
+_LEAST_COVERED = 0.75  # share of the grid that a model's surface must cover
+_LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and its angle in eye textures
+
+
+def resample_model(source: SourceModel) -> MorphableModel:
+    """Resample a model to the canonical topology.
+
+    A model without expressions gets those of the built-in model, which has the same vertices. A surface that
+    ends inside the grid, such as Basel's face12, continues as the built-in face and moves like its border.
+    Raises InputError for a mean in another unit or without a face.
+    """
+    side_m = float(np.ptp(source.mean[np.unique(source.triangles)], 0).max())
+    _require_size("its mean's largest side", side_m, _HEAD_M)
+    landmarks = landmarks_of(source)
+    eyes_m = float(np.linalg.norm(landmarks[OUTER_EYE_CORNERS[0]] - landmarks[OUTER_EYE_CORNERS[1]]))
+    _require_size("the distance of its eyes' outer corners", eyes_m, _EYES_M)
+    rotation, translation = rigid_alignment(landmarks, LANDMARKS_M)
+    mean = source.mean @ rotation.T + translation
+    corners, weights, covered = register(mean, source.triangles, landmarks @ rotation.T + translation)
+    rows = np.arange(0, corners.size + 1, 3)
+    onto_grid = csr_matrix((weights.ravel(), corners.ravel(), rows), (len(corners), len(mean)))
+    builtin, (border, weights_beyond) = load_face_model(), _beyond(covered)
+
+    def resampled(field: np.ndarray, otherwise: np.ndarray | float = 0.0) -> torch.Tensor:
+        off = onto_grid @ field - otherwise
+        off[~covered] = weights_beyond @ off[border]
+        return torch.from_numpy((off + otherwise).astype(np.float32))
+
+    def resampled_basis(basis: np.ndarray) -> torch.Tensor:
+        return torch.stack([resampled(shape @ rotation.T) for shape in basis])
+
+    has_expressions = len(source.expression) > 0
+    on_grid = resampled(mean, builtin.mean.double().numpy())
+    return MorphableModel(
+        name=source.name,
+        licence=source.licence + ("" if has_expressions else f"; expressions: {builtin.licence}"),
+        mean=on_grid,
+        identity=resampled_basis(source.identity),
+        expression=resampled_basis(source.expression) if has_expressions else builtin.expression,
+        expression_names=source.expression_names if has_expressions else builtin.expression_names,
+        head=None
+        if source.head is None
+        else _head_model(source, source.head, on_grid.numpy(), rotation, translation),
+    )
+
+
+def landmarks_of(source: SourceModel) -> np.ndarray:
+    """The landmarks [68, 3] on the source's mean: the known ones, and the others found by shape."""
+    if len(source.known) == 68:
+        return np.stack([source.known[number] for number in range(68)])
+    return find_landmarks(source.mean, source.triangles, source.known)
+
+
+def _require_size(what: str, length_m: float, between_m: tuple[float, float]) -> None:
+    """Raise InputError for a length outside a range."""
+    if not between_m[0] < length_m < between_m[1]:
+        raise InputError(f"{what} is {1000 * length_m:.4g} mm; give the model in the unit of its publication")
+
+
+def _beyond(covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The border [V] of the covered vertices [V], and weights [M, B] from its vertices to the uncovered ones.
+
+    Inverse distance weights, as in `skin_uv`: exact at the border, smooth beyond.
+    """
+    border = covered & binary_dilation(~covered.reshape(GRID, GRID)).ravel()
+    grid = grid_uv().double().numpy()
+    pull = 1 / (cdist(grid[~covered], grid[border]) ** 4 + 1e-12)
+    return border, pull / pull.sum(-1, keepdims=True)
+
+
+def register(
+    mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Place the canonical vertices on a mesh: vertex ids and barycentric weights [V, 3], and a mask [V].
+
+    A thin-plate spline of the landmarks' [68, 3] displacements from their canonical (u, v) warps the grid.
+    The mask is true where the mesh covers a vertex.
+    """
+    warp = RBFInterpolator(LANDMARK_UV, cylinder_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
+    uv = grid_uv().double().numpy()
+    mesh = trimesh.Trimesh(mean, triangles, process=False)
+    points, covered = _cast(mesh, *cylinder_rays(uv + warp(uv)))
+    points, faces = nearest_on_mesh(mesh, _pulled(points, landmarks))
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
+    weights = np.clip(weights, 0, None)
+    return triangles[faces], weights / weights.sum(-1, keepdims=True), covered
+
+
+def _cast(
+    mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points [V, 3] where the grid's rays meet the mesh, and a mask [V] of the rays that do.
+
+    A ray that slips into a slit ends at the distance of its neighbours.
+    """
+    points, rays, _ = mesh.ray.intersects_location(origins, directions, multiple_hits=False)
+    if len(rays) < len(origins) * _LEAST_COVERED:
+        raise InputError(
+            f"its surface covers {100 * len(rays) / len(origins):.0f} % of the face, from the forehead to "
+            f"below the chin; {100 * _LEAST_COVERED:.0f} % are needed, so give the model's larger mesh"
+        )
+    travelled = np.full(len(origins), np.inf)
+    travelled[rays] = np.linalg.norm(points - origins[rays], axis=-1)
+    filled = np.where(np.isfinite(travelled), travelled, travelled[rays].max())
+    usual = median_filter(filled.reshape(GRID, GRID), 5).ravel()
+    ends = origins + directions * np.where(travelled < usual + _SLIP_M, travelled, usual)[:, None]
+    return ends, np.isfinite(travelled)
+
+
+def _pulled(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
+    """Move points [V, 3] near the landmarks so that the grid's landmarks lie on the model's [68, 3].
+
+    Rays miss landmarks that are hidden from them, such as the inner corners of the mouth behind the lips.
+    """
+    corners, weights = (tensor.numpy() for tensor in landmark_weights())
+    reached = (points[corners] * weights[..., None]).sum(1)
+    kernel = np.exp(-((cdist(reached, reached) / _PULL_M) ** 2))
+    strength = np.linalg.solve(kernel + 1e-3 * np.eye(len(reached)), landmarks - reached)
+    return points + np.exp(-((cdist(points, reached) / _PULL_M) ** 2)) @ strength
+
+
+def _head_model(
+    source: SourceModel,
+    head: SourceHead,
+    canonical: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+) -> HeadModel:
+    """The source's head in the head frame, with (u, v) of skin by the canonical mean [V, 3]."""
+    mean = source.mean @ rotation.T + translation
+    uv = cylinder_uv(mean)
+    skin = np.flatnonzero(head.part == HEAD_PARTS.index("skin"))
+    uv[skin] = skin_uv(mean[skin], canonical)
+    for eye in head.eyes:
+        uv[eye] = _eye_uv(mean[eye])
+    used, triangles = np.unique(head.triangles, return_inverse=True)
+
+    def kept(field: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(field[..., used, :].astype(np.float32))
+
+    return HeadModel(
+        mean=kept(mean),
+        identity=kept(source.identity @ rotation.T),
+        expression=kept(source.expression @ rotation.T),
+        triangles=torch.from_numpy(triangles.reshape(-1, 3)),
+        part=torch.from_numpy(head.part[used]),
+        uv=kept(uv),
+    )
+
+
+def skin_uv(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
+    """The (u, v) [N, 2] of skin: that of the nearest point of the canonical mean, outside it the cylinder's.
+
+    The cylinder's (u, v) is corrected by its interpolated error at the border, so that there is no jump.
+    """
+    grid = grid_uv().double().numpy()
+    mesh = trimesh.Trimesh(canonical, grid_triangles().numpy(), process=False)
+    nearest, faces = nearest_on_mesh(mesh, points)
+    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], nearest)
+    inner = (weights[..., None] * grid[mesh.faces[faces]]).sum(1)
+    formula = cylinder_uv(points)
+    inside = ((inner > 1e-3) & (inner < 1 - 1e-3) & (np.abs(formula - 0.5) < 0.7)).all(-1)
+    border = ((grid == 0) | (grid == 1)).any(-1)
+    at = cylinder_uv(canonical[border])
+    pull = 1 / (cdist(formula, at) ** 4 + 1e-12)  # inverse distance: exact at the border, smooth beyond
+    beyond = formula + (pull @ (grid[border] - at)) / pull.sum(-1, keepdims=True)
+    return np.where(inside[:, None], inner, beyond)
+
+
+def _eye_uv(points: np.ndarray) -> np.ndarray:
+    """The (u, v) [N, 2] of an eyeball: direction and angle about the axis through its cornea, as a disc.
+
+    Angles are scaled so that an iris of radius `_LIMBUS_M` has the same place in eyeballs of any size.
+    """
+    centre = (points.min(0) + points.max(0)) / 2
+    offset = points - centre
+    radius = np.linalg.norm(offset, axis=-1)
+    axis = offset[radius > np.percentile(radius[offset[:, 2] > 0], 90)]
+    axis = axis[axis[:, 2] > 0].mean(0)
+    axis /= np.linalg.norm(axis)
+    along = offset @ axis
+    side = np.cross([0.0, 1, 0], axis)
+    side /= np.linalg.norm(side)
+    across = np.stack([offset @ side, -(offset @ np.cross(axis, side))], -1)
+    lateral = np.linalg.norm(across, axis=-1)
+    angle_deg = np.degrees(np.arctan2(lateral, along))
+    front = np.argsort(angle_deg)[: len(points) // 2]
+    limbus_deg = np.interp(_LIMBUS_M, lateral[front], angle_deg[front])
+    stretched = np.minimum(angle_deg * _LIMBUS_DEG / limbus_deg, 90)
+    return 0.5 + 0.5 * across / np.maximum(lateral, 1e-9)[:, None] * (stretched / 90)[:, None]
