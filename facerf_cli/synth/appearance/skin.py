@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from facerf_cli.synth.appearance.eyes import paint_eyes
+from facerf_cli.synth.appearance.eye_textures import paint_eyes
 from facerf_cli.synth.appearance.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
 from facerf_cli.synth.appearance.people import People, draw_people, each
 from facerf_cli.synth.appearance.pigments import hair_albedo, skin_albedo
@@ -110,9 +110,9 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
     albedo = skin_albedo(melanin, blood)
     cast = torch.tensor([1.0, 0.84, 0.70]).view(1, 3, 1, 1)  # hair under the skin absorbs more red
     albedo = albedo * torch.exp(-hair.shadow * _darkness(people) * cast)
-    odd = people.random_texture > 0
-    if bool(odd.any()):
-        albedo[odd] = _random_colours(int(odd.sum()), window, coarse[odd], middle[odd], generator)
+    random = people.random_texture > 0
+    if bool(random.any()):
+        albedo[random] = _random_colours(int(random.sum()), window, coarse[random], middle[random], generator)
     albedo = _make_up(albedo, people, window)
     albedo = _with_hair(albedo, people, hair, fine, middle)
     albedo = _openings(albedo, window)

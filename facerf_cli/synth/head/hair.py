@@ -128,9 +128,9 @@ class _Wisps:
             share = shares[index]
             step = np.maximum(length_m * (shares[index + 1] - share), _SHORTEST_STEP_M)[:, None]
             normal = self.normals if index == 0 else self.hull.normals(points)
-            held = 0.1 + 0.9 * smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair hangs down
-            held = np.where(length_m > 0.08, held, 1)
-            direction = held[:, None] * (_combed(points, normal, self.roots, style) + self.stray)
+            combing = 0.1 + 0.9 * smoothstep((points[:, 1] + 0.01) / 0.08)  # below the ears hair hangs down
+            combing = np.where(length_m > 0.08, combing, 1)
+            direction = combing[:, None] * (_combed(points, normal, self.roots, style) + self.stray)
             fallen = share * length_m / 0.1 * style.gravity
             direction[:, 1] -= np.minimum(fallen, 4)
             direction = direction + normal * (self.lift * (1 - share) ** 3)[:, None]

@@ -154,9 +154,8 @@ def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
     owner = part[triangles].max(1)  # [F] part of each triangle
     uv = _unwrapped(head.uv.double().numpy()[triangles])  # [F, 3, 2]
     count = len(head.mean)
-    refine = csr_matrix(
-        (np.ones(count), (np.arange(count), np.arange(count))), shape=(count, count)
-    )  # the identity
+    every = np.arange(count)
+    refine = csr_matrix((np.ones(count), (every, every)), shape=(count, count))  # the identity
     for _ in range(subdivisions):
         fine = (owner == _SKIN) | (owner == _EYE)
         step, divided = loop_step(triangles[fine], refine.shape[0])

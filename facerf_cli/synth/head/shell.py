@@ -90,10 +90,10 @@ def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, 
     skin = np.empty((len(on), 3))
     skin[on] = face_surface(face_mm, sheet.u_level[on])
     for name in cut:
-        for lip, held in zip(lips(name), _side_samples(subdivisions, cut, name), strict=True):
+        for lip, samples in zip(lips(name), _side_samples(subdivisions, cut, name), strict=True):
             side_mm = face_mm.copy()
             side_mm[lip.replaced] = lip.weights @ face_mm[lip.sources]
-            skin[held] = face_surface(side_mm, sheet.u_level[held])
+            skin[samples] = face_surface(side_mm, sheet.u_level[samples])
     skin[~on] = _surroundings(subdivisions).positions(face_mm)
     return skin[sheet.same]
 

@@ -111,7 +111,7 @@ def _weight(
     """Weights [N] of `Slit`, which fall with the distance from the edge; `share`: part of the upper side."""
     weight = np.zeros(len(mean))
     for edge, side, part in ((upper, above, share), (lower, ~above, share - 1)):
-        mine = movable[side[movable]]
-        away, _ = cKDTree(mean[edge]).query(mean[mine])
-        weight[mine] = part * np.exp(-((away / reach_m) ** 2) / 2)
+        own = movable[side[movable]]
+        away, _ = cKDTree(mean[edge]).query(mean[own])
+        weight[own] = part * np.exp(-((away / reach_m) ** 2) / 2)
     return weight
