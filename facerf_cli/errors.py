@@ -1,13 +1,13 @@
-"""What a user can cause: each error prints as one line that says what to do."""
+"""Errors that a user can cause; each message is one line that says what to do."""
 
 
 class FacerfError(Exception):
-    """Something the user can mend; the command line prints it in one line and exits 1."""
+    """An error that the user can correct; the command line prints it in one line and exits with 1."""
 
 
 class InputError(FacerfError):
-    """One input item is missing, broken or unsuitable; the other items go on."""
+    """One input is missing, broken or unsuitable; the run continues with the others."""
 
 
 class UsageError(FacerfError):
-    """The command was called wrongly, or there is nothing to work on; exit 2."""
+    """The command line is wrong, or there is nothing to work on; the exit code is 2."""

@@ -1,4 +1,4 @@
-"""Whole files or none: an output is written under a temporary name beside its place, then renamed."""
+"""Atomic writes: an output is written under a temporary name in its folder, then renamed."""
 
 import hashlib
 import os
@@ -12,16 +12,16 @@ from pathlib import Path
 
 from facerf_cli.errors import FacerfError
 
-_ABANDONED_S = 24 * 3600  # what no machine has written to for so long, nobody is writing
+_ABANDONED_S = 24 * 3600  # another machine's temporary file counts as abandoned after so long without a write
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write a file or a folder at; it takes `path`'s place when the block succeeds.
+    """Yield a temporary path for a file or a folder; it replaces `path` when the block succeeds.
 
-    The temporary name keeps the suffix (writers choose their format by it) and is hidden, so that a walk over
-    the folder does not take it for an input. Missing parent folders are made, and what a killed process left
-    of the same output is removed. Machines that share the folder may write the same output at once.
+    The temporary name keeps the suffix (writers choose their format by it) and is hidden, so that a search of
+    the folder does not take it for an input. Missing parent folders are created. Temporary files that a
+    killed process left for the same output are removed. Several machines may write the same output at once.
     """
     temporary = path.with_name(f".{path.stem}.part-{_machine()}-{os.getpid()}{path.suffix}")
     try:
@@ -41,11 +41,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @cache
 def _machine() -> str:
-    """What tells this machine from others that write to the same folder and count processes anew."""
+    """An id of this machine, since machines that share a folder may use the same process ids."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 def _remove_leftovers(path: Path) -> None:
+    """Remove the temporary files of `path` whose processes have ended."""
     before, after = f".{path.stem}.part-", path.suffix
     for name in os.listdir(path.parent):
         machine, _, owner = name[len(before) : len(name) - len(after)].partition("-")
@@ -59,12 +60,12 @@ def _is_abandoned(leftover: Path, machine: str, owner: int) -> bool:
         return not _runs(owner)
     try:
         return time.time() - leftover.stat().st_mtime > _ABANDONED_S
-    except OSError:  # its owner has taken it away
+    except OSError:  # its process has just renamed or removed it
         return False
 
 
 def _runs(process: int) -> bool:
-    if os.name == "nt":  # where signal 0 is no question; leftovers stay
+    if os.name == "nt":  # os.kill would end the process there; leftovers stay
         return True
     try:
         os.kill(process, 0)

@@ -1,4 +1,4 @@
-"""Published files, fetched once into the user's cache: resumed after a broken connection, verified."""
+"""Downloads of published files into the user's cache: resumed after a broken connection, then verified."""
 
 import hashlib
 import http.client
@@ -26,52 +26,52 @@ from facerf_cli.logs import LOGGER_NAME, STDERR, one_line
 if sys.platform != "win32":
     import fcntl
 
-TIMEOUT_S = 30.0  # of silence on a connection
-_TRIES = 5  # connections to a server; each goes on where the last one broke
-_BLOCK = 2**20
-_THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+TIMEOUT_S = 30.0  # without any data on a connection
+_TRIES = 5  # connections to a server; each continues where the last one broke
+_BLOCK = 2**20  # bytes read at a time
+_THIS_MACHINE = ("localhost", "127.0.0.1", "::1")  # where http is safe
 _NO_NETWORK = (URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError)
 
 log = logging.getLogger(LOGGER_NAME)
 
 
 def file_sha256(path: Path) -> str:
-    """A file's SHA-256 in 64 hex digits."""
+    """Return a file's SHA-256 as 64 hex digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)
-class Published:
-    """A file that someone publishes: its address, its digest in 64 hex digits, the most bytes it may have.
+class PublishedFile:
+    """A file on a server, and the digest that verifies it.
 
-    `digest` is what of the file has that digest: of an archive that its server packs anew now and then, such
-    as GitHub's, the contents (a damaged file's digest may be any other text).
+    `digest` computes the digest of a downloaded file. GitHub packs an archive differently from time to time,
+    so an archive's digest is computed from its contents (for a damaged archive it may return any other text).
     """
 
     url: str
-    sha256: str
-    size_limit: int
+    sha256: str  # 64 hex digits
+    size_limit: int  # bytes; more are refused
     digest: Callable[[Path], str] = file_sha256
 
     @property
     def name(self) -> str:
-        """The last part of its address: its name in the cache."""
+        """The file's name in the cache: the last part of its address."""
         return Path(unquote(urlsplit(self.url).path)).name
 
 
 def cache_folder() -> Path:
-    """Where fetched files are kept: the user's cache of this platform, as `facerf doctor` shows it."""
+    """Return the folder of downloaded files in this platform's user cache; `facerf doctor` shows it."""
     return platformdirs.user_cache_path("facerf")
 
 
-def fetch(published: Published, option: str, cache: Path | None = None) -> Path:
-    """The file's place in the cache, fetched there first where it is not yet; verified every time.
+def fetch(published: PublishedFile, option: str, cache: Path | None = None) -> Path:
+    """Return the file's path in the cache; download it first if it is missing, and verify it every time.
 
-    `option` is what the user can give in its stead, such as '--vgg-weights PATH': the one line of an error
-    says so, and where the file may be put by hand. What a broken fetch got stays beside the file's place, and
-    the next one goes on from there. Only https, or http on this machine, through redirections too. A bar
-    shows progress where stderr is a terminal.
+    `option` is the option that replaces the download, such as '--vgg-weights PATH': an error names it, and
+    the path to which the user can copy the file. An interrupted download is kept, and the next one continues
+    it. Addresses and redirections must be https, or http on this machine. A bar shows progress if stderr is a
+    terminal.
     """
     path = (cache or cache_folder()) / published.name
     try:
@@ -79,7 +79,7 @@ def fetch(published: Published, option: str, cache: Path | None = None) -> Path:
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
         with _alone(path):
-            if not _is_whole(published, path):  # as another process may have made it meanwhile
+            if not _is_whole(published, path):  # another process may have fetched it by now
                 log.info("fetching %s to %s", published.url, path)
                 _fetch(published, path)
     except _Refused as error:
@@ -99,42 +99,43 @@ def fetch(published: Published, option: str, cache: Path | None = None) -> Path:
 
 
 class _Refused(Exception):
-    """What came is not what was wanted; in words."""
+    """The download is not the published file; the text says why."""
 
 
-def _fetch(published: Published, path: Path) -> None:
+def _fetch(published: PublishedFile, path: Path) -> None:
+    """Download to a temporary file, verify it, and rename it to `path`."""
     part = path.with_name(f".{path.name}.part")
     resumed = part.exists()
     try:
         _download(published, part)
-        if resumed and not _is_whole(published, part):  # its beginning was another file's: all of it anew
+        if resumed and not _is_whole(published, part):  # the kept beginning was of another file
             part.unlink()
             _download(published, part)
         if not _is_whole(published, part):
-            raise _Refused("what came is not the published file (its SHA-256 is another)")
+            raise _Refused("the download is not the published file (its SHA-256 differs)")
     except _Refused:
         part.unlink(missing_ok=True)
         raise
     os.replace(part, path)
 
 
-def _download(published: Published, part: Path) -> None:
-    """Fetch what `part` lacks, over new connections for as long as each brings some of it."""
+def _download(published: PublishedFile, part: Path) -> None:
+    """Download the rest of `part`; connect again as long as each connection delivers some data."""
     for _ in range(_TRIES):
         before = _size(part)
-        trouble: Exception = ConnectionError("the connection broke off")
+        failure: Exception = ConnectionError("the connection broke off")
         try:
             if _one_connection(published, part):
                 return
         except _NO_NETWORK as error:
-            trouble = error
+            failure = error
         if _size(part) <= before:
             break
-    raise trouble
+    raise failure
 
 
-def _one_connection(published: Published, part: Path) -> bool:
-    """Append to `part` what one connection brings; whether the server had no more to send."""
+def _one_connection(published: PublishedFile, part: Path) -> bool:
+    """Append one connection's data to `part`; return whether the file is complete."""
     begin = _size(part)
     headers = {"User-Agent": f"facerf/{__version__}"} | ({"Range": f"bytes={begin}-"} if begin else {})
     try:
@@ -142,11 +143,11 @@ def _one_connection(published: Published, part: Path) -> bool:
     except HTTPError as error:
         error.close()
         if begin and error.code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
-            return True  # all is here, or more; the digest tells
+            return True  # the file is complete, or too long; the digest decides
         raise
     with response:
         if not response.headers.get("Content-Range", "").startswith(f"bytes {begin}-"):
-            begin = 0  # the server sends all of it, whatever was asked
+            begin = 0  # the server ignores the range and sends the whole file
         length = response.headers.get("Content-Length", "")
         total = begin + int(length) if length.isdecimal() else None
         _refuse_beyond(published, total or 0)
@@ -158,13 +159,13 @@ def _one_connection(published: Published, part: Path) -> bool:
             return total is None or file.tell() >= total
 
 
-def _refuse_beyond(published: Published, size: int) -> None:
+def _refuse_beyond(published: PublishedFile, size: int) -> None:
     if size > published.size_limit:
         raise _Refused(f"larger than the published file can be ({published.size_limit / 2**20:.0f} MiB)")
 
 
 class _GuardedRedirects(urllib.request.HTTPRedirectHandler):
-    """Follows no redirection to where `_check_address` would not let us begin."""
+    """Refuse a redirection to an address that `_check_address` refuses."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
@@ -176,7 +177,7 @@ class _GuardedRedirects(urllib.request.HTTPRedirectHandler):
 def _open(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
     handlers: list[urllib.request.BaseHandler] = [_GuardedRedirects()]
     if _check_address(url) in _THIS_MACHINE:
-        handlers.append(urllib.request.ProxyHandler({}))  # no proxy to reach ourselves
+        handlers.append(urllib.request.ProxyHandler({}))  # this machine is reached without a proxy
     request = urllib.request.Request(url, headers=headers)
     response: http.client.HTTPResponse = urllib.request.build_opener(*handlers).open(
         request, timeout=TIMEOUT_S
@@ -185,35 +186,35 @@ def _open(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
 
 
 def _check_address(url: str) -> str:
-    """The host of an address that may be fetched from."""
+    """Return the host of an allowed address; refuse any other."""
     parts = urlsplit(url)
     host = parts.hostname or ""
     if not (parts.scheme == "https" or (parts.scheme == "http" and host in _THIS_MACHINE)):
-        raise _Refused(f"leads to {parts.scheme}://{host}, and only https is fetched from")
+        raise _Refused(f"the address {parts.scheme}://{host} is not https; only https is allowed")
     return host
 
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Keep other processes from fetching `path`; they wait, then find it there. Not on Windows."""
+    """Make other processes that want `path` wait until it is downloaded; no effect on Windows."""
     with path.with_name(f".{path.name}.lock").open("ab") as file:
         if sys.platform != "win32":
-            with suppress(OSError):  # a file system without locks
+            with suppress(OSError):  # some file systems have no locks
                 fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
 @contextmanager
 def _progress(name: str, begin: int, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Show a progress bar if stderr is a terminal; yield a function that advances it by bytes."""
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    redirect = sys.stdout.isatty()
-    shown = STDERR.is_terminal
-    with Progress(*columns, console=STDERR, disable=not shown, redirect_stdout=redirect) as progress:
+    hidden, redirect = not STDERR.is_terminal, sys.stdout.isatty()
+    with Progress(*columns, console=STDERR, disable=hidden, redirect_stdout=redirect) as progress:
         task = progress.add_task(name, total=total, completed=begin)
         yield lambda count: progress.advance(task, count)
 
 
-def _is_whole(published: Published, path: Path) -> bool:
+def _is_whole(published: PublishedFile, path: Path) -> bool:
     return path.is_file() and published.digest(path) == published.sha256
 
 
@@ -222,6 +223,7 @@ def _size(path: Path) -> int:
 
 
 def _reason(error: Exception) -> str:
+    """Return the cause of a failed download in a few words."""
     if isinstance(error, HTTPError):
         return one_line(f"HTTP {error.code} {error.reason}")
     inner = error.reason if isinstance(error, URLError) else error

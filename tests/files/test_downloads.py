@@ -14,7 +14,7 @@ import pytest
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.files import downloads
-from facerf_cli.files.downloads import Published, fetch
+from facerf_cli.files.downloads import PublishedFile, fetch
 
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -34,8 +34,8 @@ class Server:
     location: str = ""
     asked: list[str | None] = field(default_factory=list)  # the Range of each request
 
-    def published(self, **changes: Any) -> Published:
-        return replace(Published(f"{self.url}/models/a%20file.pth", DIGEST, 10**6), **changes)
+    def published(self, **changes: Any) -> PublishedFile:
+        return replace(PublishedFile(f"{self.url}/models/a%20file.pth", DIGEST, 10**6), **changes)
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_the_default_place_is_the_users_cache(
     assert fetch(server.published(), OPTION).parent == tmp_path
 
 
-def test_a_damaged_file_in_the_cache_is_fetched_anew(server: Server, tmp_path: Path) -> None:
+def test_a_damaged_file_in_the_cache_is_fetched_again(server: Server, tmp_path: Path) -> None:
     (tmp_path / "a file.pth").write_bytes(CONTENT[:-1] + b"!")
     assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
 
@@ -160,7 +160,7 @@ def test_offline_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
         with pytest.raises(
             FacerfError, match=r"\(Connection refused\); run again .* --weights PATH$"
         ) as caught:
-            fetch(Published(url, DIGEST, 10**6), OPTION, tmp_path)
+            fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
     assert "\n" not in str(caught.value)
 
 
@@ -169,13 +169,13 @@ def test_a_silent_server_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyP
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/a.pth"
         with pytest.raises(FacerfError, match="no answer within"):
-            fetch(Published(url, DIGEST, 10**6), OPTION, tmp_path)
+            fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
 
 
 @pytest.mark.parametrize("url", ["http://example.org/a.pth", "file:///etc/passwd", "ftp://example.org/a.pth"])
 def test_only_https_is_fetched_from(server: Server, tmp_path: Path, url: str) -> None:
     with pytest.raises(FacerfError, match="only https"):
-        fetch(Published(url, DIGEST, 10**6), OPTION, tmp_path)
+        fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
     server.location = url
     with pytest.raises(FacerfError, match=r"only https|not allowed"):
         fetch(server.published(), OPTION, tmp_path)

@@ -19,7 +19,7 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import EXPRESSION_STD, SourceHead, SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS
-from facerf_cli.files.downloads import Published, cache_folder, fetch
+from facerf_cli.files.downloads import PublishedFile, cache_folder, fetch
 from facerf_cli.logs import one_line
 
 DAMAGED = (OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
@@ -173,7 +173,7 @@ def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
 _ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 # GitHub packs an archive of a commit anew when it likes, and then its bytes are others; the .obj files inside
 # are the same for ever, so the digest is of them.
-ICT_FACEKIT = Published(
+ICT_FACEKIT = PublishedFile(
     f"https://github.com/ICT-VGL/ICT-FaceKit/archive/{_ICT_COMMIT}/ICT-FaceKit-{_ICT_COMMIT}.tar.gz",
     "76eafb7253344ed6dc7f6d92c6f409868f854b029d5a68a2f4e3583c5bc1ebeb",
     512 << 20,
