@@ -1,18 +1,18 @@
-"""Basel Face Model 2009 (Paysan et al., 'A 3D Face Model for Pose and Illumination Invariant ...', 2009).
+"""The Basel Face Models of 2009, 2017 and 2019.
 
-`PublicMM1/01_MorphableModel.mat`, MATLAB version 5: `shapeMU` [3 N, 1] in micrometres, `shapePC` [3 N, 199]
-of unit length, `shapeEV` [199, 1], which are standard deviations in spite of their name, and `tl` [F, 3] from
-1 on (as eos's convert-bfm2009-to-eos.py reads it, Apache-2.0). It has no expressions; the built-in model's
-stand in for them.
+2009 (Paysan et al., 'A 3D Face Model for Pose and Illumination Invariant ...', 2009):
+`PublicMM1/01_MorphableModel.mat`, MATLAB version 5, holds `shapeMU` [3 N, 1] in micrometres, `shapePC`
+[3 N, 199] of unit length, `shapeEV` [199, 1], which are standard deviations in spite of their name, and `tl`
+[F, 3] counted from 1 (as eos's convert-bfm2009-to-eos.py reads it, Apache-2.0). It has no expressions; those
+of the built-in model replace them.
 
-Basel Face Model 2017 and 2019 (Gerig et al., 'Morphable Face Models - An Open Framework').
-
-HDF5 in statismo's layout: under `shape` and `expression`, `model/mean` [3 N] in millimetres,
-`model/pcaBasis` [3 N, K] of unit length and `model/pcaVariance` [K]; `shape/representer/cells` [3, F]. The
-neutral face is the shapes' mean; the expressions' mean is how far the people's faces were from it on average,
-up to 17 mm about an open mouth. So it is a shape of its own here: with the others it has the same second
-moments about the neutral face. `metadata/landmarks/json` names points on the shapes' mean, which scalismo
-writes as a list of `id` and `coordinates`.
+2017 and 2019 (Gerig et al., 'Morphable Face Models - An Open Framework'): HDF5 in statismo's layout holds,
+under `shape` and `expression`, `model/mean` [3 N] in millimetres, `model/pcaBasis` [3 N, K] of unit length
+and `model/pcaVariance` [K]; `shape/representer/cells` is [3, F]. The neutral face is the mean of the shapes.
+The mean of the expressions is the average displacement of the scanned faces from it, up to 17 mm around an
+open mouth. It becomes an expression shape here; together with it the others keep their second moments about
+the neutral face. `metadata/landmarks/json`, written by scalismo, names points on the mean of the shapes as a
+list of `id` and `coordinates`.
 """
 
 import importlib
@@ -30,10 +30,19 @@ from facerf_cli.face.importers.source import SourceModel, require_mesh
 from facerf_cli.logs import one_line
 
 _MAX_BYTES, _MAX_ENTRIES, _MAX_SHAPES = 1 << 30, 120_000_000, 500
+_MAX_TEXT = 1 << 20  # bytes of the landmarks' JSON
+
 _LICENCE_2009 = "Basel Face Model 2009, (c) University of Basel; non-commercial use, by its licence agreement"
-_NAMES = ("shapeMU", "shapePC", "shapeEV", "tl")
-_NUMBERS = ("single", "double", "int16", "uint16", "int32", "uint32", "int64", "uint64")
-_DAMAGED = (
+_ARRAYS_2009 = ("shapeMU", "shapePC", "shapeEV", "tl")
+_NUMBERS = ("single", "double", "int16", "uint16", "int32", "uint32", "int64", "uint64")  # kinds of arrays
+_VERTICES_2009 = 53490
+# MPEG-4 feature points among the 68 landmarks: number and vertex from 0, eos's ibug_to_bfm.txt (Apache-2.0).
+_LANDMARKS_2009 = """
+17 38792 | 19 40087 | 21 40514 | 22 41091 | 24 41511 | 26 42825 | 30 8319 | 33 8334 | 36 2088 | 39 5959
+42 10603 | 45 14472 | 48 5006 | 51 8344 | 54 11714 | 57 8374 | 62 8354 | 66 8366
+"""
+# Errors that reading a damaged .mat can raise.
+_MAT_ERRORS = (
     NotImplementedError,
     ValueError,
     TypeError,
@@ -45,77 +54,12 @@ _DAMAGED = (
     MatReadError,
 )
 
-_VERTICES = 53490
-# MPEG-4 feature points that are among the 68, counted from 0: eos's ibug_to_bfm.txt (Apache-2.0).
-_LANDMARKS_2009 = """
-17 38792 | 19 40087 | 21 40514 | 22 41091 | 24 41511 | 26 42825 | 30 8319 | 33 8334 | 36 2088 | 39 5959
-42 10603 | 45 14472 | 48 5006 | 51 8344 | 54 11714 | 57 8374 | 62 8354 | 66 8366
-"""
-
-
-def read_basel_2009(path: Path) -> SourceModel:
-    """The model from `01_MorphableModel.mat`, or the folder that has it; an InputError for what is none."""
-    if path.is_dir():
-        path = next(iter(sorted(path.rglob("01_MorphableModel.mat"))), path / "01_MorphableModel.mat")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the Basel Face Model's 01_MorphableModel.mat")
-    try:
-        mean, basis, deviations, triangles = _arrays(path)
-        require_mesh(mean, triangles)
-    except _DAMAGED as error:
-        raise InputError(
-            f"{path}: not a Basel Face Model 2009 ({one_line(str(error))[:160]}); "
-            "give 01_MorphableModel.mat as it was downloaded"
-        ) from None
-    return SourceModel(
-        name="basel-2009",
-        licence=_LICENCE_2009,
-        mean=mean,
-        identity=(basis * deviations).T.reshape(-1, len(mean), 3),
-        expression=np.zeros((0, len(mean), 3), np.float32),
-        expression_names=(),
-        triangles=triangles,
-        known=_known_2009(mean),
-    )
-
-
-def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mean [N, 3] and basis [3 N, K] in metres per deviation, deviations [K], triangles [F, 3] from 0 on."""
-    if path.stat().st_size > _MAX_BYTES:
-        raise ValueError("it is too large")
-    listed = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
-    for name in _NAMES:
-        if name not in listed:
-            raise ValueError(f"it lacks {name}")
-        shape, kind = listed[name]
-        if len(shape) != 2 or shape[0] * shape[1] > _MAX_ENTRIES or kind not in _NUMBERS:
-            raise ValueError(f"{name} is a {kind} of shape {list(shape)}")
-    raw = scipy.io.loadmat(path, variable_names=_NAMES)  # numbers alone: no objects, no functions
-    mean, basis, deviations = (raw[name] for name in _NAMES[:3])
-    mean, deviations = mean.ravel().astype(np.float64), deviations.ravel().astype(np.float32)
-    if basis.shape != (len(mean), len(deviations)) or len(mean) % 3 or len(deviations) > _MAX_SHAPES:
-        raise ValueError(f"shapePC has shape {list(basis.shape)}, not [{len(mean)}, {len(deviations)}]")
-    if not all(np.isfinite(field).all() for field in (mean, basis, deviations)):
-        raise ValueError("it holds values that are not finite")
-    triangles = raw["tl"].astype(np.int64) - 1
-    return mean.reshape(-1, 3) / 1e6, basis, deviations / 1e6, triangles
-
-
-def _known_2009(mean: np.ndarray) -> dict[int, np.ndarray]:
-    """The named landmarks of the published mesh; of a cut or refined one nothing is known."""
-    if len(mean) != _VERTICES:
-        return {}
-    pairs = (cell.split() for cell in _LANDMARKS_2009.strip().replace("\n", "|").split("|"))
-    return {int(number): mean[int(vertex)] for number, vertex in pairs}
-
-
-_MAX_TEXT = 1 << 20
 _LICENCE_2017 = (
     "Basel Face Model {year}, (c) University of Basel; non-commercial use, by its licence agreement"
 )
 _YEARS = {"basel-2017": "2017", "basel-2019": "2019"}
-_ON_MEAN_M = 0.003  # a named point further from the surface is inside the head, as a pupil's may be
-# The names that mean a point of the 68; 'right' is the person's right, which is the picture's left.
+_ON_MEAN_M = 0.003  # a named point further from the surface is inside the head, such as that of a pupil
+# The names of points among the 68 landmarks; 'right' is the subject's right, on the image's left.
 _LANDMARKS_2017 = {
     "center.chin.tip": 8,
     "center.nose.tip": 30,
@@ -137,17 +81,73 @@ _LANDMARKS_2017 = {
 }
 
 
-def read_basel_2017(path: Path, kind: str = "basel-2017") -> SourceModel:
-    """The model of a `model2017-1_*.h5` or `model2019_*.h5`; an InputError for what is none.
+def read_basel_2009(path: Path) -> SourceModel:
+    """Read the model from `01_MorphableModel.mat` or its folder; raises InputError for any other file."""
+    if path.is_dir():
+        path = next(iter(sorted(path.rglob("01_MorphableModel.mat"))), path / "01_MorphableModel.mat")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give the Basel Face Model's 01_MorphableModel.mat")
+    try:
+        mean, basis, deviations, triangles = _arrays_2009(path)
+        require_mesh(mean, triangles)
+    except _MAT_ERRORS as error:
+        raise InputError(
+            f"{path}: not a Basel Face Model 2009 ({one_line(str(error))[:160]}); "
+            "give 01_MorphableModel.mat as it was downloaded"
+        ) from None
+    return SourceModel(
+        name="basel-2009",
+        licence=_LICENCE_2009,
+        mean=mean,
+        identity=(basis * deviations).T.reshape(-1, len(mean), 3),
+        expression=np.zeros((0, len(mean), 3), np.float32),
+        expression_names=(),
+        triangles=triangles,
+        known=_known_2009(mean),
+    )
 
-    h5py comes with the extra `face-models`; a FacerfError says so where it is missing.
+
+def _arrays_2009(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mean [N, 3] in metres, unit basis [3 N, K], deviations [K] in metres, triangles [F, 3] from 0."""
+    if path.stat().st_size > _MAX_BYTES:
+        raise ValueError("it is too large")
+    listed = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
+    for name in _ARRAYS_2009:
+        if name not in listed:
+            raise ValueError(f"it lacks {name}")
+        shape, kind = listed[name]
+        if len(shape) != 2 or shape[0] * shape[1] > _MAX_ENTRIES or kind not in _NUMBERS:
+            raise ValueError(f"{name} is a {kind} of shape {list(shape)}")
+    raw = scipy.io.loadmat(path, variable_names=_ARRAYS_2009)  # numbers only: no objects, no functions
+    mean, basis, deviations = (raw[name] for name in _ARRAYS_2009[:3])
+    mean, deviations = mean.ravel().astype(np.float64), deviations.ravel().astype(np.float32)
+    if basis.shape != (len(mean), len(deviations)) or len(mean) % 3 or len(deviations) > _MAX_SHAPES:
+        raise ValueError(f"shapePC has shape {list(basis.shape)}, not [{len(mean)}, {len(deviations)}]")
+    if not all(np.isfinite(field).all() for field in (mean, basis, deviations)):
+        raise ValueError("it holds values that are not finite")
+    triangles = raw["tl"].astype(np.int64) - 1
+    return mean.reshape(-1, 3) / 1e6, basis, deviations / 1e6, triangles
+
+
+def _known_2009(mean: np.ndarray) -> dict[int, np.ndarray]:
+    """The known landmarks of the published mesh; none for a cut or refined mesh."""
+    if len(mean) != _VERTICES_2009:
+        return {}
+    pairs = (cell.split() for cell in _LANDMARKS_2009.strip().replace("\n", "|").split("|"))
+    return {int(number): mean[int(vertex)] for number, vertex in pairs}
+
+
+def read_basel_2017(path: Path, kind: str = "basel-2017") -> SourceModel:
+    """Read the model from `model2017-1_*.h5` or `model2019_*.h5`; raises InputError for any other file.
+
+    Raises FacerfError where h5py, of the extra `face-models`, is missing.
     """
     h5py = _h5py()
     if not path.is_file():
         raise InputError(f"{path}: no such file; give the Basel Face Model's .h5")
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return _source(file, kind)
+            return _source_2017(file, kind)
     except (ValueError, KeyError, TypeError, IndexError, OSError, RuntimeError, RecursionError) as error:
         raise InputError(
             f"{path}: not a Basel Face Model {_YEARS[kind]} ({one_line(str(error))[:160]}); "
@@ -156,16 +156,16 @@ def read_basel_2017(path: Path, kind: str = "basel-2017") -> SourceModel:
 
 
 def _h5py() -> Any:
-    """The package, which the type checker need not know."""
+    """Import the optional package h5py."""
     try:
         return importlib.import_module("h5py")
     except ImportError:
         raise FacerfError(
-            "Basel Face Models of 2017 and 2019 need h5py; run pip install 'facerf[face-models]'"
+            "Basel Face Model: h5py is missing; run pip install 'facerf[face-models]'"
         ) from None
 
 
-def _source(file: Any, kind: str) -> SourceModel:
+def _source_2017(file: Any, kind: str) -> SourceModel:
     mean, identity = _linear_model(file, "shape")
     usual, expression = _linear_model(file, "expression")
     triangles = _numbers(file, "shape/representer/cells").astype(np.int64).T
@@ -186,7 +186,7 @@ def _source(file: Any, kind: str) -> SourceModel:
 
 
 def _linear_model(file: Any, group: str) -> tuple[np.ndarray, np.ndarray]:
-    """Mean [N, 3] in metres, and basis [K, N, 3] in metres a deviation."""
+    """Mean [N, 3] in metres, and basis [K, N, 3] in metres per standard deviation."""
     mean, basis, variance = (
         _numbers(file, f"{group}/model/{name}") for name in ("mean", "pcaBasis", "pcaVariance")
     )
@@ -202,7 +202,7 @@ def _linear_model(file: Any, group: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _numbers(file: Any, name: str) -> np.ndarray:
-    """A dataset of the file itself: no links to other files, and no more than there is room for."""
+    """Read the numbers of a dataset; raises ValueError for links, large datasets and values not finite."""
     dataset = _dataset(file, name)
     if dataset.dtype.kind not in "fiu" or dataset.size > _MAX_ENTRIES or dataset.ndim > 2:
         raise ValueError(f"{name} is {dataset.dtype} of shape {list(dataset.shape)}")
@@ -213,6 +213,7 @@ def _numbers(file: Any, name: str) -> np.ndarray:
 
 
 def _dataset(file: Any, name: str) -> Any:
+    """The dataset `name`, stored in this file."""
     h5py = _h5py()
     at = file
     for part in name.split("/"):
@@ -220,15 +221,15 @@ def _dataset(file: Any, name: str) -> Any:
         if link is None:
             raise ValueError(f"it lacks {name}")
         if not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{name} leads elsewhere")
+            raise ValueError(f"{name} is a link")
         at = at[part]
     if not isinstance(at, h5py.Dataset) or at.external or at.is_virtual:
-        raise ValueError(f"{name} is no dataset of this file")
+        raise ValueError(f"{name} is not a dataset of this file")
     return at
 
 
 def _known_2017(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
-    """The named points on the mean [N, 3], by their number among the 68; none where the file has no names."""
+    """The known landmarks on the mean [N, 3] by number; none where the file names no points."""
     try:
         dataset = _dataset(file, "metadata/landmarks/json")
     except ValueError:
@@ -248,7 +249,7 @@ def _known_2017(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def _text(stored: Any) -> str | bytes:
-    """What h5py gives of a text: itself, bytes, or an array of one text or of its bytes."""
+    """Convert a text as h5py reads it: text, bytes, or an array of one text or of its bytes."""
     if isinstance(stored, np.ndarray) and stored.dtype.kind in "OSU" and stored.size == 1:
         stored = stored.item()
     return stored if isinstance(stored, (str, bytes)) else np.asarray(stored).tobytes()

@@ -1,15 +1,15 @@
-"""Where FLAME's landmarks lie on its mesh: the embeddings that travel with it, in the forms they have.
+"""FLAME (Li et al., 'Learning a model of facial shape and expression from 4D scans', SIGGRAPH Asia 2017).
 
-An embedding is a triangle and barycentric weights a point: `landmark_embedding.npy` (DECA: a pickled table
-with all 68 as `full_lmk_faces_idx` and `full_lmk_bary_coords`, the 51 inner ones as `static_...`), or
-`lmk_face_idx` and `lmk_b_coords` of 51 or 68 points (FLAME's `flame_static_embedding.pkl`, and .npz files).
+Its files of 2019 to 2023 hold `v_template` [5023, 3] in metres, `f` [9976, 3], and `shapedirs`
+[5023, 3, 400]: 300 shapes of identity and 100 of expression, scaled by their standard deviations (as smplx
+and DECA read them). FLAME opens the mouth by turning the jaw, which is not a shape; `posedirs`, `weights` and
+`J_regressor` become three jaw shapes here. In `flame2023_no_jaw.pkl` the expressions open the mouth and the
+jaw never turns.
 
-FLAME (Li et al., 'Learning a model of facial shape and expression from 4D scans', SIGGRAPH Asia 2017).
-
-Its files, 2019 to 2023, hold `v_template` [5023, 3] in metres, `f` [9976, 3], and `shapedirs` [5023, 3, 400]:
-300 shapes of identity and 100 of expression, each scaled by its standard deviation (as smplx, DECA and others
-read them). A mouth opens by turning the jaw, which is no shape there: `posedirs`, `weights` and `J_regressor`
-make three shapes of it here. In `flame2023_no_jaw.pkl` the expressions open it, and its jaw is never turned.
+An embedding places landmarks on the mesh by a triangle and barycentric weights for each point. The file is
+`landmark_embedding.npy` (DECA: a pickled table with all 68 as `full_lmk_faces_idx` and
+`full_lmk_bary_coords`, the 51 inner ones as `static_...`), or a file with `lmk_face_idx` and `lmk_b_coords`
+of 51 or 68 points (FLAME's `flame_static_embedding.pkl`, and .npz files).
 """
 
 from collections.abc import Mapping
@@ -25,84 +25,35 @@ from facerf_cli.files.inert_arrays import array_of
 from facerf_cli.files.inert_pickle import read_inert_pickle, read_inert_stream
 from facerf_cli.logs import one_line
 
-_KEYS = (
-    ("full_lmk_faces_idx", "full_lmk_bary_coords"),
-    ("lmk_face_idx", "lmk_b_coords"),
-    ("static_lmk_faces_idx", "static_lmk_bary_coords"),
-)
-_INNER = 51  # landmarks without the contour, which are the last of the 68
-
-
-def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[int, np.ndarray]:
-    """Points on the mean [N, 3] by their number among the 68; an InputError where the file has none."""
-    try:
-        table = _table(path)
-        faces, weights = next(
-            (array_of(table[first]), array_of(table[second]))
-            for first, second in _KEYS
-            if first in table and second in table
-        )
-        faces, weights = faces.astype(np.int64).ravel(), weights.astype(np.float64).reshape(-1, 3)
-        if len(faces) not in (_INNER, 68) or len(weights) != len(faces):
-            raise ValueError(f"it has {len(faces)} points and {len(weights)} weights")
-        if not (0 <= faces.min() <= faces.max() < len(triangles)) or abs(weights.sum(-1) - 1).max() > 0.01:
-            raise ValueError("it is of another mesh")
-    except StopIteration:
-        keys = ", ".join(key for pair in _KEYS for key in pair)
-        raise InputError(f"{path}: no embedding of FLAME's landmarks in it (none of {keys})") from None
-    except (ValueError, KeyError, TypeError, OSError, EOFError) as error:
-        raise InputError(
-            f"{path}: not an embedding of FLAME's landmarks ({one_line(str(error))[:160]})"
-        ) from None
-    points = np.einsum("nkc,nk->nc", mean[triangles[faces]], weights)
-    return dict(zip(range(68 - len(points), 68), points, strict=True))
-
-
-def _table(path: Path) -> Mapping[str, Any]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    if path.suffix == ".npz":
-        return read_npz(path)
-    if path.suffix != ".npy":
-        table = read_inert_pickle(path)
-    else:
-        with path.open("rb") as file:
-            if np.lib.format.read_magic(file) != (1, 0):
-                raise ValueError("a newer .npy than embeddings come in")
-            _, _, kind = np.lib.format.read_array_header_1_0(file)
-            if not kind.hasobject:
-                raise ValueError("it holds plain numbers, not a table")
-            table = read_inert_stream(file, path)
-    if not isinstance(table, dict):
-        raise ValueError(f"it holds a {type(table).__name__}, not a table")
-    return table
-
-
-IDENTITIES = 300  # the shapes after them are expressions
+IDENTITIES = 300  # the first shapes; the others are expressions
 _MAX_SHAPES = 500
 _LICENCE = (
     "FLAME, (c) Max-Planck-Gesellschaft; under the licence that its download came with "
     "(flame.is.tue.mpg.de; non-commercial research, unless that says otherwise)"
 )
 _OPEN_LICENCE = "FLAME 2023 Open, (c) Max-Planck-Gesellschaft; CC BY 4.0 (flame.is.tue.mpg.de)"
-_OPEN_KEY = "supr_expression_metadata"  # which FLAME 2023 Open alone has
-_NO_JAW = "no_jaw"  # in a file's name; nothing in the file says so
-_JAW, _JOINTS = 2, 5  # of the joints: root, neck, jaw and two eyes
+_OPEN_KEY = "supr_expression_metadata"  # only FLAME 2023 Open has it
+_NO_JAW = "no_jaw"  # part of a file's name; nothing in the file tells it
+_JAW, _JOINTS = 2, 5  # joints: root, neck, jaw and two eyes
 _JAW_STD_RAD = 0.1  # a coefficient of 3 opens a mouth by 17 degrees
-_JAW_SHAPES = {
+_JAW_SHAPES = {  # turns of the jaw as axes in units of _JAW_STD_RAD
     "jaw_open": (1, 0, 0),
     "jaw_turn": (0, 0.3, 0),
     "jaw_roll": (0, 0, 0.3),
-}  # axes, by their spread
+}
+_EMBEDDING_KEYS = (
+    ("full_lmk_faces_idx", "full_lmk_bary_coords"),
+    ("lmk_face_idx", "lmk_b_coords"),
+    ("static_lmk_faces_idx", "static_lmk_bary_coords"),
+)
+_INNER = 51  # landmarks without the contour: the last of the 68
 
 
 def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
-    """FLAME from its .pkl or an .npz of the same arrays, or from a folder with one.
+    """Read FLAME from its .pkl, from an .npz of the same arrays, or from a folder with one such file.
 
-    Args:
-        path: `generic_model.pkl`, `flame2023.pkl` and their like; of a folder, the one such file in it.
-        landmarks: where the 68 points lie (`flame_landmarks`); a `landmark_embedding.npy` beside the model
-            is found by itself. Without, they are found by their shape.
+    landmarks is an embedding; the default is `landmark_embedding.npy` in the model's folder. Landmarks
+    without an embedding are found later by shape. Raises InputError for any other file.
     """
     path = _model_file(path)
     found = landmarks or path.with_name("landmark_embedding.npy")
@@ -120,6 +71,7 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
 
 
 def _model_file(path: Path) -> Path:
+    """The model's file: `path`, or the only model in a folder."""
     if not path.is_dir():
         if path.suffix not in (".pkl", ".npz") or not path.is_file():
             wrong = "" if path.exists() else "no such file; "
@@ -159,9 +111,9 @@ def _source(raw: Mapping[str, Any], stem: str) -> SourceModel:
 
 
 def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """The jaw's turns by one deviation about each axis [1, N, 3] (linear blend skinning, FLAME's equation 2).
+    """Jaw turns of one standard deviation [1, N, 3] by name (linear blend skinning, FLAME's equation 2).
 
-    None where the file has no skeleton; a ValueError where it is not FLAME's.
+    {} for a file without a skeleton. Raises ValueError for a skeleton that is not FLAME's.
     """
     keys = ("posedirs", "weights", "J_regressor")
     if not all(key in raw for key in keys):
@@ -172,7 +124,9 @@ def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarra
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(f"{key} has shape {list(array.shape)}, not {list(shape)}, or is not finite")
     joint, weight = regressor[_JAW] @ mean, weights[:, _JAW, None]
-    own = slice(9 * (_JAW - 1), 9 * _JAW)  # corrections are by the entries of every turn but the root's
+    own = slice(
+        9 * (_JAW - 1), 9 * _JAW
+    )  # the corrections' columns are the entries of each joint's turn, without the root
     shapes = {}
     for name, axis in _JAW_SHAPES.items():
         turn = Rotation.from_rotvec(_JAW_STD_RAD * np.array(axis, float)).as_matrix()
@@ -180,3 +134,51 @@ def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarra
         skinned = corrected + weight * ((corrected - joint) @ (turn - np.eye(3)).T)
         shapes[name] = (skinned - mean)[None].astype(np.float32)
     return shapes
+
+
+def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[int, np.ndarray]:
+    """Read landmarks on the mean [N, 3] by number; raises InputError for a file without an embedding."""
+    try:
+        table = _embedding_table(path)
+        faces, weights = next(
+            (array_of(table[first]), array_of(table[second]))
+            for first, second in _EMBEDDING_KEYS
+            if first in table and second in table
+        )
+        faces, weights = faces.astype(np.int64).ravel(), weights.astype(np.float64).reshape(-1, 3)
+        if len(faces) not in (_INNER, 68) or len(weights) != len(faces):
+            raise ValueError(f"it has {len(faces)} points and {len(weights)} weights")
+        if not (0 <= faces.min() <= faces.max() < len(triangles)) or abs(weights.sum(-1) - 1).max() > 0.01:
+            raise ValueError("it belongs to another mesh")
+    except StopIteration:
+        keys = ", ".join(key for pair in _EMBEDDING_KEYS for key in pair)
+        raise InputError(
+            f"{path}: no landmarks (none of {keys}); give an embedding of FLAME's landmarks"
+        ) from None
+    except (ValueError, KeyError, TypeError, OSError, EOFError) as error:
+        raise InputError(
+            f"{path}: no landmarks ({one_line(str(error))[:160]}); give an embedding of FLAME's landmarks"
+        ) from None
+    points = np.einsum("nkc,nk->nc", mean[triangles[faces]], weights)
+    return dict(zip(range(68 - len(points), 68), points, strict=True))
+
+
+def _embedding_table(path: Path) -> Mapping[str, Any]:
+    """Read the arrays of an embedding by name, without running pickles."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; give an embedding of FLAME's landmarks")
+    if path.suffix == ".npz":
+        return read_npz(path)
+    if path.suffix != ".npy":
+        table = read_inert_pickle(path)
+    else:
+        with path.open("rb") as file:
+            if np.lib.format.read_magic(file) != (1, 0):
+                raise ValueError("its .npy version is not 1.0")
+            _, _, kind = np.lib.format.read_array_header_1_0(file)
+            if not kind.hasobject:
+                raise ValueError("it holds plain numbers, not a table")
+            table = read_inert_stream(file, path)
+    if not isinstance(table, dict):
+        raise ValueError(f"it holds a {type(table).__name__}, not a table")
+    return table

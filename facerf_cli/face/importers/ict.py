@@ -1,8 +1,7 @@
-"""What lies in a folder, a .zip or a .tar, read with bounds.
+"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020).
 
-ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020).
-
-Face models that anyone may download without signing an agreement.
+It is read from `FaceXModel/*.obj` in a folder, a .zip or a .tar, and fetched from GitHub: its MIT licence
+needs no agreement.
 """
 
 import hashlib
@@ -22,96 +21,47 @@ from facerf_cli.face.morphable import HEAD_PARTS
 from facerf_cli.files.downloads import PublishedFile, cache_folder, fetch
 from facerf_cli.logs import one_line
 
-DAMAGED = (OSError, EOFError, RuntimeError, zlib.error, lzma.LZMAError, tarfile.TarError, zipfile.BadZipFile)
-
-
-def members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
-    """Each file in a folder or archive: its name, and what reads at most so many bytes of it."""
-    if path.is_dir():
-        for file in sorted(path.rglob("*.obj")):
-            with file.open("rb") as stream:
-                yield file.as_posix(), stream.read
-    elif zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                with archive.open(name) as member:
-                    yield name, member.read
-    elif path.is_file() and tarfile.is_tarfile(path):
-        # One pass: seeking in a compressed tar would decompress it anew for each of its 150 files.
-        with tarfile.open(path, "r|*") as tar:
-            for entry in tar:
-                if entry.isfile() and (content := tar.extractfile(entry)):
-                    yield entry.name, content.read
-    else:
-        wrong = "" if path.exists() else "no such file; "
-        raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")
-
-
-_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, and of all
-
-_LANDMARKS = (
+_IDS = (
     "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 "
     "268 493 1914 2044 1401 3615 4240 4114 2734 2509 978 4527 4942 4857 1140 2075 1147 "
     "4269 3360 1507 1542 1537 1528 1518 1511 3742 3751 3756 3721 3725 3732 5708 5695 2081 "
     "0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 5517 5966"
 )
-LANDMARK_IDS = np.array(_LANDMARKS.split(), dtype=np.int64)  # from its README
-_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
+LANDMARK_IDS = np.array(_IDS.split(), dtype=np.int64)  # from its README
 VERTICES = 26719
-_PARTS = {  # first and last vertex; an eyeball is its sclera, which wraps the iris and bulges as a cornea
+_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
+_PARTS = {  # first and last vertex; an eyeball is its sclera, which covers the iris and bulges as a cornea
     "skin": ((0, 11247),),
     "mouth": ((11248, 13293), (14062, 17038)),  # socket; gums and tongue
     "teeth": ((17039, 21450),),
     "eye": ((21451, 22220), (23021, 23790)),
 }
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
+_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
+# Errors that reading a damaged archive can raise.
+_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
+_ARCHIVE_ERRORS = (OSError, EOFError, RuntimeError, lzma.LZMAError, tarfile.TarError, *_ZIP_ERRORS)
+_ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 
 
 def read_ict_facekit(path: Path) -> SourceModel:
-    """ICT Face Model Light as its authors publish it: `FaceXModel/*.obj` in a folder, a .zip or a .tar.xz."""
+    """Read ICT-FaceKit's folder, .zip or .tar; raises InputError for anything else."""
     raw = dict(_objs(path))
     if "generic_neutral_mesh" not in raw:
         raise InputError(
-            f"{path}: no FaceXModel/generic_neutral_mesh.obj in it; give ICT-FaceKit's folder or archive"
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj; give ICT-FaceKit's folder or archive"
         )
     return ict_source(path, raw)
 
 
-def ict_content_sha256(path: Path) -> str:
-    """What `sha256sum *.obj | LC_ALL=C sort -k2 | sha256sum` prints in FaceXModel; '' if it is damaged."""
-    try:
-        digests = {f"{stem}.obj": hashlib.sha256(text).hexdigest() for stem, text in _objs(path)}
-    except InputError:
-        return ""
-    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
-    return hashlib.sha256(lines.encode()).hexdigest()
-
-
-def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
-    """The .obj files by their stems; an InputError where they cannot be read or are too large."""
-    total = 0
-    try:
-        for name, read in members(path):
-            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
-                text = read(_MAX_OBJ_BYTES + 1)
-                total += len(text)
-                if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
-                    raise InputError(f"{path}: {name} is too large; this is not ICT-FaceKit")
-                yield found[1], text
-    except DAMAGED as error:
-        raise InputError(
-            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
-        ) from None
-
-
 def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
-    """The model of the .obj files' contents by their stems; centimetres there, metres here."""
+    """The model of the .obj files' contents by stem; their centimetres become metres."""
     neutral = raw.pop("generic_neutral_mesh")
     mean = _obj_vertices(path, "generic_neutral_mesh", neutral)
     identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
     expressions = sorted(set(raw) - set(identities))
     if not identities or not expressions:
-        raise InputError(f"{path}: identity or expression shapes are missing from FaceXModel")
+        raise InputError(f"{path}: identity or expression shapes are missing; fetch ICT-FaceKit again")
 
     def offsets(stems: list[str]) -> np.ndarray:
         return np.stack([_obj_vertices(path, stem, raw[stem]) - mean for stem in stems])
@@ -134,7 +84,7 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
 
 
 def _head(triangles: np.ndarray) -> SourceHead:
-    """Skin, mouth, teeth and eyeballs; the sockets behind the eyes and the film before them are left out."""
+    """Skin, mouth, teeth and eyeballs, without the eyes' sockets and the film in front of the eyes."""
     part = np.full(VERTICES, 255, np.uint8)
     for name, spans in _PARTS.items():
         for first, last in spans:
@@ -144,6 +94,7 @@ def _head(triangles: np.ndarray) -> SourceHead:
 
 
 def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
+    """The vertices [N, 3] of an .obj in metres."""
     lines = [line[2:] for line in text.splitlines() if line.startswith(b"v ")]
     try:
         vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
@@ -157,6 +108,7 @@ def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
 
 
 def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
+    """The triangles [F, 3] of the neutral mesh's polygons."""
     triangles = []
     try:
         for line in text.splitlines():
@@ -170,9 +122,57 @@ def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
     return np.array(triangles)
 
 
-_ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
-# GitHub packs an archive of a commit anew when it likes, and then its bytes are others; the .obj files inside
-# are the same for ever, so the digest is of them.
+def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Iterate over the stems and contents of the .obj files; raises InputError for damaged or large ones."""
+    total = 0
+    try:
+        for name, read in _members(path):
+            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+                text = read(_MAX_OBJ_BYTES + 1)
+                total += len(text)
+                if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
+                    raise InputError(f"{path}: {name} is too large; fetch ICT-FaceKit again")
+                yield found[1], text
+    except _ARCHIVE_ERRORS as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
+        ) from None
+
+
+def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
+    """Iterate over the files of a folder or archive: the name, and a function that reads up to n bytes."""
+    if path.is_dir():
+        for file in sorted(path.rglob("*.obj")):
+            with file.open("rb") as stream:
+                yield file.as_posix(), stream.read
+    elif zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            for name in archive.namelist():
+                with archive.open(name) as member:
+                    yield name, member.read
+    elif path.is_file() and tarfile.is_tarfile(path):
+        # One pass: seeking in a compressed tar decompresses it again for each of its 150 files.
+        with tarfile.open(path, "r|*") as tar:
+            for entry in tar:
+                if entry.isfile() and (content := tar.extractfile(entry)):
+                    yield entry.name, content.read
+    else:
+        wrong = "" if path.exists() else "no such file; "
+        raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")
+
+
+def ict_content_sha256(path: Path) -> str:
+    """The digest of `sha256sum *.obj | LC_ALL=C sort -k2 | sha256sum` in FaceXModel; '' if damaged."""
+    try:
+        digests = {f"{stem}.obj": hashlib.sha256(text).hexdigest() for stem, text in _objs(path)}
+    except InputError:
+        return ""
+    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+# GitHub may repack a commit's archive, which changes its bytes; the .obj files inside stay the same, so the
+# digest is that of the files.
 ICT_FACEKIT = PublishedFile(
     f"https://github.com/ICT-VGL/ICT-FaceKit/archive/{_ICT_COMMIT}/ICT-FaceKit-{_ICT_COMMIT}.tar.gz",
     "76eafb7253344ed6dc7f6d92c6f409868f854b029d5a68a2f4e3583c5bc1ebeb",
@@ -183,12 +183,12 @@ PUBLISHED = {"ict-facekit": ICT_FACEKIT}
 
 
 def fetch_face_model(kind: str) -> Path:
-    """The archive of a published model in the user's cache, fetched there first where it is not yet."""
+    """The archive of a public model in the user's cache; it is fetched if missing."""
     return fetch(PUBLISHED[kind], f"`facerf face-model import {kind}` a copy that you have", _folder())
 
 
 def cached_face_model(kind: str) -> Path | None:
-    """Where a published model lies in the user's cache, if a file of its name does; it is not read."""
+    """The archive of a public model in the user's cache if a file has its name; the file is not read."""
     path = _folder() / PUBLISHED[kind].name
     return path if path.is_file() else None
 

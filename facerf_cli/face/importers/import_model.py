@@ -1,4 +1,4 @@
-"""From a publisher's files to a face model on the canonical topology, by the kind of model."""
+"""Import of a published face model to the canonical topology, by its kind."""
 
 from pathlib import Path
 
@@ -13,13 +13,14 @@ from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.logs import one_line
 
-_MAX_TEXT = 10_000
+_MAX_LETTERS = 10_000  # of a list of vertex numbers
 
 
 def import_face_model(kind: str, path: Path, landmarks: Path | None = None) -> MorphableModel:
-    """The model in `path`, one of the kinds of `facerf face-model import`; what is wrong is an InputError.
+    """Import the model in `path`, of one of the kinds of `facerf face-model import`.
 
-    `landmarks` is an embedding for FLAME, or for any kind a .txt of 68 vertex numbers from 0 on.
+    `landmarks` is an embedding for FLAME, or for any kind a .txt of 68 vertex numbers from 0. Raises
+    InputError for files that cannot be imported.
     """
     source = _read(kind, path, landmarks)
     try:
@@ -33,7 +34,7 @@ def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
     if kind == "flame":
         source = read_flame(path, None if listed else landmarks)
     elif landmarks is not None and not listed:
-        raise InputError(f"{landmarks}: for {kind}, give the landmarks as a .txt of 68 vertex numbers")
+        raise InputError(f"{landmarks}: not for {kind}; give the landmarks as a .txt of 68 vertex numbers")
     elif kind == "basel-2009":
         source = read_basel_2009(path)
     elif kind in ("basel-2017", "basel-2019"):
@@ -46,11 +47,13 @@ def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
 
 
 def _listed(path: Path, mean: np.ndarray) -> dict[int, np.ndarray]:
-    """The points on a mean [N, 3] whose numbers a text file lists in the order of the 68."""
+    """The landmarks on a mean [N, 3] by number, from a text file of 68 vertex numbers."""
     try:
-        numbers = [int(word) for word in path.read_text(encoding="utf-8")[:_MAX_TEXT].split()]
+        numbers = [int(word) for word in path.read_text(encoding="utf-8")[:_MAX_LETTERS].split()]
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({one_line(str(error))})") from None
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); give a .txt of 68 vertex numbers"
+        ) from None
     if len(numbers) != 68 or not 0 <= min(numbers) <= max(numbers) < len(mean):
-        raise InputError(f"{path}: holds {len(numbers)} numbers; 68 from 0 to {len(mean) - 1} are wanted")
+        raise InputError(f"{path}: holds {len(numbers)} numbers; give 68 from 0 to {len(mean) - 1}")
     return dict(enumerate(mean[numbers]))
