@@ -1,15 +1,19 @@
-"""The relit face back in its photo, at the photo's own resolution.
+"""The relit face back in its photo, at the photo's own resolution, or alone in its frame.
 
-The network's texture is coarser than the photo. What it says about light is therefore carried over as a
-change: where the source texture was S and is R after relighting, a photo pixel P becomes
+A texture is coarser than the photo, so the photo's detail is added to it. Where the source texture is S and
+the relit one R, a photo pixel P becomes
 
-    R + g (P - S)  with  g = (R + k e) / (S + e),    k = mean R / mean S,
+    R (P + e) / (S + e) + k e (P - S) / (S + e)    where P >= S,    k = mean R / mean S,
+    R P / S                                        where P < S.
 
-the render plus the photo's own detail. With a bright source this is P R / S; where the source is nearly black
-(e is a small share of its mean) the quotient would be noise, and the render takes over. Own light returns P.
+For bright sources both are the quotient P R / S. Where the source is nearly black the quotient would be
+noise, and e, a small share of the source's mean, keeps the pixel near R. Under the photo's own light (R = S)
+the photo comes back. Every step is linear in R, so two lights composed apart add up to both composed at once.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,127 +21,191 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
+from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture, Head
+from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
-from facerf_cli.face.view import FaceView, smooth, view_face
+from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
+from facerf_cli.light.sphere import RigLight
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
 
-_OWN_REGIONS = ("eyes", "mouth", "brows")
+_DARK = 0.08  # e above, a share of the source's mean
+_OWN_REGIONS = ("eyes", "mouth", "brows")  # keep the photo's own detail, scaled as the skin around them
+_OWN_SIDE = 128  # texels of their mask; finer ones take seconds to draw
 _TINY = 1e-8
-_OWN_SIDE = 128  # of masks; finer ones take seconds to draw
+
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
-_UPRIGHT = 0.4  # a step up or down counts for so much: there are hair and neck, to the side is background
-_SURROUND_PX = 64  # along a crop there
+_SURROUND_PX = 64  # pixels along a crop there
+_SPREAD = 0.04  # standard deviation of the blur of the change of light, in crop sides
+_REACH = 0.22  # of that change to the side, in crop sides; beyond it all follows the mean change
+_UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and below are hair and neck
 
 
-@dataclass(frozen=True)
-class CompositeSettings:
-    """Lengths (spread, reach) are shares of the crop's side."""
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What a relit head is shown as.
 
-    dark: float = 0.08  # e above, a share of the source's mean
-    spread: float = 0.04  # standard deviation of the blur of the change of light around the face
-    reach: float = 0.22  # of that change to the side; further off all follows the mean change
-    darker: float = 12.0  # hair and background follow at most so far below the mean change,
-    brighter: float = 1.6  # and so far above it: a bright rim beside the face reads as a glow
-
-
-def change_of_light(
-    source: Tensor, relit: Tensor, seen: Tensor, settings: CompositeSettings = CompositeSettings()
-) -> tuple[Tensor, Tensor]:
-    """Gain and offset [3, T, T] that take the photo's pixels to the relit ones: P -> gain P + offset.
-
-    source, relit [3, T, T] linear; seen [T, T] in 0..1. Eyes, brows and teeth stay the photo's: their gain is
-    that of the skin around them, without offset.
+    `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its face
+    relit, or the rendered face alone. In the photo, hair and background follow the light on the face, unless
+    `keep_background`; a `matte` [H, W] in 0..1 limits what may change.
     """
-    own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
-    own = F.interpolate(own[None, None], source.shape[1:], mode="bilinear", align_corners=False)[0, 0]
-    trusted = seen * (1 - own)
-    gain, offset = _gain_and_offset(source, relit, trusted, settings.dark)
-    floor = settings.dark * (source * trusted).sum() / (3 * trusted.sum().clamp(min=_TINY)) + _TINY
-    around = inpaint(relit, trusted) / inpaint(source, trusted).clamp(min=float(floor))
-    return torch.lerp(gain, around, own), offset * (1 - own)
+
+    fit: FaceFit | None = None
+    composite: Literal["photo", "face"] = "photo"
+    keep_background: bool = False
+    matte: np.ndarray | None = None
 
 
-def _gain_and_offset(source: Tensor, relit: Tensor, weight: Tensor, dark: float) -> tuple[Tensor, Tensor]:
-    total = weight.sum().clamp(min=_TINY)
-    mean_source = (source * weight).sum((1, 2), keepdim=True) / total
-    mean_relit = (relit * weight).sum((1, 2), keepdim=True) / total
-    floor = dark * mean_source.mean() + _TINY
-    gain = (relit + floor * mean_relit / mean_source.clamp(min=_TINY)) / (source + floor)
-    return gain, relit - gain * source
+AS_IN_PHOTO = Target()
 
 
-def composite(
-    photo: np.ndarray,
-    source: Tensor,
-    relit: Tensor,
-    seen: Tensor,
-    view: FaceView,
-    surround: "Surround | None",
-    matte: np.ndarray | None = None,
-    settings: CompositeSettings = CompositeSettings(),
-) -> np.ndarray:
-    """The photo [H, W, 3] with its face relit [H, W, 3], linear.
+@dataclass(frozen=True, eq=False)
+class RelitImage:
+    """An image [H, W, 3], scene-linear; alpha [H, W] of a face alone; further layers [H, W, C] by name."""
 
-    `surround` None leaves everything outside the face's mask as it was, bit for bit. A `matte` [H, W] is what
-    the light may change, whatever the face's mask says.
-    """
-    gain, offset = change_of_light(source, relit, seen, settings)
-    change = view.render(torch.cat([gain, offset]))
-    low = np.float32(1) if surround is None else surround.gain(source, relit)
-    result = photo * low
-    mask = view.mask.numpy()[..., None]
-    face = photo[view.window] * change[..., :3].numpy() + change[..., 3:].numpy()
-    result[view.window] += mask * (face.clip(min=0) - result[view.window])
-    return result if matte is None else photo + matte[..., None] * (result - photo)
+    pixels: np.ndarray
+    alpha: np.ndarray | None = None
+    layers: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
-class Surround:
-    """How hair, neck and background follow: the face's change of light, spread outward and blurred.
+class Composition:
+    """Compose relit textures of one head into one frame: the photo's, or without a photo the crop's own.
 
-    With distance it becomes the mean change.
+    What does not depend on the light is computed once.
     """
 
     def __init__(
-        self,
-        vertices_camera: Tensor,
-        crop: Crop,
-        height_px: int,
-        width_px: int,
-        settings: CompositeSettings = CompositeSettings(),
+        self, model: MorphableModel, photo: np.ndarray | None, head: Head, target: Target = AS_IN_PHOTO
     ) -> None:
+        fit = head.fit if target.fit is None else target.fit
+        vertices = fit.vertices_camera(model)
+        size_px = (fit.crop.size_px, fit.crop.size_px) if photo is None else (photo.shape[0], photo.shape[1])
+        crop = Crop(0.0, 0.0, float(fit.crop.size_px), fit.crop.size_px) if photo is None else fit.crop
+        self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
+        self._photo = photo if target.composite == "photo" else None
+        self._face, self._target = head.face, target
+        self._detail = None if self._photo is None else PhotoDetail(self._photo, head.face, self.view)
+        follows = self._photo is not None and not target.keep_background
+        self._surround = Surround(vertices, crop, *size_px) if follows else None
+        self._mask = self.view.full(self.view.mask)
+        self._layers = {"face.A": self._mask} if self._photo is not None else {}
+        places = {"normal": self.view.normal, "position": self.view.position_m, "uv": self.view.uv}
+        self._layers |= {name: self.view.full(values) for name, values in places.items()}
+
+    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
+        """The head in its frame under `light`, whose relit texture [3, T, T] is given.
+
+        The change of light around the face is read from the texture; `light` is for relighters of what lies
+        around it.
+        """
+        if self._photo is None or self._detail is None:
+            return RelitImage(self.view.full(self.view.render(relit)), self._mask, self._layers)
+        surround = np.float32(1) if self._surround is None else self._surround.gain(self._face.texture, relit)
+        result = self._photo * surround
+        mask = self.view.mask.numpy()[..., None]
+        result[self.view.window] += mask * (self._detail.relit(relit) - result[self.view.window])
+        if (matte := self._target.matte) is not None:
+            result = self._photo + matte[..., None] * (result - self._photo)
+        return RelitImage(result, None, self._layers)
+
+    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+        """The image's pixels at an exposure in EV; where the photo is kept, of its new light."""
+        gain = 2**ev
+        return self.image(light, relit * gain).pixels if self._keeps_photo else image.pixels * gain
+
+    def auto_exposure_ev(self, relit: Tensor) -> float:
+        """The exposure that shows the lit face well; in a kept photo, as bright as the face was there."""
+        chosen_ev = _auto_exposure_ev(relit, self._face.visible)
+        own_ev = _auto_exposure_ev(self._face.texture, self._face.visible) if self._keeps_photo else 0.0
+        return chosen_ev - own_ev
+
+    @property
+    def _keeps_photo(self) -> bool:
+        kept = self._target.keep_background or self._target.matte is not None
+        return self._photo is not None and kept
+
+
+def _auto_exposure_ev(texture: Tensor, visible: Tensor) -> float:
+    return auto_exposure_ev(texture.permute(1, 2, 0).numpy(), visible.numpy())
+
+
+class PhotoDetail:
+    """The photo's own detail, added to relit textures in the window [h, w] of a view (formula above).
+
+    Eyes, brows and teeth stay the photo's: they are scaled as the skin around them.
+    """
+
+    def __init__(self, photo: np.ndarray, face: FaceTexture, view: FaceView) -> None:
+        self._view, self._texture = view, face.texture
+        own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
+        side = face.texture.shape[1:]
+        own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[0, 0]
+        self._trusted = face.visible * (1 - own)
+        self._mean_source = _mean(face.texture, self._trusted)
+        floor = _DARK * float(self._mean_source.mean()) + _TINY
+        self._around_source = inpaint(face.texture, self._trusted).clamp(min=floor)
+        rendered = view.render(torch.cat([face.texture, own[None]])).numpy()
+        source, self._own = rendered[..., :3], rendered[..., 3:]
+        self._pixels = photo[view.window].clip(min=0)
+        finer = self._pixels >= source
+        self._gain = np.where(
+            finer, (self._pixels + floor) / (source + floor), self._pixels / source.clip(min=_TINY)
+        )
+        self._bias = np.where(finer, floor * (self._pixels - source) / (source + floor), 0)
+
+    def relit(self, texture: Tensor) -> np.ndarray:
+        """The photo's pixels [h, w, 3] under the light of a relit texture [3, T, T]."""
+        mean_change = _mean(texture, self._trusted) / self._mean_source.clamp(min=_TINY)
+        around = inpaint(texture, self._trusted) / self._around_source
+        rendered = self._view.render(torch.cat([texture, around])).numpy()
+        skin = rendered[..., :3] * self._gain + mean_change.numpy() * self._bias
+        return skin + self._own * (rendered[..., 3:] * self._pixels - skin)
+
+
+def _mean(texture: Tensor, weight: Tensor) -> Tensor:
+    """Mean colour [3] of a texture [3, T, T] under weights [T, T]."""
+    return (texture * weight).sum((1, 2)) / weight.sum().clamp(min=_TINY)
+
+
+class Surround:
+    """The change of light on the face, spread outward and blurred: hair, neck and background follow it.
+
+    With distance it becomes the mean change. It is linear in the relit texture.
+    """
+
+    def __init__(self, vertices_camera: Tensor, crop: Crop, height_px: int, width_px: int) -> None:
         side = _SURROUND * _SURROUND_PX
-        self._settings = settings
         camera = Camera(CROP_FOCAL_PER_SIDE * _SURROUND_PX, side, side, side / 2, side / 2)
         self._view = view_face(vertices_camera, camera, _SURROUND_PX)
         self._mask = torch.from_numpy(self._view.full(self._view.mask))
         outside = (self._mask < 0.5).numpy()
         away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
-        self._near = 1 - smooth(away_px / (settings.reach * _SURROUND_PX))
-        self._grid = self._photo_grid(crop, height_px, width_px)
+        self._near = 1 - smooth(away_px / (_REACH * _SURROUND_PX))
+        self._grid = _photo_grid(crop, height_px, width_px)
 
     def gain(self, source: Tensor, relit: Tensor) -> np.ndarray:
         """The change of light [H, W, 3] over the photo, for textures [3, T, T]."""
         pair = torch.from_numpy(self._view.full(self._view.render(torch.cat([source, relit]))))
         pair = pair.permute(2, 0, 1)
         mean = (pair * self._mask).sum((1, 2), keepdim=True) / self._mask.sum().clamp(min=_TINY)
+        sigma = _SPREAD * _SURROUND_PX
         filled = inpaint(pair, self._mask).numpy()
-        sigma = self._settings.spread * _SURROUND_PX
         blurred = torch.from_numpy(gaussian_filter(filled, (0, sigma, sigma), mode="nearest"))
-        floor = self._settings.dark * mean[:3]
+        floor = _DARK * mean[:3]
         change = mean[3:] / mean[:3].clamp(min=_TINY)
         local = (blurred[3:] + floor * change) / (blurred[:3] + floor).clamp(min=_TINY)
-        local = local.minimum(change * self._settings.brighter).maximum(change / self._settings.darker)
-        field = torch.lerp(change.expand_as(local), local, self._near)
-        spread = F.grid_sample(
-            field[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
+        spread = torch.lerp(change.expand_as(local), local, self._near)
+        over_photo = F.grid_sample(
+            spread[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
         )
-        return spread[0].permute(1, 2, 0).clamp(min=0).numpy()
+        return over_photo[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
 
-    @staticmethod
-    def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:
-        """Where each pixel of the photo lies in the square, for grid_sample [1, H, W, 2]."""
-        x = ((torch.arange(width_px) + PIXEL_CENTRE - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
-        y = ((torch.arange(height_px) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
-        return torch.stack([x.expand(height_px, -1), y[:, None].expand(-1, width_px)], -1)[None].float()
+
+def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:
+    """Where each pixel of the photo lies in the surround's square, for grid_sample [1, H, W, 2]."""
+    x = ((torch.arange(width_px) + PIXEL_CENTRE - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
+    y = ((torch.arange(height_px) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
+    return torch.stack([x.expand(height_px, -1), y[:, None].expand(-1, width_px)], -1)[None].float()

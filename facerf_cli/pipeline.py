@@ -1,290 +1,192 @@
-"""From one photo to the face under any light, from any head pose: one function an arrow of the method.
+"""The method, one function an arrow: from one photo to the face under any light, from any head pose.
 
-photo -> crop_face -> fit_face -> unwrap_face (-> explain_photo) -> predict_olat -> weigh -> render_face
--> picture
+    photo -> fit_photo -> head -> reflectance_of -> relight -> image
+                           head -> estimate_light -> light
+                           head -> predict_olat -> a texture for each light
+
+Every verb, every protocol of `evaluate` and every benchmark calls these functions. Images are scene-linear
+[H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.face.fit import FaceFit, FitStart, fit_landmarks, trust_inside
-from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles, grid_uv, interior_texture, region_mask
-from facerf_cli.light.estimate import LightEvidence, RefinedLight, estimate_light, refine_light
-from facerf_cli.light.quotient import Quotient
+from facerf_cli.baselines import Kind
+from facerf_cli.baselines.base import Explained, Reflectance
+from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
+from facerf_cli.baselines.prt import explain_by_prt
+from facerf_cli.baselines.specular_sh import explain_by_specular_sh
+from facerf_cli.composite import AS_IN_PHOTO, Composition, RelitImage, Target
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
+from facerf_cli.face.fit_start import FitStart
+from facerf_cli.face.head import Head, unwrap_face
+from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk
+from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.network.checkpoint import load_networks
-from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.network.feature_networks import Layered
-from facerf_cli.network.reflectance import ReflectanceNetwork, colour_cast, exposure_of
-from facerf_cli.raster.camera import Camera
-from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import inpaint, normal_map, sample_texture, unwrap
+from facerf_cli.models import Models
+from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.inputs import exposure_of
 
-DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
-_DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
-_EXPLAINED_SIDE, _EXPLAINING_LIGHTS = 128, 50  # texels and lights for the estimate of a photo's light
-_SEEN_WELL = 0.9  # of a small texel: the photo says what colour it is
-_LIGHTS_ON_CPU = 4  # at a time; more of them leave the processor's cache and are slower
+TEXTURE_SIDE = 256  # texels, by default
+_CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
 
 
-@dataclass(frozen=True)
-class Models:
-    """The face model, on the processor as all geometry is, and the trained networks on `device`."""
+def fit_photo(
+    models: Models, photo: np.ndarray, landmarks_px: np.ndarray, texture_side: int = TEXTURE_SIDE
+) -> Head:
+    """Crop a photo [H, W, 3] around landmarks [68, 2] in its pixels, fit the face model, unwrap the face.
 
-    face: MorphableModel
-    network: ReflectanceNetwork | None  # what of these the checkpoint holds: a Reflectance Network,
-    geometry: nn.Module | None  # a Geometry Network,
-    diffuse: DiffuseNetwork | None  # the network of the baseline diffuse-sh
-    checkpoint_name: str
-    metadata: dict[str, Any]
-    device: torch.device
-
-
-@dataclass(frozen=True)
-class FaceTexture:
-    """A photo in the chart: texture [3, T, T], unseen texels filled; visible [T, T]; normals [3, T, T].
-
-    The texture is scene-linear, `visible` in 0..1, normals are unit vectors in camera space.
+    Raises InputError where the landmarks are no face's or the face lies outside the photo.
     """
-
-    texture: Tensor
-    visible: Tensor
-    normals: Tensor
-
-
-def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
-    """Load what the arrows need; `checkpoint` None is the one shipped."""
-    path = checkpoint or DEFAULT_CHECKPOINT
-    networks, metadata = load_networks(path, LAYOUT_VERSION)
-    if not networks.keys() & {"reflectance", "diffuse_sh"}:
-        raise InputError(f"{path}: holds no Reflectance Network; give one by `facerf train`")
-    _require_builtin_coefficients(path, networks.get("geometry"))
-    on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
-    return Models(
-        face=load_face_model(face_model),
-        network=on_device.get("reflectance"),
-        geometry=on_device.get("geometry"),
-        diffuse=on_device.get("diffuse_sh"),
-        checkpoint_name=path.stem,
-        metadata=metadata,
-        device=device,
-    )
-
-
-def _require_builtin_coefficients(path: Path, geometry: Any) -> None:
-    """InputError where a Geometry Network regresses more coefficients than the built-in model has."""
-    if geometry is None:
-        return
-    model, settings = load_face_model(BUILTIN), geometry.settings
-    if settings.identity > len(model.identity) or settings.expression > len(model.expression):
-        raise InputError(f"{path}: its Geometry Network is of another built-in face model; train it again")
-
-
-def crop_face(photo: np.ndarray, landmarks_px: np.ndarray, size_px: int) -> tuple[Crop, np.ndarray]:
-    """The square crop [size, size, 3] of a linear photo [H, W, 3] around landmarks [68, 2] in its pixels."""
-    crop = from_landmarks(landmarks_px, size_px)
-    return crop, crop.apply(photo)
+    crop = from_landmarks(landmarks_px, texture_side * _CROP_PER_TEXTURE)
+    cropped = crop.apply(photo)
+    in_crop = crop.to_crop(landmarks_px)
+    trust = trust_inside(in_crop, crop, *photo.shape[:2])
+    fit = fit_landmarks(models.face, in_crop, crop, trust=trust, start=regress_head(models, cropped))
+    return Head(cropped, fit, unwrap_face(models.face, fit, cropped, texture_side, photo.shape))
 
 
 @torch.no_grad()
-def see_head(models: Models, cropped: np.ndarray) -> FitStart | None:
-    """Where the Geometry Network sees the head in a crop [S, S, 3]; None where there is no such network."""
+def regress_head(models: Models, cropped: np.ndarray) -> FitStart | None:
+    """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network; None without one."""
     if models.geometry is None:
         return None
     image = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
     return FitStart(*(tensor.cpu() for tensor in models.geometry(image)))
 
 
-def fit_face(
-    model: MorphableModel,
-    crop: Crop,
-    landmarks_px: np.ndarray,
-    photo_shape: tuple[int, ...],
-    start: FitStart | None = None,
-) -> FaceFit:
-    """Fit the face model to landmarks [68, 2] in the pixels of a photo [H, W, ...].
+def reflectance_of(
+    models: Models,
+    head: Head,
+    kind: Kind = "field",
+    network_alone: bool = False,
+    memory_bytes: int = MEMORY_BYTES,
+) -> Reflectance:
+    """Read the reflectance of a head from its photo.
 
-    `start` is what `see_head` found in the crop; without it the fit starts from the landmarks alone.
+    The field is corrected by the photo's quotient image, so that the photo comes back under its own light;
+    with `network_alone` it is not. The models that the paper compares with have no such correction.
     """
-    in_crop = crop.to_crop(landmarks_px)
-    trust = trust_inside(in_crop, crop, *photo_shape[:2])
-    return fit_landmarks(model, in_crop, crop, trust=trust, start=start)
+    if kind != "field":
+        return explain(models, head, kind).reflectance
+    quotient = None if network_alone else photo_quotient(models, head.face)
+    return Field(models, head.face, quotient, memory_bytes)
 
 
-def unwrap_face(
-    model: MorphableModel,
-    fit: FaceFit,
-    cropped: np.ndarray,
-    texture_side: int,
-    photo_shape: tuple[int, ...],
-) -> FaceTexture:
-    """Unwrap the crop [S, S, 3] of a photo [H, W, ...] into the chart (paper, 'Network Architecture')."""
-    vertices = fit.vertices_camera(model)
-    inside = fit.crop.valid(*photo_shape[:2])  # beyond the photo the crop only repeats its border
-    image = torch.from_numpy(np.dstack([cropped, inside.astype(np.float32)])).permute(2, 0, 1)
-    unwrapped, visible = unwrap(image, vertices, grid_triangles(), fit.camera, texture_side)
-    texture, visible = unwrapped[:3], visible * (unwrapped[3] > 0.99)
-    if visible.max() < 0.5:
-        raise InputError("the fitted face lies outside the picture; give its landmarks with --landmarks")
-    normals = normal_map(vertices, grid_triangles(), texture_side)
-    return FaceTexture(inpaint(texture, visible), visible, normals)
+def explain(models: Models, head: Head, kind: Kind = "field", network_alone: bool = True) -> Explained:
+    """Read both reflectance and light of a head's photo, as far as the model can tell them apart."""
+    if kind == "field":
+        return Explained(
+            reflectance_of(models, head, kind, network_alone), estimate_light(models, head).light
+        )
+    baselines = {
+        "diffuse-sh": explain_by_diffuse_sh,
+        "specular-sh": explain_by_specular_sh,
+        "prt": explain_by_prt,
+    }
+    return baselines[kind](models, head.fit, head.face)
 
 
-def leave_out(model: MorphableModel, fit: FaceFit, face: FaceTexture, shown: np.ndarray) -> FaceTexture:
-    """The texture without what a mask [S, S] of the crop, 0 to 1, leaves out: filled in from around it."""
-    mask = torch.from_numpy(shown.astype(np.float32))[None]
-    side = face.texture.shape[-1]
-    kept = unwrap(mask, fit.vertices_camera(model), grid_triangles(), fit.camera, side)[0][0]
-    visible = face.visible * (kept > _SEEN_WELL)
-    if visible.max() < 0.5:
-        raise InputError("the face is masked out: nothing of it is left to look at")
-    return FaceTexture(inpaint(face.texture, visible), visible, face.normals)
-
-
-def explain_photo(models: Models, face: FaceTexture) -> Quotient:
-    """What the field lacks of the face's own photo, for `predict_olat` to give back.
-
-    The photo's light is estimated over a coarse rig, on small textures.
-    """
-    small = _shrunk(face)
-    olats = torch.cat(list(predict_olat(models, small, _coarse_rig())))
-    seen = small.visible > _SEEN_WELL
-    weights = estimate_light(olats[..., seen], small.texture[:, seen])
-    return Quotient.of(small.texture, weigh(olats, weights[None])[0], small.visible)
-
-
-def estimate_photo_light(
-    models: Models, face: FaceTexture, rig: Tensor, non_negative: bool = True, keep_eyes: bool = False
-) -> RigLight:
-    """The light of the face's photo over lights [L, 3] (paper, Eq. leastsq).
-
-    Not `non_negative`: the paper's plain least squares. InputError where there is no face to read it from.
-    """
-    evidence = light_evidence(models, face, rig, keep_eyes)
-    return RigLight(rig, evidence.least_squares(non_negative))
-
-
-def light_evidence(models: Models, face: FaceTexture, rig: Tensor, keep_eyes: bool = False) -> LightEvidence:
-    """What the light of the face's photo is read from, over lights [L, 3], on small textures."""
-    seen = evidence_of_photo(face, keep_eyes)
-    return replace(seen, directions=rig, olats=torch.cat(list(predict_olat(models, _shrunk(face), rig))))
-
-
-def evidence_of_photo(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
-    """The photo's side of the evidence, without any light; InputError where too little of a face is seen.
-
-    The mask is the interior of the face where the photo shows it well. Without `keep_eyes` the eyes are left
-    out, for the field of open eyes is not learnt (paper, 'Results').
-    """
-    small = _shrunk(face)
-    mask = (small.visible > _SEEN_WELL) & (interior_texture(_EXPLAINED_SIDE)[0] > 0.5)
-    if not keep_eyes:
-        mask &= region_mask("eyes", _EXPLAINED_SIDE) < 0.5
-    evidence = LightEvidence(torch.zeros(0, 3), torch.zeros(0, 3, *mask.shape), small.texture, mask)
-    evidence.require_a_face()
-    return evidence
-
-
-def refine_photo_light(
-    evidence: LightEvidence, start: Tensor, network: Layered, non_negative: bool = True
-) -> RefinedLight:
-    """`refine_light` from weights [L, 3] by V_f or S_f, at the exposure at which these are trained."""
-    exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())
-    return refine_light(evidence, start, lambda linear: network.layers(linear / exposure), non_negative)
-
-
-def _shrunk(face: FaceTexture) -> FaceTexture:
-    """The texture at the side at which light is estimated."""
-    side = (_EXPLAINED_SIDE, _EXPLAINED_SIDE)
-    fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
-    small = F.interpolate(fields, side, mode="area")[0]
-    return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
-
-
-@cache
-def _coarse_rig() -> Tensor:
-    return rig_directions(_EXPLAINING_LIGHTS)
-
-
-@torch.no_grad()
 def predict_olat(
     models: Models,
-    face: FaceTexture,
+    head: Head,
     lights: Tensor,
-    turn: Tensor | None = None,
-    memory_bytes: int = 2 << 30,
+    rotation: Tensor | None = None,
+    network_alone: bool = False,
+    memory_bytes: int = MEMORY_BYTES,
     bf16: bool = False,
-    quotient: Quotient | None = None,
 ) -> Iterator[Tensor]:
-    """OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T] that fit `memory_bytes`.
+    """Yield OLAT textures for unit directions [L, 3], in batches [l, 3, T, T] that fit the memory.
 
-    `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s. `quotient` is
-    what `explain_photo` found; without it they are the network's own.
+    `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's.
     """
-    network, device, texels = models.network, models.device, face.texture.shape[-1] ** 2
-    if network is None:
-        raise UsageError(
-            f"{models.checkpoint_name}: a checkpoint without a Reflectance Network, which the field needs; "
-            "give --reflectance diffuse-sh with it, or another --checkpoint"
-        )
-    most = _LIGHTS_ON_CPU if device.type == "cpu" else len(lights)
-    bytes_per_light = 4 * (_DECODER_CHANNELS * network.settings.side**2 + 16 * texels)
-    batch = max(1, min(most, memory_bytes // bytes_per_light))
-    normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
-    normals = normals[None].to(device)
-    visible = face.visible[None, None]
-    texture = face.texture[None] / colour_cast(face.texture[None], visible)
-    source = (texture, face.normals[None], visible)
-    with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
-        encoded = network.encode(*(tensor.to(device) for tensor in source))
-    for chunk in torch.split(lights, batch):
-        with torch.autocast(device.type, torch.bfloat16, enabled=bf16):  # not around a yield: it would leak
-            olats = network.decode(encoded, normals, chunk[None].to(device))[0]
-        olats = olats.float().cpu()
-        yield quotient.corrected(olats) if quotient else olats
+    quotient = None if network_alone else photo_quotient(models, head.face)
+    olats = Field(models, head.face, quotient, memory_bytes, bf16).olats(lights, _turn(head.fit, rotation))
+    yield from olats
 
 
-def weigh(olats: Tensor, weights: Tensor) -> Tensor:
-    """Sum of OLATs [L, 3, ...] with rgb weights [M, L, 3]: M pictures [M, 3, ...] (paper, 'Relighting')."""
-    flat = torch.einsum("mlc,lcn->mcn", weights, olats.flatten(2))
-    return flat.view(*flat.shape[:2], *olats.shape[2:])
+@dataclass(frozen=True, eq=False)
+class LightEstimate:
+    """The light of a photo, the evidence for it, and the texture [3, t, t] of the face under it.
 
-
-def weigh_batches(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
-    """`weigh` of OLATs [L, 3, T, T] that come in batches, so that they are never all held: [M, 3, T, T].
-
-    Pictures are weighed as textures and rendered after, for a render costs more than a texture's product.
+    If features refined the weights, `refined` says how, and `least_squares` [L, 3] are those before.
     """
-    total, done = torch.zeros(()), 0
-    for olats in batches:
-        total = total + weigh(olats, weights[:, done : done + len(olats)])
-        done += len(olats)
-    return total
+
+    light: RigLight
+    evidence: LightEvidence
+    explained: Tensor
+    refined: RefinedLight | None = None
+    least_squares: Tensor | None = None
 
 
-def turn_to(fit: FaceFit, rotation: Tensor) -> Tensor:
-    """The turn [3, 3] of camera-space vectors that takes the fit's head to `rotation` (head_to_camera)."""
-    return rotation @ fit.rotation.T
+def estimate_light(
+    models: Models,
+    head: Head,
+    kind: Kind = "field",
+    rig: Tensor | None = None,
+    non_negative: bool = True,
+    features: FeatureNetwork | None = None,
+    keep_eyes: bool = False,
+) -> LightEstimate:
+    """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
+
+    Without `non_negative` the paper's plain least squares are solved. `features` (V_f or S_f) refines the
+    weights. The models other than the field have a light of their own. Eyes are left out, as in the paper,
+    unless `keep_eyes`. Raises InputError where too little of the face is visible.
+    """
+    evidence = photo_evidence(head.face, keep_eyes)
+    if kind != "field":
+        explained = explain(models, head, kind)
+        texture = explained.reflectance.relit(explained.light.directions, explained.light.weights[None])
+        small = F.interpolate(texture, evidence.photo.shape[1:], mode="area")[0]
+        return LightEstimate(explained.light, evidence, small)
+    rig = rig_directions() if rig is None else rig
+    olats = torch.cat(list(Field(models, shrunk(head.face)).olats(rig)))
+    evidence = replace(evidence, directions=rig, olats=olats)
+    weights = evidence.least_squares(non_negative)
+    if features is None:
+        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
+    exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
+    refined = refine_light(evidence, weights, lambda x: features.layers(x / exposure), non_negative)
+    light = RigLight(rig, refined.weights)
+    return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
 
 
-def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The (u, v) that each pixel of a picture sees [H, W, 2], and the face's coverage [H, W], 0 or 1."""
-    fragments = rasterize(vertices_camera, grid_triangles(), camera)
-    return interpolate(grid_uv(), grid_triangles(), fragments), fragments.covered.float()
+def relight(
+    models: Models,
+    photo: np.ndarray | None,
+    head: Head,
+    light: RigLight,
+    target: Target = AS_IN_PHOTO,
+    reflectance: Reflectance | None = None,
+) -> RelitImage:
+    """Relight the head of a photo [H, W, 3] (paper, 'Relighting').
+
+    Without a photo the face alone is shown, in the frame of its crop. `reflectance` is read from the head
+    if it is not given.
+    """
+    reflectance = reflectance or reflectance_of(models, head)
+    relit = relit_textures(head, reflectance, light.directions, light.weights[None], target)[0]
+    return Composition(models.face, photo, head, target).image(light, relit)
 
 
-def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
-    """Pictures [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black beyond it."""
-    images = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
-    return images.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)
+def relit_textures(
+    head: Head, reflectance: Reflectance, directions: Tensor, weights: Tensor, target: Target = AS_IN_PHOTO
+) -> Tensor:
+    """Textures [M, 3, T, T] of a head under M sums, rgb weights [M, L, 3], of lights [L, 3].
+
+    One prediction of the lights serves all sums; `Composition` makes an image of each.
+    """
+    rotation = None if target.fit is None else target.fit.rotation
+    return reflectance.relit(directions, weights, _turn(head.fit, rotation))
+
+
+def _turn(fit: FaceFit, rotation: Tensor | None) -> Tensor | None:
+    """The rotation [3, 3] of camera-space vectors that takes the fit's head to a pose, head_to_camera."""
+    return None if rotation is None else rotation @ fit.rotation.T

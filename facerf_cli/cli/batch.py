@@ -158,10 +158,24 @@ def run_batch(
     options: BatchOptions,
     settings: Settings,
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
+    prepare: Callable[[], object] | None = None,
 ) -> int:
-    """Work through the files that `inputs` name: `run_items` over `collect_items`."""
+    """Process the files that `inputs` name: `run_files` over `collect_items`."""
     items = collect_items(inputs, options.output, suffixes)
-    return run_items(verb, items, _OfFile(process), outputs_of, options, settings)
+    return run_files(verb, items, process, outputs_of, options, settings, prepare)
+
+
+def run_files(
+    verb: str,
+    items: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    prepare: Callable[[], object] | None = None,
+) -> int:
+    """Process items that are files: `run_items`, and a missing file is an error of its item."""
+    return run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare)
 
 
 def run_items(
@@ -171,12 +185,14 @@ def run_items(
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
+    prepare: Callable[[], object] | None = None,
 ) -> int:
-    """Work through the items and give the exit code: 0 all done, 1 some failed.
+    """Process the items and return the exit code: 0 all done, 1 some failed.
 
-    With `--shard` through this process's share of them, which has a report of its own. Raises `UsageError`
-    (exit 2) where the output folder cannot be used. With `jobs` > 1 or `--ray` `process` runs in other
-    processes and must be picklable.
+    With `--shard` only this process's share of them, which has a report of its own. `prepare` is called once,
+    before the first item, and not at all where everything is finished: it loads what `process` needs, so that
+    what is wrong with that is said once. With several workers `process` runs in other processes and must be
+    picklable. Raises `UsageError` (exit 2) where the output folder cannot be used.
     """
     items = settings.shard.share(items)
     finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
@@ -184,15 +200,16 @@ def run_items(
     todo = [item for item in items if item not in done]
     if options.dry_run:
         return _say_what_would_be_done(todo, finished, outputs_of)
+    if todo and prepare:
+        prepare()
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if finished:
-        advice = "--overwrite makes them anew, as other options would have them"
+        advice = "--overwrite makes them again, as other options require"
         log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
     recover = _Recover(outputs_of, options.overwrite)
     failures = 0
-    with closing(
-        spread(_Work(process), todo, workers_of(settings, options.jobs), _broken, recover)
-    ) as results:
+    workers = workers_of(settings, options.jobs)
+    with closing(spread(_Work(process), todo, workers, _broken, recover)) as results:
         for result in _with_progress(results, len(todo), verb, settings):
             if result.stops_the_run is not None:
                 raise result.stops_the_run
@@ -202,6 +219,17 @@ def run_items(
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
     return 1 if failures else 0
+
+
+def all_finished(
+    items: Sequence[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> bool:
+    """Whether this process's share of the items is finished, so that nothing needs to be loaded."""
+    share = settings.shard.share(items)
+    return not options.overwrite and all(_is_finished(outputs_of(item)) for item in share)
 
 
 def report_name(shard: Shard) -> str:

@@ -35,7 +35,7 @@ def doctor(
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:
     """Everything that the doctor looks at, by section."""
     from facerf_cli.face.morphable import BUILTIN_PATH
-    from facerf_cli.pipeline import DEFAULT_CHECKPOINT
+    from facerf_cli.models import DEFAULT_CHECKPOINT
 
     return {
         "facerf": {

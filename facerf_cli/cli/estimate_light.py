@@ -1,14 +1,14 @@
-"""`facerf estimate-light`: the light of a photo, as a map, as numbers and as a picture."""
+"""`facerf estimate-light`: the light of a photo as a map, as numbers and as an image."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_batch
-from facerf_cli.cli.light_options import LightOptions, Refine, estimate_light_of
+from facerf_cli.cli.light_options import LightOptions, Refine
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -19,21 +19,8 @@ from facerf_cli.cli.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import (
-    FaceOption,
-    FittedFace,
-    LandmarksOption,
-    PhotoOptions,
-    TextureSizeOption,
-    fit_faces,
-    load_models_once,
-    provenance,
-    read_photo,
-)
+from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
 from facerf_cli.errors import UsageError
-
-if TYPE_CHECKING:
-    from facerf_cli.files.images import LinearImage
 
 _OUTPUTS = ("_light.exr", "_light.json", "_light.png")
 _MOST_ORDER = 20
@@ -51,40 +38,18 @@ class EstimateLight:
         """Every file of an item's (first) face."""
         return [item.output(self.options.photo.first_tag + ending) for ending in _OUTPUTS]
 
+    def prepare(self) -> None:
+        """Load the models, before the first photo."""
+        from facerf_cli.cli.items.estimate_light import prepare_light
+
+        prepare_light(self.options)
+
     def __call__(self, item: Item) -> Outcome:
-        """Estimate the light of every face that was asked for."""
-        image = read_photo(item, self.options.photo)
-        faces = fit_faces(item, image, self.options.photo)
-        facts = [self._write(item, image, face) for face in reversed(faces)][::-1]
-        written = [item.output(face.tag + ending) for face in faces for ending in _OUTPUTS]
-        return Outcome(written, facts[0] if len(facts) == 1 else {"faces": facts})
+        """Estimate the light of every chosen face."""
+        from facerf_cli.cli.items.estimate_light import write_lights
 
-    def _write(self, item: Item, image: "LinearImage", face: FittedFace) -> dict[str, Any]:
-        from facerf_cli.cli.items.light_image import draw_estimate
-        from facerf_cli.files.images import write_display, write_exr
-        from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
-        from facerf_cli.light.rig_latlong import rig_to_latlong
-        from facerf_cli.light.sh import CONVENTION, rig_coefficients
-
-        estimate = estimate_light_of(item.input_path, image, face, self.options)
-        models = load_models_once(self.options.photo)
-        said = {f"facerf:light_{name}": _word(value) for name, value in estimate.facts.items()}
-        metadata = provenance(item, self.options.photo, models.checkpoint_name) | said
-        envmap = rig_to_latlong(estimate.light, self.width_px // 2)
-        base = item.output(f"{face.tag}_light")
-        write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
-        light, rig = estimate.light, f"--lights {self.options.rig}"
-        harmonics = Harmonics(rig_coefficients(light, self.sh_order), CONVENTION)
-        record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
-        write_light(base.with_name(base.name + ".json"), record)
-        shown = draw_estimate(face, models.face, estimate.explained, envmap)
-        write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
-        return face.facts() | estimate.facts
-
-
-def _word(value: Any) -> str | int | float:
-    """A fact in a file's header, which holds words and numbers."""
-    return value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))
+        tags, facts = write_lights(item, self.options, self.width_px, self.sh_order)
+        return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)
 
 
 def estimate_light(
@@ -93,47 +58,51 @@ def estimate_light(
     output: OutputOption,
     lights: Annotated[
         str,
-        typer.Option("--lights", metavar="N|FILE", help="The rig over which the light is solved for."),
+        typer.Option(
+            "--lights",
+            metavar="N|FILE",
+            help="Solve for the light of a rig of N lights, or of a file of directions.",
+        ),
     ] = "150",
     non_negative: Annotated[
         bool,
         typer.Option(
             "--non-negative/--signed",
-            help="Lights that shine, robust to highlights, hair and glasses; or the paper's plain least "
-            "squares, whose weights may be negative and huge.",
+            help="Solve for weights from 0 up, robust to highlights, hair and glasses; or for the paper's "
+            "plain least squares, whose weights may be negative and huge.",
         ),
     ] = True,
     refine: Annotated[
-        Refine, typer.Option(help="Go on from the least squares by features of the texture.")
+        Refine, typer.Option(help="Refine the least squares by comparing features of the texture.")
     ] = "none",
     vgg_weights: Annotated[
         str | None,
         typer.Option(
             metavar="imagenet|PATH",
-            help="The paper's V_f for --refine features: fetched once (528 MiB), or a file.",
-            show_default="S_f, the shipped network that knows where light comes from",
+            help="Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.",
+            show_default="S_f, the shipped network trained to find the light",
         ),
     ] = None,
     reflectance: Annotated[
-        Kind, typer.Option(help="The model of the face; baselines estimate a light of their own.")
+        Kind, typer.Option(help="Choose the reflectance model; each baseline estimates its own light.")
     ] = "field",
     keep_eyes: Annotated[
-        bool, typer.Option("--keep-eyes", help="Let the eyes count too (the paper leaves them out).")
+        bool, typer.Option("--keep-eyes", help="Use the eyes, too (the paper leaves them out).")
     ] = False,
     matte: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="What of the photo may be used (no hair, no glasses, say): a grey picture, or its alpha, "
-            "of the photo's size. The photo's own alpha counts likewise.",
+            help="Use only what a grey image, or its alpha, of the photo's size shows (for example to leave "
+            "out hair and glasses). The photo's own alpha is used in the same way.",
             show_default=False,
         ),
     ] = None,
     width: Annotated[
-        int, typer.Option(min=16, max=8192, help="Of the map in pixels; the height is half.")
+        int, typer.Option(min=16, max=8192, help="Width of the map in pixels; the height is half of it.")
     ] = 512,
     sh_order: Annotated[
-        int, typer.Option(min=0, max=_MOST_ORDER, help="Of the spherical harmonics in the JSON.")
+        int, typer.Option(min=0, max=_MOST_ORDER, help="Order of the spherical harmonics in the JSON.")
     ] = 2,
     texture_size: TextureSizeOption = 256,
     overwrite: OverwriteOption = False,
@@ -144,24 +113,25 @@ def estimate_light(
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
-    """Estimate the light of photos from how it falls on their faces.
+    """Estimate the light of photos from the shading of their faces.
 
-    For each photo: _light.exr, a lat-long map for `relight --envmap`; _light.json, the lights that add up to
-    it and their spherical harmonics; and _light.png: the photo, the face as this light explains it, where
-    that is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the
-    residual inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
+    For each photo: _light.exr, a lat-long map for `relight --envmap`; _light.json, the weights of the lights
+    and their spherical harmonics; and _light.png: the photo, the face under the estimated light, where that
+    is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the residual
+    inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
 
-    A face tells much of the light before it and little of that behind it. Brightness and colour of the light
-    cannot be told from those of the skin; they are what the network takes the skin for.
+    A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
+    the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
     """
     if width % 2:
-        raise UsageError(f"--width {width}: the height is half of it, so give an even number")
+        raise UsageError(f"--width {width}: an odd width has no half; give an even number")
     photo = PhotoOptions(settings_of(context), input_colourspace, face_model, face, landmarks, texture_size)
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()
     work = EstimateLight(how, width, sh_order)
-    if not dry_run:
-        load_models_once(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    raise typer.Exit(run_batch("estimate-light", inputs, work, work.outputs_of, options, photo.settings))
+    code = run_batch(
+        "estimate-light", inputs, work, work.outputs_of, options, photo.settings, prepare=work.prepare
+    )
+    raise typer.Exit(code)

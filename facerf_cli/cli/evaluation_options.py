@@ -1,28 +1,25 @@
-"""The options that every protocol of `facerf evaluate` has beside its own, named and explained once."""
+"""The options that the protocols of `facerf evaluate` share, each named and explained once."""
 
 import inspect
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from facerf_cli.cli.options import DryRunOption, JobsOption, OutputOption, OverwriteOption
+from facerf_cli.baselines import Kind
+from facerf_cli.cli.options import DryRunOption, JobsOption, OutputOption, OverwriteOption, refuse_given
 from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.case import folder_name
+from facerf_cli.evaluation import folder_name
 
-if TYPE_CHECKING:
-    from facerf_cli.evaluation.measure import Measures
-
-KindName = Literal["field", "diffuse-sh", "specular-sh", "prt"]  # as `baselines/base.py` has them
 PredictionsOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--compare",
         metavar="DIR",
-        help="Predictions of another method, DIR/CASE.exr, .png or .npy; the folder's name is the method's. "
-        "May be given several times.",
+        help="Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name. "
+        "Repeatable.",
         show_default="none",
     ),
 ]
@@ -31,8 +28,9 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         metavar="KIND",
-        help="field, diffuse-sh, specular-sh or prt; may be given several times, and the first is what "
-        "the others are held against.",
+        help="Measure field, diffuse-sh, specular-sh or prt; repeatable, and the others are compared with "
+        "the "
+        "first.",
         show_default="field",
     ),
 ]
@@ -41,7 +39,7 @@ AgainstOption = Annotated[
     typer.Option(
         "--against",
         metavar="FILE",
-        help="A further checkpoint of the field, named by its stem; may be given several times.",
+        help="Measure another checkpoint of the field, named by its stem. Repeatable.",
         show_default="none",
     ),
 ]
@@ -49,19 +47,23 @@ PicturesOption = Annotated[
     bool,
     typer.Option(
         "--pictures",
-        help="Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods' use.",
+        help="Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.",
     ),
 ]
 KeepEyesOption = Annotated[
-    bool, typer.Option("--keep-eyes", help="Compare open eyes too (default: out of the mask, as the paper).")
+    bool, typer.Option("--keep-eyes", help="Compare open eyes, too (default: not, as in the paper).")
 ]
 SpaceOption = Annotated[
-    Literal["linear", "display"], typer.Option("--space", help="The values that metrics see.")
+    Literal["linear", "display"],
+    typer.Option("--space", help="Measure scene-linear values, or values encoded by sRGB."),
 ]
 LpipsOption = Annotated[
     Path | None,
     typer.Option(
-        "--lpips", metavar="FILE", help="LPIPS's linear heads (v0.1, VGG).", show_default="where installed"
+        "--lpips",
+        metavar="FILE",
+        help="Read the linear heads of LPIPS (v0.1, VGG) from a file.",
+        show_default="where installed",
     ),
 ]
 VggWeightsOption = Annotated[
@@ -69,14 +71,49 @@ VggWeightsOption = Annotated[
     typer.Option(
         "--vgg-weights",
         metavar="imagenet|PATH",
-        help="Measure LPIPS too, by VGG-16: imagenet fetches it; or a file.",
+        help="Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.",
         show_default="no LPIPS",
     ),
 ]
 PresetOption = Annotated[
     Literal["paper"] | None,
-    typer.Option("--preset", help="paper: as many pictures as the paper measured.", show_default="none"),
+    typer.Option("--preset", help="Measure as many images as the paper did.", show_default="none"),
 ]
+
+
+DatasetArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="DATASET",
+        help="Folder of `facerf prepare-dataset`, with pairs of `facerf relight-dataset`.",
+        show_default=False,
+    ),
+]
+PhotosOrDatasetArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PHOTO...|DATASET",
+        help="Images, folders, - for a list on standard input; or a folder of `facerf prepare-dataset`.",
+        show_default=False,
+    ),
+]
+SplitOption = Annotated[
+    Literal["train", "validation", "test", "all"],
+    typer.Option("--split", help="Measure this split of DATASET; all if no network was trained on it."),
+]
+EveryOption = Annotated[
+    int, typer.Option("--every", min=1, metavar="N", help="Measure every Nth pair of DATASET's split only.")
+]
+RefitOption = Annotated[
+    bool,
+    typer.Option(
+        "--refit", help="Fit each image of DATASET to its own landmarks, not all of a person at once."
+    ),
+]
+
+_CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
+_OF_DATASETS = ("split", "every", "refit")
+_OF_PHOTOS = ("face", "landmarks", "input_colourspace")
 
 
 @dataclass(frozen=True)
@@ -84,7 +121,7 @@ class EvaluateOptions:
     """The shared options, as the user gave them; settings only, so that it can go to other processes."""
 
     output: Path
-    reflectance: tuple[KindName, ...] = ("field",)
+    reflectance: tuple[Kind, ...] = ("field",)
     against: tuple[Path, ...] = ()
     compare: tuple[Path, ...] = ()
     pictures: bool = False
@@ -99,38 +136,30 @@ class EvaluateOptions:
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The reflectance models' and the checkpoints' names: what a protocol's predictions are called."""
+        """The names of a protocol's predictions: those of the reflectance models and the checkpoints."""
         return (*self.reflectance, *(path.stem for path in self.against))
 
     def check(self) -> None:
-        """Raise for what would fail every item alike."""
+        """Raise UsageError for an option that would fail every item."""
         names = [*self.methods, *map(folder_name, self.compare)]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise UsageError(f"two methods are called {twice[0]!r}; rename one's file or folder")
+            raise UsageError(f"two methods have the name {twice[0]!r}; rename the file or folder of one")
         for path in self.against:
             if not path.is_file():
-                raise UsageError(f"--against {path}: no such file")
+                raise UsageError(f"--against {path}: no such file; give one that exists")
         for folder in self.compare:
             if not folder.is_dir():
-                raise UsageError(f"--compare {folder}: no such folder")
+                raise UsageError(f"--compare {folder}: no such folder; give one that exists")
         self.require_output_apart(self.compare)
         if self.lpips is not None and self.vgg_weights is None:
-            raise UsageError("--lpips is measured with --vgg-weights imagenet, or a file of VGG-16's weights")
+            raise UsageError("--lpips: needs VGG-16; add --vgg-weights imagenet, or a file of its weights")
 
     def require_output_apart(self, folders: Iterable[Path]) -> None:
-        """UsageError for an output folder in one whose pictures are read: the next run would read it too."""
+        """Raise UsageError for an output folder inside one that is read: the next run would read it, too."""
         for folder in folders:
             if self.output.resolve().is_relative_to(folder.resolve()):
-                raise UsageError(
-                    f"-o {self.output}: is {folder} or lies in it, which is read; give another one"
-                )
-
-    def measures(self) -> "Measures":
-        """How pictures are measured."""
-        from facerf_cli.evaluation.measure import Measures
-
-        return Measures(space=self.space, lpips=self.lpips, vgg_weights=self.vgg_weights)
+                raise UsageError(f"-o {self.output}: lies in {folder}, which is read; give another folder")
 
 
 def _evaluate_options(
@@ -148,7 +177,7 @@ def _evaluate_options(
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
 ) -> EvaluateOptions:
-    """The shared options from the command line; a command's signature ends with these parameters."""
+    """Collect the shared options; a command's signature ends with these parameters."""
     given = EvaluateOptions(
         output,
         _kinds(reflectance or ["field"]),
@@ -163,21 +192,54 @@ def _evaluate_options(
     return replace(given, preset=preset, jobs=jobs, overwrite=overwrite, dry_run=dry_run)
 
 
-def _kinds(given: Sequence[str]) -> tuple[KindName, ...]:
+def _kinds(given: Sequence[str]) -> tuple[Kind, ...]:
     found = []
     for name in given:
-        kind = next((kind for kind in get_args(KindName) if kind == name), None)
+        kind = next((kind for kind in get_args(Kind) if kind == name), None)
         if kind is None:
-            raise UsageError(f"--reflectance {name}: give {', '.join(get_args(KindName))}")
+            raise UsageError(f"--reflectance {name}: give {', '.join(get_args(Kind))}")
         found.append(kind)
     return tuple(found)
 
 
-def with_shared_options(command: Callable[..., int], left_out: Sequence[str] = ()) -> Callable[..., None]:
-    """A protocol's command with the shared options after its own, but those that mean nothing to it.
+def only_dataset(inputs: Sequence[str]) -> Path | None:
+    """The dataset of the inputs, or None for photos; raises UsageError for both, or for a capture."""
+    for path in map(Path, inputs):
+        if (path / _CAPTURE_FILE).is_file():
+            raise UsageError(
+                f"{path}: a capture, not a dataset; run prepare-dataset on it and give the result"
+            )
+    datasets = [path for path in map(Path, inputs) if (path / _DATASET_FILE).is_file()]
+    if datasets and len(inputs) > 1:
+        raise UsageError(f"{datasets[0]}: one dataset among several inputs; give it alone, or give photos")
+    return datasets[0] if datasets else None
 
-    The command takes its own parameters and `options: EvaluateOptions`, and gives the exit code. typer reads
-    signatures, so the function that it gets has one that lists them all.
+
+def refuse_for_others(context: typer.Context, photos: bool) -> None:
+    """Raise UsageError for an option of datasets given with photos, or of photos given with a dataset."""
+    names, kind = (_OF_DATASETS, "a prepared dataset") if photos else (_OF_PHOTOS, "photos")
+    refuse_given(context, names, f"is for {kind}; leave it out here")
+
+
+def refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
+    """Raise UsageError for an option of the field if that is not among the methods."""
+    if "field" not in options.reflectance and not options.against:
+        refuse_given(context, (name,), "is for the field; give --reflectance field too, or leave it out")
+
+
+def no_part_of_preset(options: EvaluateOptions, every: int) -> None:
+    """Raise UsageError where `--every` would reduce a preset."""
+    if options.preset and every > 1:
+        raise UsageError(
+            "--preset and --every exclude each other: a preset has a fixed number of images; leave one out"
+        )
+
+
+def with_shared_options(command: Callable[..., int], left_out: Sequence[str] = ()) -> Callable[..., None]:
+    """Add the shared options to a protocol's command, except those that it has no use for.
+
+    The command takes its own parameters and `options: EvaluateOptions`, and returns the exit code. typer
+    reads signatures, so the returned function has one that lists all parameters.
     """
     own = [p for name, p in inspect.signature(command).parameters.items() if name != "options"]
     of_all = inspect.signature(_evaluate_options).parameters

@@ -1,21 +1,15 @@
-"""The options that verbs share, so that each is named, explained and read once.
-
-`--shard` and `--ray`, for every verb that walks folders.
-"""
+"""The options that verbs share, each named, explained and read once; and the choice of workers."""
 
 import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
 from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
-
-if TYPE_CHECKING:
-    import torch
 
 T = TypeVar("T")
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
@@ -23,19 +17,19 @@ DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 
 @dataclass(frozen=True)
 class Shard:
-    """Which of the items are this process's: every `of`th, from number `number` on, which counts from 1."""
+    """The share of the items that this process takes: every `of`th, from `number` on, which counts from 1."""
 
     number: int = 1
     of: int = 1
 
     @staticmethod
     def parse(text: str | None) -> "Shard":
-        """`K/N`; all items where nothing is given. UsageError for what is no such share."""
+        """Parse `K/N`; None takes all items. Raises UsageError for anything else."""
         if text is None:
             return Shard()
         number, slash, of = text.partition("/")
         if not (slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
-            raise UsageError(f"--shard {text}: give K/N with K from 1 to N, as 3/8")
+            raise UsageError(f"--shard {text}: not a share; give K/N with K from 1 to N, such as 3/8")
         return Shard(int(number), int(of))
 
     def share(self, items: Sequence[T]) -> Sequence[T]:
@@ -45,7 +39,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Settings:
-    """The global options, and which items are worked on where; `ctx.obj` in every verb."""
+    """The global options and the choice of workers; `ctx.obj` in every verb."""
 
     verbosity: int = 0  # -1 errors only, 0 notes and warnings, 1 everything and tracebacks
     log_json: bool = False
@@ -69,25 +63,25 @@ def workers_of(settings: Settings, jobs: int) -> Workers:
 
 
 def was_given(context: typer.Context, name: str) -> bool:
-    """Whether the command line names an option, be it with its default."""
+    """True if the command line names an option, even with its default value."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
 
 def flag(name: str) -> str:
-    """An option as it is typed."""
+    """An option as it is typed on the command line."""
     return f"--{name.replace('_', '-')}"
 
 
 def refuse_given(context: typer.Context, names: Sequence[str], why: str) -> None:
-    """UsageError for those of the options that were given although they would do nothing; `why` goes on."""
+    """Raise UsageError for an option that is given but would do nothing; `why` completes the message."""
     for name in names:
         if was_given(context, name):
             raise UsageError(f"{flag(name)} {why}")
 
 
-def torch_device(settings: Settings) -> "torch.device":
-    """Seed torch and give the device that `--device` names; `auto` takes cuda, then mps, then cpu."""
+def torch_device(settings: Settings) -> Any:
+    """Seed torch and return the device of `--device`; `auto` takes cuda, then mps, then cpu."""
     import torch
 
     torch.manual_seed(settings.seed)
@@ -95,7 +89,7 @@ def torch_device(settings: Settings) -> "torch.device":
     name = next(kind for kind in present if present[kind]) if settings.device == "auto" else settings.device
     if not present[name]:
         found = ", ".join(kind for kind in present if present[kind])
-        raise UsageError(f"--device {name}: torch finds no such device here (it finds: {found})")
+        raise UsageError(f"--device {name}: torch finds no such device; give one of: {found}")
     return torch.device(name)
 
 
@@ -103,27 +97,29 @@ InputsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="PHOTO...",
-        help="Pictures, folders (walked recursively), or - for a list of paths on standard input.",
+        help="Images, folders (walked recursively), or - to read a list of paths from standard input.",
         show_default=False,
     ),
 ]
 OutputOption = Annotated[
     Path,
-    typer.Option("--output", "-o", metavar="DIR", help="Folder for the results.", show_default=False),
+    typer.Option(
+        "--output", "-o", metavar="DIR", help="Write the results to this folder.", show_default=False
+    ),
 ]
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Make results anew that are already there (default: skip them).")
+    bool, typer.Option("--overwrite", help="Make results again that exist already (default: skip them).")
 ]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="Say what would be read and written; write nothing.")
+    bool, typer.Option("--dry-run", help="List what would be read and written; write nothing.")
 ]
-JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Pictures worked on at a time.")]
+JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Process this many items at a time.")]
 ShardOption = Annotated[
     str | None,
     typer.Option(
         "--shard",
         metavar="K/N",
-        help="Every Nth item only, from the Kth on; the other shards are for other machines.",
+        help="Process every Nth item only, from the Kth on; other machines take the rest.",
         show_default="all items",
     ),
 ]
@@ -132,8 +128,8 @@ RayOption = Annotated[
     typer.Option(
         "--ray",
         metavar="ADDRESS",
-        help="Work as tasks of Ray: HOST:PORT of a cluster's head, auto, or local for this machine; --jobs "
-        "tasks at a time, by default one a processor, and with --device cuda one a GPU.",
+        help="Run as tasks of Ray: HOST:PORT of a cluster's head, auto, or local for this machine; --jobs "
+        "tasks at a time, by default one per processor, with --device cuda one per GPU.",
         show_default=False,
     ),
 ]
@@ -142,17 +138,27 @@ InputColourspaceOption = Annotated[
     typer.Option(
         "--input-colourspace",
         metavar="NAME",
-        help="Colour space of the input, over what the file says: sRGB, linear (lin_rec709), ACEScg, "
+        help="Read the input in this colour space instead of the file's: sRGB, linear (lin_rec709), ACEScg, "
         "Rec.2020, lin_rec2020, 'Display P3', or any name of the OCIO configuration.",
-        show_default="what the file says",
+        show_default="the file's",
     ),
+]
+NetworkAloneOption = Annotated[
+    bool,
+    typer.Option(
+        "--network-alone", help="Use the network's own field, without the correction by the photo's quotient."
+    ),
+]
+MemoryOption = Annotated[
+    float,
+    typer.Option("--memory", metavar="GB", min=0.1, help="Limit the memory of the prediction, roughly."),
 ]
 FaceModelOption = Annotated[
     str,
     typer.Option(
         "--face-model",
         metavar="NAME|PATH",
-        help="Morphable model: builtin, or a .npz by `face-model import`.",
+        help="Fit this morphable model: builtin, or a .npz of `face-model import`.",
     ),
 ]
 
@@ -160,10 +166,10 @@ _AFTER, _ALSO = "jobs", "dry_run"  # by these a verb that walks folders is known
 
 
 def with_machines(verb: Callable[..., Any]) -> Callable[..., Any]:
-    """The verb with `--shard` and `--ray` after its `--jobs`; a verb that walks no folders stays as it is.
+    """Add `--shard` and `--ray` after a verb's `--jobs`; a verb that walks no folders stays as it is.
 
-    They go where `run_items` finds them, into the verb's `Settings`, so that the verb need not know them.
-    typer reads signatures, so the function that it gets has one that lists them.
+    Their values go into the verb's `Settings`, where `run_items` finds them. typer reads signatures, so the
+    returned function has one that lists them.
     """
     own = inspect.signature(verb).parameters
     if not {_AFTER, _ALSO} <= own.keys():

@@ -1,34 +1,84 @@
-"""`facerf relight`: photos, or stacks of predicted lights, under environment maps and lamps."""
+"""`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.items.relight import Composite, Relight
-from facerf_cli.cli.light_options import LightOptions, of_other_photos
-from facerf_cli.cli.lights import Sampling, collect_shots, photo_lights, usable, write_balls
+from facerf_cli.cli.batch import (
+    PHOTO_SUFFIXES,
+    BatchOptions,
+    Item,
+    Outcome,
+    all_finished,
+    collect_items,
+    run_files,
+)
+from facerf_cli.cli.light_options import LightOptions, for_other_photos
+from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
+    MemoryOption,
+    NetworkAloneOption,
     OutputOption,
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import (
-    FaceOption,
-    LandmarksOption,
-    PhotoOptions,
-    TextureSizeOption,
-    load_models_once,
-)
-from facerf_cli.cli.values import numbers, parse_directions, parse_pose
+from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
+from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
+
+Composite = Literal["photo", "face"]
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Relights one item under every light setup; settings only."""
+
+    photo: PhotoOptions
+    setups: tuple[LightSetup, ...]
+    rig: str
+    sampling: Sampling
+    pose: str | None
+    composite: Composite
+    keep_background: bool
+    matte: Path | None
+    exposure_ev: float | None  # None: auto
+    memory_bytes: int
+    asked_for_photo: bool  # --composite photo is on the command line
+    reflectance: Kind = "field"
+    network_alone: bool = False
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """An EXR and a PNG for each setup."""
+        tag = self.photo.first_tag
+        return [setup.output(item, tag, suffix) for setup in self.setups for suffix in (".exr", ".png")]
+
+    def readable(self) -> "Relight":
+        """Load the models, and keep the setups whose maps can be read."""
+        from facerf_cli.cli.items.lights import readable
+        from facerf_cli.cli.items.photo import prepare_photos
+
+        prepare_photos(self.photo)
+        setups = readable(self.setups)
+        if not setups:
+            raise FacerfError("no map can be read; give others")
+        return replace(self, setups=setups)
+
+    def __call__(self, item: Item) -> Outcome:
+        """Relight a photo or a stack."""
+        from facerf_cli.cli.items.relight import relight_item
+
+        written, facts = relight_item(item, self)
+        outputs = [path.with_suffix(suffix) for path in written for suffix in (".exr", ".png")]
+        exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
+        return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
 
 
 def relight(
@@ -40,9 +90,9 @@ def relight(
         typer.Option(
             "--envmap",
             metavar="SKY.exr|DIR|procedural:N",
-            help="Lat-long maps (.exr, .hdr), twice as wide as high: files, folders or quoted patterns; a "
-            "light of estimate-light or convert-light (.json); or N maps drawn from --seed, the first N of "
-            "facerf envmap. May be repeated; .exr and .hdr files that follow it directly are maps too.",
+            help="Relight under lat-long maps (.exr, .hdr): files, folders or quoted patterns; a light of "
+            "estimate-light or convert-light (.json); or the first N maps that facerf envmap draws from "
+            "--seed. Repeatable; .exr and .hdr files that follow it directly are maps, too.",
             show_default=False,
         ),
     ] = None,
@@ -51,8 +101,8 @@ def relight(
         typer.Option(
             "--light",
             metavar="AZ,EL[,R,G,B][;...]",
-            help="A picture under a single light from azimuth and elevation in degrees (AZ > 0: from the "
-            "picture's right), or under several that shine together, with ; between them. May be repeated.",
+            help="Relight under a single light from an azimuth and elevation in degrees (AZ > 0: from the "
+            "image's right), or under several at once, separated by ;. Repeatable.",
             show_default=False,
         ),
     ] = None,
@@ -61,20 +111,25 @@ def relight(
         typer.Option(
             "--light-from",
             metavar="PHOTO|DIR",
-            help="The light of another photo's largest face, as `facerf estimate-light` reads it by default "
-            "(with this --reflectance); it turns and has balls as a map. May be repeated.",
+            help="Relight under the light of another photo, estimated from its largest face as `facerf "
+            "estimate-light` does by default (with this --reflectance). Repeatable.",
             show_default=False,
         ),
     ] = None,
     lights: Annotated[
-        str, typer.Option("--lights", metavar="N|FILE", help="The rig that maps are weighed over.")
+        str,
+        typer.Option(
+            "--lights",
+            metavar="N|FILE",
+            help="Approximate maps by a rig of N lights, or by a file of directions.",
+        ),
     ] = "150",
     rotate: Annotated[
         str | None,
         typer.Option(
             "--rotate",
             metavar="DEG|FROM:TO:N",
-            help="Turn the maps: DEG is added to every azimuth; or N frames .0000, .0001, ... (TO left out).",
+            help="Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.",
             show_default="as they are",
         ),
     ] = None,
@@ -82,27 +137,25 @@ def relight(
         str | None,
         typer.Option(
             metavar="YAW,PITCH,ROLL",
-            help="Turn the head to this pose, in degrees; gives the face alone.",
+            help="Turn the head to a pose, in degrees; shows the face alone.",
             show_default="the photo's",
         ),
     ] = None,
     reflectance: Annotated[
         Kind,
         typer.Option(
-            help="What the face is taken to be: the field of the network, or, to compare, diffuse under "
-            "spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
+            help="Choose the reflectance model: the network's field, or, to compare, diffuse under spherical "
+            "harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
         ),
     ] = "field",
     exposure: Annotated[
         str,
-        typer.Option(
-            metavar="EV|auto", help="Of the PNG; the EXR holds absolute light. auto: by the lit face."
-        ),
+        typer.Option(metavar="EV|auto", help="Exposure of the PNG in EV, or auto: expose the lit face well."),
     ] = "auto",
     composite: Annotated[
         Composite | None,
         typer.Option(
-            help="The photo with its face relit, or the rendered face with alpha.",
+            help="Show the photo with its face relit, or the rendered face alone, with alpha.",
             show_default="photo; face with --pose",
         ),
     ] = None,
@@ -110,27 +163,30 @@ def relight(
         bool,
         typer.Option(
             "--keep-background",
-            help="Leave hair and background as they are, bit for bit; "
-            "--exposure is then that of the light on the face.",
+            help="Leave hair and background as they are, bit for bit; --exposure then applies to the light "
+            "on the face only.",
         ),
     ] = False,
     matte: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="What the light may change: a grey picture (or its alpha) of the photo's size.",
+            help="Change only what a grey image, or its alpha, of the photo's size shows.",
             show_default=False,
         ),
     ] = None,
     ball: Annotated[
-        bool, typer.Option("--ball", help="Also a mirror ball and a diffuse ball under each map.")
+        bool, typer.Option("--ball", help="Write a mirror ball and a diffuse ball under each map, too.")
     ] = False,
     envmap_sampling: Annotated[
         Sampling,
-        typer.Option(help="A light takes the map's integral over its cell, or, as in the paper, one pixel."),
+        typer.Option(
+            help="Give each light the map's integral over its cell, or, as in the paper, one pixel."
+        ),
     ] = "cell",
+    network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = 256,
-    memory: Annotated[float, typer.Option(metavar="GB", min=0.1, help="For the prediction, about.")] = 2.0,
+    memory: MemoryOption = 2.0,
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -141,46 +197,61 @@ def relight(
 ) -> None:
     """Relight photos under environment maps and single lights.
 
-    Each picture is an EXR of absolute, scene-linear light, with the layers face.A (the face's soft mask),
-    normal, position (camera space; metres) and uv, and a PNG at --exposure. One prediction serves all maps
-    and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay there.
+    Each image is written as a scene-linear EXR, with the layers face.A (the soft mask of the face), normal,
+    position (camera space, metres) and uv, and as a PNG at --exposure. One prediction serves all maps and
+    rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the end.
 
-    A stack is relit by its own lights: --lights does not apply, and --light takes the nearest of them.
+    An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
+    the nearest of them.
     """
     settings = settings_of(context)
     if pose is not None and composite == "photo":
-        raise UsageError("--pose turns the head out of its photo; use --composite face with it")
+        raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
-    parse_directions(lights)
-    exposure_ev = None if exposure == "auto" else numbers(exposure, ("EV or auto",), "--exposure")[0]
+    parse_lights(lights)
+    if network_alone and reflectance != "field":
+        raise UsageError("--network-alone: is for the field; leave it out, or use --reflectance field")
     photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, texture_size)
     photo.check()
     if matte is not None and not matte.is_file():
-        raise UsageError(f"--matte {matte}: no such file")
-    lit = photo_lights(light_from or (), output, LightOptions(of_other_photos(photo), reflectance))
-    asked = collect_shots(envmap or (), rotate, light or (), output, settings.seed, lit)
-    shots = asked if dry_run and lit else usable(asked)  # a photo's light takes its time
-    if not shots:
-        raise FacerfError("no map can be used")
-    mode: Composite = composite or ("photo" if pose is None else "face")
+        raise UsageError(f"--matte {matte}: no such file; give one that exists")
+    lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), reflectance))
     work = Relight(
         photo=photo,
-        shots=shots,
+        setups=collect_setups(envmap or (), rotate, light or (), output, settings.seed, lit),
         rig=lights,
         sampling=envmap_sampling,
         pose=pose,
-        composite=mode,
-        surround=not keep_background,
+        composite=composite or ("photo" if pose is None else "face"),
+        keep_background=keep_background,
         matte=matte,
-        exposure_ev=exposure_ev,
+        exposure_ev=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
         reflectance=reflectance,
+        network_alone=network_alone,
     )
-    if not dry_run:
-        load_models_once(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch("relight", inputs, work, work.outputs_of, options, settings)
+    items = collect_items(inputs, output, PHOTO_SUFFIXES)
+    todo = not dry_run and not all_finished(items, work.outputs_of, options, settings)
+    usable = work.readable() if todo else work
+    code = run_files("relight", items, usable, usable.outputs_of, options, settings)
     if ball and not dry_run and settings.shard.number == 1:
-        write_balls(shots, output, exposure_ev, overwrite)
-    raise typer.Exit(max(code, int(len(shots) < len(asked))))
+        _write_balls(usable, options)
+    raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))
+
+
+def _write_balls(work: Relight, options: BatchOptions) -> None:
+    """Write the balls under each map to `balls/NAME.exr` and `.png`, unless they are there."""
+    folder = options.output / "balls"
+    missing = {
+        setup: path
+        for setup in work.setups
+        if (path := folder / f"{setup.name}{setup.frame}.exr")
+        and setup.envmap is not None
+        and (options.overwrite or not path.with_suffix(".png").exists())
+    }
+    if missing:
+        from facerf_cli.cli.items.lights import write_balls
+
+        write_balls(list(missing), list(missing.values()), work.exposure_ev)

@@ -82,8 +82,8 @@ class _Photograph:
         return [item.output_base] if transport is None else [item.output_base, transport]
 
     def __call__(self, item: Item) -> Outcome:
-        from facerf_cli.synth.heads_bank import one_thread
         from facerf_cli.synth.stage import draw_subject, subject_model, write_subject
+        from facerf_cli.synth.threads import one_thread
 
         model = subject_model(self.stage.face_model)
         with one_thread():

@@ -9,7 +9,6 @@ Other methods' predictions, looked up by case: none may be missing, for a smalle
 
 import csv
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
+from facerf_cli.evaluation import folder_name
 from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
 
 
@@ -114,11 +114,6 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell))
     except ValueError:
         return False
-
-
-def folder_name(folder: Path) -> str:
-    """The folder's own name; a link's is the link's, and '.' has that of the folder it stands for."""
-    return Path(os.path.abspath(folder)).name
 
 
 SUFFIXES = (".exr", ".png", ".npy")

@@ -34,19 +34,18 @@ class KeptStrip:
 class ItemFigures:
     """What an item left: the key of how it was evaluated, its rows, its strips.
 
-    `pictures` are those that were kept for other methods; their paths, too, start from the evaluation's
-    folder.
+    `pictures` are images kept for other methods. Paths start from the evaluation's folder.
     """
 
     key: str
     rows: tuple[Row, ...]
     strips: tuple[KeptStrip, ...]
-    images: tuple[str, ...]
+    pictures: tuple[str, ...]
 
     @property
     def files(self) -> tuple[str, ...]:
         """All that was kept beside the figures."""
-        return (*(strip.file for strip in self.strips), *self.images)
+        return (*(strip.file for strip in self.strips), *self.pictures)
 
 
 def write_figures(path: Path, figures: ItemFigures) -> None:

@@ -1,13 +1,18 @@
-"""A light estimate as one picture: photo, explanation, what is left over, and two balls under the light."""
+"""A light estimate as one image: photo, explanation, difference, and two balls under the light."""
 
-from typing import TYPE_CHECKING
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+from torch import Tensor
 
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
-    from facerf_cli.cli.photo_options import FittedFace
-    from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.head import Head
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import region_mask
+from facerf_cli.face.view import render_face, see_face
+from facerf_cli.light.envmap import ball
+from facerf_cli.network.inputs import resize
 
 TILE_PX = 256
 _LABEL_PX = 20
@@ -15,25 +20,17 @@ _LABELS = ("photo", "explained", "red: too bright, blue: too dark", "mirror ball
 _BALL_PX = 236  # within its tile
 
 
-def draw_estimate(
-    face: "FittedFace", model: "MorphableModel", explained: "Tensor", envmap: "Tensor"
-) -> "np.ndarray":
+def draw_estimate(head: Head, model: MorphableModel, explained: Tensor, envmap: Tensor) -> np.ndarray:
     """Five tiles side by side [H, W, 3], linear, exposed for display; labels above.
 
     `explained` [3, t, t] is the face's texture as its light explains it; `envmap` [H, 2 H, 3] that light.
     """
-    import numpy as np
-
-    from facerf_cli.colour import auto_exposure_ev
-    from facerf_cli.face.crop import Crop
-    from facerf_cli.light.envmap import ball
-
-    whole = Crop(0.0, 0.0, float(len(face.cropped)), TILE_PX)
-    image, mask = _explained_in_crop(face, model, explained)
-    gain = np.float32(2 ** auto_exposure_ev(face.cropped, mask))
+    whole = Crop(0.0, 0.0, float(len(head.cropped)), TILE_PX)
+    image, mask = _explained_in_crop(head, model, explained)
+    gain = np.float32(2 ** auto_exposure_ev(head.cropped, mask))
     photo, remade = (
-        face.cropped * gain,
-        (mask[..., None] * image + (1 - mask[..., None]) * face.cropped) * gain,
+        head.cropped * gain,
+        (mask[..., None] * image + (1 - mask[..., None]) * head.cropped) * gain,
     )
     faces = [whole.apply(tile.clip(0, 1)) for tile in (photo, remade, _difference(photo, remade, mask))]
     both = np.stack([ball(envmap.clamp_min(0), _BALL_PX, kind).numpy() for kind in ("mirror", "diffuse")])
@@ -44,30 +41,18 @@ def draw_estimate(
     return np.concatenate([_labels(tiles.shape[1]), tiles])
 
 
-def _explained_in_crop(
-    face: "FittedFace", model: "MorphableModel", explained: "Tensor"
-) -> "tuple[np.ndarray, np.ndarray]":
+def _explained_in_crop(head: Head, model: MorphableModel, explained: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """The explained face in the crop [S, S, 3], and how far it stands there for the photo [S, S] in 0..1."""
-    import torch
-
-    from facerf_cli.face.topology import region_mask
-    from facerf_cli.network.reflectance import resize
-    from facerf_cli.pipeline import render_face, see_face
-
-    uv, coverage = see_face(face.fit.vertices_camera(model), face.fit.camera)
-    side = face.texture.texture.shape[-1]
-    inside = (face.texture.visible * region_mask("face", side))[None]
+    uv, coverage = see_face(head.fit.vertices_camera(model), head.fit.camera)
+    side = head.face.texture.shape[-1]
+    inside = (head.face.visible * region_mask("face", side))[None]
     planes = torch.cat([resize(explained[None], side)[0], inside])
     rendered = render_face(planes[None], uv, coverage)[0].permute(1, 2, 0).numpy()
     return rendered[..., :3], rendered[..., 3].clip(0, 1)
 
 
-def _difference(photo: "np.ndarray", remade: "np.ndarray", mask: "np.ndarray") -> "np.ndarray":
+def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """On grey: red where the face was made too bright for the eye, blue where too dark."""
-    import numpy as np
-
-    from facerf_cli.colour import linear_to_srgb, srgb_to_linear
-
     encoded = [linear_to_srgb(tile.clip(0, 1)).mean(-1) for tile in (remade, photo)]
     error = 2 * (encoded[0] - encoded[1]) * mask
     bright, dark = error.clip(0, 0.5), (-error).clip(0, 0.5)
@@ -75,11 +60,8 @@ def _difference(photo: "np.ndarray", remade: "np.ndarray", mask: "np.ndarray") -
     return np.asarray(srgb_to_linear(shown.astype(np.float32)))
 
 
-def _labels(width_px: int) -> "np.ndarray":
+def _labels(width_px: int) -> np.ndarray:
     """A strip [h, W, 3], linear, with a word over each tile."""
-    import numpy as np
-    from PIL import Image, ImageDraw
-
     strip = Image.new("L", (width_px, _LABEL_PX))
     draw = ImageDraw.Draw(strip)
     for column, label in enumerate(_LABELS):

@@ -1,235 +1,211 @@
-"""The findings of a capture's checks as people read them: a table, like findings put together.
-
-What `prepare-dataset` does with the findings of a capture's checks: stop a subject, tell, write down.
-
-A dataset's findings.jsonl has them all; findings/SUBJECT.jsonl each subject's, where it has any, written
-before the subject is worked on.
-
-What `facerf prepare-dataset` does with one subject of a capture: check, choose, prepare.
-"""
+"""Work of `facerf prepare-dataset`: draft a stage.json, or check and prepare the subjects of a capture."""
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
 
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
+import numpy as np
 
-from facerf_cli.cli.batch import Item, Outcome
-from facerf_cli.cli.options import Settings, workers_of
+from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.chart_correction import ChartCorrection
+from facerf_cli.capture.checks.align import with_alignment
+from facerf_cli.capture.checks.findings import frames_left_out
+from facerf_cli.capture.colour_chart import read_charts, write_chart_overlays
+from facerf_cli.capture.draft import as_text, draft_stage
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.select import Selection, has_new_frames, select_frames
+from facerf_cli.capture.stage_json import STAGE_FILE
+from facerf_cli.cli.batch import PHOTO_SUFFIXES, BatchOptions, Item, Outcome, run_items, sums_up
+from facerf_cli.cli.items.capture_findings import (
+    CheckOnly,
+    check,
+    check_all,
+    collect_findings,
+    require_sound,
+    show_findings,
+    write_findings,
+)
+from facerf_cli.cli.options import Settings
+from facerf_cli.cli.prepare_dataset import Checks, PrepareOptions
+from facerf_cli.dataset.dataset import (
+    DATASET_FILE,
+    LARGEST_CROP_PX,
+    Split,
+    describe_dataset,
+    preparation_key,
+    record_path,
+    sha256_of,
+)
+from facerf_cli.dataset.pages import index_page
+from facerf_cli.dataset.prepare import prepare_subject, prepared_subjects, subject_outputs
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.logs import LOGGER_NAME, STDERR, counted, json_line, one_line
-from facerf_cli.workers import process_died, spread
+from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.documents import write_document
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.synth.threads import one_thread
 
-if TYPE_CHECKING:
-    from facerf_cli.capture.capture import Capture
-    from facerf_cli.capture.checks.findings import Finding
-    from facerf_cli.capture.colour_correction import ChartCorrection
-    from facerf_cli.capture.select import Selection
-    from facerf_cli.face.morphable import MorphableModel
-
-_ALIKE = 3  # findings of one check in a camera that are shown; the rest are counted
-_STYLES = {"error": "red", "warning": "yellow"}
-_PLAIN_WIDTH = 160  # of a log file, which has no width of its own
-
-Row = Mapping[str, Any]  # as `Finding.row` makes it
-
-
-def show_findings(rows: Sequence[Row], strict: bool = False, console: Console = STDERR) -> None:
-    """Print the rows as a table, if there are any; findings.jsonl has all of them, here like ones are cut.
-
-    With `strict` each of them stops its subject.
-    """
-    if strict:
-        rows = [{**row, "severity": "error", "leaves_out": False} for row in rows]
-    if rows:
-        wide = console if console.is_terminal else Console(file=console.file, width=_PLAIN_WIDTH)
-        wide.print(findings_table(rows))
-
-
-def findings_table(rows: Sequence[Row]) -> Table:
-    """Errors first, then by subject; of many alike the first few, and how many more."""
-    table = Table(title=summary(rows), title_justify="left", title_style="bold", expand=False)
-    for name in ("where", "check", "what follows"):
-        table.add_column(name, no_wrap=name != "what follows", overflow="fold")
-    table.add_column("finding", overflow="fold")
-    for row, more in _shortened(rows):
-        words = one_line(str(row["words"])) + (f" (and {more} more like it)" if more else "")
-        where = "/".join(str(row[key]) for key in ("subject", "camera", "light") if row.get(key))
-        style = _STYLES.get(str(row["severity"]), "")
-        table.add_row(Text(where), Text(str(row["check"])), Text(follows(row), style), Text(words))
-    return table
-
-
-def follows(row: Row) -> str:
-    """What a finding means for the subject."""
-    if row["leaves_out"]:
-        return "frame left out"
-    return "subject stopped" if row["severity"] == "error" else "warning"
-
-
-def summary(rows: Sequence[Row]) -> str:
-    """One line over the table."""
-    subjects = len({row["subject"] for row in rows})
-    kinds = [follows(row) for row in rows]
-    counts = ((kinds.count(kind), kind) for kind in ("subject stopped", "frame left out", "warning"))
-    words = ", ".join(f"{count} x {kind}" for count, kind in counts if count)
-    return f"Findings about {counted(subjects, 'subject')}: {words}"
-
-
-def _shortened(rows: Sequence[Row]) -> Iterator[tuple[Row, int]]:
-    """The first few rows of each check in a camera, the last of them with how many were left away."""
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        key = (follows(row) == "warning", row["leaves_out"], row["subject"], row.get("camera"), row["check"])
-        groups.setdefault((*key[:3], key[3] or "", key[4]), []).append(row)
-    for key in sorted(groups):
-        group = groups[key]
-        for place, row in enumerate(group[:_ALIKE], start=1):
-            yield row, len(group) - _ALIKE if place == _ALIKE else 0
-
-
-FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
-_ROWS_LIMIT_BYTES = 256 << 20
+_CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
 
 
-def check(capture: "Capture", subject: str) -> "list[Finding]":
-    """Findings about a subject's frames, less those that the capture itself gives up.
+def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: bool) -> None:
+    """Write a draft of stage.json to `output` or into the folder, and print its path and notes.
 
-    What the camera saw is looked at, before a colour chart's matrix hides which channel was clipped.
+    UsageError where the file exists. A dry run prints the notes only.
     """
-    from facerf_cli.capture.checks.subject import check_subject
-
-    marked = capture.marked.get(subject, frozenset())
-    return [
-        found
-        for found in check_subject(replace(capture, charts=()), subject)
-        if not (found.check == "missing" and found.light in marked)
-    ]
-
-
-def require_sound(subject: str, findings: "Iterable[Finding]", strict: bool) -> None:
-    """An InputError where findings stop the subject."""
-    from facerf_cli.capture.checks.findings import stopping
-
-    if at_fault := stopping(findings, strict):
-        first = at_fault[0]
-        more = f" ({len(at_fault)} such findings, see {FINDINGS_FILE})" if len(at_fault) > 1 else ""
-        advice = "" if first.severity == "error" else "; without --strict it would do"
-        raise InputError(f"{first.place}: {first.check}: {first.words}{advice}{more}")
-
-
-def write_findings(folder: Path, subject: str, findings: "Sequence[Finding]") -> None:
-    """Keep a subject's findings in a dataset's folder; none where there are none."""
-    path = folder / _FOLDER / f"{subject}.jsonl"
-    if findings:
-        _write_rows(path, (found.row() for found in findings))
-    else:
-        path.unlink(missing_ok=True)
-
-
-def collect_findings(folder: Path, subjects: Iterable[str]) -> dict[str, list[dict[str, Any]]]:
-    """Write `findings.jsonl` of all subjects' findings, and give its rows by subject."""
-    rows = {subject: _read_rows(folder / _FOLDER / f"{subject}.jsonl") for subject in subjects}
-    _write_rows(folder / FINDINGS_FILE, (row for of_subject in rows.values() for row in of_subject))
-    return {subject: of_subject for subject, of_subject in rows.items() if of_subject}
-
-
-def check_all(
-    work: "CheckOnly", items: Sequence[Item], output: Path, jobs: int, strict: bool, settings: Settings
-) -> int:
-    """Check all subjects, print the table, write `findings.jsonl`; 1 where a subject would be stopped.
-
-    A UsageError with `--shard`: the file is of all subjects, and no shard would know that it is the last.
-    """
-    if settings.shard.of > 1:
-        raise UsageError("--checks only looks at all subjects; leave --shard out, and give --jobs or --ray")
-    from rich.progress import track
-
-    from facerf_cli.capture.checks.findings import stopping
-
-    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    results = spread(work, items, workers_of(settings, jobs), _died)
-    bar = track(results, "checks", len(items), console=STDERR, transient=True, disable=not shown)
-    findings = [found for of_subject in bar for found in of_subject]
-    rows = [found.row() for found in findings]
-    _write_rows(output / FINDINGS_FILE, rows)
-    show_findings(rows, strict)
-    if not rows:
-        log.info("checked: %s, nothing found", counted(len(items), "subject"))
-    print(output / FINDINGS_FILE)
-    return 1 if stopping(findings, strict) else 0
-
-
-@dataclass(frozen=True)
-class CheckOnly:
-    """Checks one subject of a capture that `opened` reads."""
-
-    opened: Any  # () -> Capture; can be sent to other processes
-
-    def __call__(self, item: Item) -> "list[Finding]":
-        """The subject's findings."""
-        from facerf_cli.synth.heads_bank import one_thread
-
-        with one_thread():
-            return check(self.opened(), item.name)
-
-
-def _died(item: Item, error: Exception) -> "list[Finding]":
-    from facerf_cli.capture.checks.findings import Finding
-
-    return [Finding("error", "unchecked", item.name, process_died(error))]
-
-
-def _write_rows(path: Path, rows: "Iterable[Mapping[str, Any]]") -> None:
-    from facerf_cli.files.atomic import atomic_path
-
+    path = folder / STAGE_FILE if output is None else output
+    if path.is_dir():
+        raise UsageError(f"-o {path}: is a folder; give the draft's name, such as {path / STAGE_FILE}")
+    if path.exists() or path.is_symlink():
+        raise UsageError(
+            f"{path}: is there already, and a draft replaces nothing; move it, or give -o another name"
+        )
+    stage = draft_stage(folder, PHOTO_SUFFIXES, pattern)
+    for note in stage["draft"]:
+        log.info("%s", note)
+    if dry_run:
+        print(f"{folder} -> {path}")
+        return
     with atomic_path(path) as temporary:
-        temporary.write_text("".join(json_line(row) + "\n" for row in rows), encoding="utf-8")
+        temporary.write_text(as_text(stage), encoding="utf-8", errors="backslashreplace")
+    print(path)
 
 
-def _read_rows(path: Path) -> list[dict[str, Any]]:
-    import json
-
-    if not path.is_file() or path.stat().st_size > _ROWS_LIMIT_BYTES:
-        return []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    try:
-        rows = [json.loads(line) for line in lines]
-    except ValueError:
-        raise InputError(f"{path}: damaged; remove it, and give --overwrite to check again") from None
-    return [row for row in rows if isinstance(row, dict)]
-
-
-Checks = Literal["on", "off", "only"]
+def prepare_capture(options: PrepareOptions, output: Path, settings: Settings) -> int:
+    """Prepare all subjects of a capture, or only check them; return the exit code."""
+    split = Split.parse(options.split)
+    if options.crop_px % _CROP_STEP_PX or not 0 < options.crop_px <= LARGEST_CROP_PX:
+        raise UsageError(
+            f"--crop {options.crop_px}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}"
+        )
+    source = _with_charts(
+        CaptureSource(options.capture, options.layout, options.subtract_ambient, options.align),
+        options.colour_chart,
+        options.chart_corners,
+    )
+    capture = source.opened()
+    _check_subjects(capture, output, split)
+    items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
+    if options.checks == "only" and not options.dry_run:
+        return check_all(CheckOnly(source.opened), items, output, options.jobs, options.strict, settings)
+    model_sha256 = _model_digest(options.face_model)
+    key = preparation_key(capture, model_sha256, options.crop_px)
+    _check_earlier(capture, output, key, options.overwrite)
+    work = Prepare(source, options.checks, options.strict, options.face_model, options.crop_px, output, key)
+    batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)
+    if options.overwrite and not options.dry_run:
+        (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
+    elif not options.dry_run:
+        _forget_completed(capture, output)
+    code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
+    if not options.dry_run and sums_up(items, work.outputs_of, batch, settings):
+        _write_dataset(work, capture, split, settings.seed, model_sha256)
+    return code
 
 
 @dataclass(frozen=True)
-class Given:
-    """Which capture, and how it is read; settings only."""
+class CaptureSource:
+    """A capture's folder and the options to read it with."""
 
     folder: Path
     layout: str
     subtract_ambient: bool
     align: bool
-    charts: "tuple[ChartCorrection, ...]" = ()
+    charts: tuple[ChartCorrection, ...] = ()
 
-    def opened(self) -> "Capture":
-        """The capture's description, read once a process; it is an input of the whole run."""
-        capture = _capture(self.folder, self.layout, self.subtract_ambient, self.align)
+    def opened(self) -> Capture:
+        """Read the capture's description once per process; UsageError where it is wrong."""
+        capture = _read_capture(self.folder, self.layout, self.subtract_ambient, self.align)
         return replace(capture, charts=self.charts)
+
+
+@cache
+def _read_capture(folder: Path, layout: str, subtract_ambient: bool, align: bool) -> Capture:
+    try:
+        return read_capture(folder, layout, subtract_ambient, align)
+    except InputError as error:
+        raise UsageError(str(error)) from None
+
+
+def _with_charts(source: CaptureSource, image: str, corners: str) -> CaptureSource:
+    """Add the colour corrections of --colour-chart, and log each."""
+    if not image:
+        if corners:
+            raise UsageError("--chart-corners: no image is given; give --colour-chart too")
+        return source
+    try:
+        charts = tuple(read_charts(source.opened(), image, _parse_corners(corners) if corners else None))
+    except InputError as error:
+        raise UsageError(f"--colour-chart: {error}") from None
+    for chart in charts:
+        log.info("%s", chart.in_words())
+    return replace(source, charts=charts)
+
+
+def _parse_corners(text: str) -> np.ndarray:
+    """Parse four corners [4, 2] in pixels, `x,y x,y x,y x,y`."""
+    try:
+        corners_px = np.array([[float(number) for number in pair.split(",")] for pair in text.split()])
+    except ValueError:
+        corners_px = np.empty(0)
+    if corners_px.shape != (4, 2) or not np.isfinite(corners_px).all():
+        raise UsageError(f"--chart-corners '{text}': give four corners in pixels, as 'x,y x,y x,y x,y'")
+    return corners_px
+
+
+def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
+    """Raise for faults that concern all subjects; log what the options leave out."""
+    if not capture.subjects:
+        raise UsageError(
+            f"{capture.folder}: no subjects found at {capture.pattern}; check the pattern and the images"
+        )
+    if output.resolve() == capture.folder.resolve():
+        raise UsageError(f"-o {output}: is the capture itself; give another folder")
+    if marked := sum(map(len, capture.marked.values())):
+        log.info("%s: %d images that are marked as damaged (.bad) are left out", capture.folder, marked)
+    left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
+    if left:
+        log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
+
+
+def _model_digest(name: str) -> str:
+    _face_model(name)  # reports a wrong file before it is hashed
+    return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
+
+
+@cache
+def _face_model(name: str) -> MorphableModel:
+    """Load the face model once per process."""
+    return load_face_model(name)
+
+
+def _check_earlier(capture: Capture, output: Path, key: str, overwrite: bool) -> None:
+    """Raise where finished subjects were prepared with other options than this run has."""
+    earlier = {} if overwrite else prepared_subjects(capture, output)
+    other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
+    if other:
+        raise UsageError(
+            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model, "
+            "calibration or colour chart; give --overwrite, or another folder"
+        )
+
+
+def _forget_completed(capture: Capture, output: Path) -> None:
+    """Remove the records of subjects whose missing frames exist by now, so that they are prepared again."""
+    for subject, record in prepared_subjects(capture, output).items():
+        if has_new_frames(capture, subject, record.get("missing", ())):
+            log.info("%s: frames that were missing exist now; it is prepared again", subject)
+            record_path(output, subject).unlink()
 
 
 @dataclass(frozen=True)
 class Prepare:
     """Prepares one subject; settings only."""
 
-    given: Given
+    source: CaptureSource
     checks: Checks
     strict: bool
     face_model: str
@@ -237,18 +213,13 @@ class Prepare:
     folder: Path
     key: str
 
-    def outputs_of(self, item: Item) -> list[Path]:
-        """A subject's files."""
-        from facerf_cli.dataset.prepare import subject_outputs
-
-        return subject_outputs(self.given.opened(), item.name, self.folder)
+    def outputs_of(self, item: Item) -> Sequence[Path]:
+        """Files of a subject."""
+        return subject_outputs(self.source.opened(), item.name, self.folder)
 
     def __call__(self, item: Item) -> Outcome:
-        """Prepare a subject, on one thread, so that its bytes do not depend on how many there are."""
-        from facerf_cli.dataset.prepare import prepare_subject
-        from facerf_cli.synth.heads_bank import one_thread
-
-        model = face_model_of(self.face_model)
+        """Prepare a subject on one thread, so that its bytes do not depend on the number of cores."""
+        model = _face_model(self.face_model)
         with one_thread():
             capture, chosen = self._choose(item.name)
             record = prepare_subject(
@@ -262,13 +233,9 @@ class Prepare:
         facts |= {"lights": len(chosen.lights)}
         return Outcome(self.outputs_of(item), facts)
 
-    def _choose(self, subject: str) -> "tuple[Capture, Selection]":
-        """The capture, aligned on request, and its sound frames; an InputError where those are too few."""
-        from facerf_cli.capture.checks.findings import frames_left_out
-        from facerf_cli.capture.checks.motion import with_alignment
-        from facerf_cli.capture.select import select_frames
-
-        capture = self.given.opened()
+    def _choose(self, subject: str) -> tuple[Capture, Selection]:
+        """Check a subject, select its sound frames, and align them on request; InputError for too few."""
+        capture = self.source.opened()
         findings = check(capture, subject) if self.checks == "on" else []
         write_findings(self.folder, subject, findings)
         require_sound(subject, findings, self.strict)
@@ -278,19 +245,26 @@ class Prepare:
         return capture, chosen
 
 
-@cache
-def _capture(folder: Path, layout: str, subtract_ambient: bool, align: bool) -> "Capture":
-    from facerf_cli.capture.layouts import read_capture
+def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, model_sha256: str) -> None:
+    """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
+    found = prepared_subjects(capture, work.folder).items()
+    records = {subject: record for subject, record in found if record.get("prepared") == work.key}
+    findings = collect_findings(work.folder, capture.subjects)
+    show_findings([row for rows in findings.values() for row in rows], work.strict)
+    if not records:
+        return
+    _write_chart_overlays(capture, work.folder)
+    model = _face_model(work.face_model)
+    dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
+    with atomic_path(work.folder / "index.html") as temporary:
+        text = index_page(dataset, records, findings)
+        temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
+    write_document(work.folder / DATASET_FILE, dataset)
+    print(work.folder / DATASET_FILE)
 
-    try:
-        return read_capture(folder, layout, subtract_ambient, align)
-    except InputError as error:
-        raise UsageError(str(error)) from None
 
-
-@cache
-def face_model_of(name: str) -> "MorphableModel":
-    """The face model, once a process."""
-    from facerf_cli.face.morphable import load_face_model
-
-    return load_face_model(name)
+def _write_chart_overlays(capture: Capture, output: Path) -> None:
+    """Replace the control images of colour charts."""
+    for older in output.glob("colour_chart*.png"):
+        older.unlink()
+    write_chart_overlays(capture, output)

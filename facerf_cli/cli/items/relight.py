@@ -1,215 +1,227 @@
-"""What `facerf relight` does with one item: a photo, or an OLAT stack that was predicted before."""
+"""One photo, or one OLAT stack, under every light setup: relit, exposed and written."""
 
-from collections.abc import Callable, Iterable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Protocol
 
-from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import Item, Outcome
-from facerf_cli.cli.items.relit_images import Backdrop, Canvas, ImageCanvas, read_matte
-from facerf_cli.cli.lights import Sampling, Shot, light_photos, light_stack
-from facerf_cli.cli.photo_options import (
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.items.lights import weights_over_rig, weights_over_stack
+from facerf_cli.cli.items.photo import (
     FittedFace,
-    PhotoOptions,
     face_model,
     facts_of,
     fit_faces,
     load_models_once,
     provenance,
+    read_matte,
     read_photo,
+    rotation_of,
 )
-from facerf_cli.cli.values import parse_pose
+from facerf_cli.cli.relight import Relight
+from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.composite import Composition, RelitImage, Target
 from facerf_cli.errors import InputError
-from facerf_cli.logs import attributes_of_sum
+from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.head import FaceTexture, Head
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.field import weighted_sum
+from facerf_cli.files.images import LinearImage, write_display, write_exr
+from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
+from facerf_cli.light.sphere import RigLight
+from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
+from facerf_cli.pipeline import reflectance_of, relit_textures
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from facerf_cli.baselines.base import Reflectance
-    from facerf_cli.face.fit import FaceFit
-    from facerf_cli.files.images import LinearImage
-    from facerf_cli.files.olat_stack import OlatStack
-    from facerf_cli.pipeline import Models
-
-Composite = Literal["photo", "face"]
-_HELD = 4  # relit textures are held this many times over while light is added to them
+_HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
+log = logging.getLogger(LOGGER_NAME)
+
+Written = dict[Path, float]  # the EXR of each image, and the exposure of the PNG in its place
 
 
-@dataclass(frozen=True)
-class Relight:
-    """Relights one item under every shot; settings only."""
+class Composer(Protocol):
+    """What turns relit textures into images: a `Composition`, or the images of a stack as they are."""
 
-    photo: PhotoOptions
-    shots: tuple[Shot, ...]
-    rig: str
-    sampling: Sampling
-    pose: str | None
-    composite: Composite
-    surround: bool
-    matte: Path | None
-    exposure_ev: float | None  # None: auto
-    memory_bytes: int
-    asked_for_photo: bool  # --composite photo, in so many words
-    reflectance: Kind = "field"
+    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
+        """The image of a relit texture [3, T, T]."""
 
-    def outputs_of(self, item: Item) -> list[Path]:
-        """An EXR and a PNG a shot."""
-        tag = self.photo.first_tag
-        return [shot.output(item, tag, suffix) for shot in self.shots for suffix in (".exr", ".png")]
+    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+        """The image's pixels at an exposure in EV."""
 
-    def __call__(self, item: Item) -> Outcome:
-        """Relight a photo or a stack."""
-        from facerf_cli.files.olat_stack import is_olat_stack
+    def auto_exposure_ev(self, relit: Tensor) -> float:
+        """The exposure that shows the face well."""
 
-        stack = item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
-        written, facts = self._relight_stack(item) if stack else self._relight_photo(item)
-        outputs = [path.with_suffix(suffix) for path in written for suffix in (".exr", ".png")]
-        exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
-        return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
 
-    def _relight_photo(self, item: Item) -> tuple[dict[Path, float], dict[str, Any]]:
-        image = read_photo(item, self.photo)
-        faces = fit_faces(item, image, self.photo)
-        written: dict[Path, float] = {}
-        for face in reversed(faces):  # the first one's files say that the photo is finished
-            written.update(self._relight_face(item, image, face))
-        return written, facts_of(faces)
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """Relit textures of M setups, rgb weights [M, L, 3] of lights [L, 3], and what composes them."""
 
-    def _relight_face(
-        self, item: Item, image: "LinearImage", face: FittedFace
-    ) -> Iterator[tuple[Path, float]]:
-        """Write every shot of a face; the EXR's path and the PNG's exposure of each."""
-        models = load_models_once(self.photo)
-        size_px = image.pixels.shape[0], image.pixels.shape[1]
-        fit, turn = self._turned(face.fit)
-        vertices = fit.vertices_camera(models.face)
-        directions, weights = light_photos(self.shots, self.rig, self.sampling)
-        canvas = Canvas(vertices, face.fit.crop, size_px, face.texture, self._backdrop(image, size_px))
-        reflectance = self._reflectance_of(models, face)
+    composer: Composer
+    directions: Tensor
+    weights: Tensor
+    textures: Callable[[slice], Tensor]  # [m, 3, T, T] of some of the setups
+    bytes_each: int
+    alpha: np.ndarray | None = None  # of the photo
 
-        def relit(rows: slice) -> "Tensor":
-            return reflectance.relit(directions, weights[rows], turn)
 
-        metadata = provenance(item, self.photo, models.checkpoint_name)
-        if self.reflectance != "field":
-            metadata["facerf:reflectance"] = self.reflectance
-        yield from self._write_shots(item, face.tag, canvas, relit, metadata)
+def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    """Relight a photo or a stack under every setup; the images written, and facts for the report."""
+    stack = item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
+    return _relight_stack(item, work) if stack else _relight_photo(item, work)
 
-    def _reflectance_of(self, models: "Models", face: FittedFace) -> "Reflectance":
-        """The face's reflectance; the field is held to the photo, for which no light need be known."""
-        from facerf_cli.baselines.explain import explain
-        from facerf_cli.baselines.field import Field
-        from facerf_cli.pipeline import explain_photo
 
-        if self.reflectance == "field":
-            return Field(models, face.texture, explain_photo(models, face.texture), self.memory_bytes)
-        return explain(self.reflectance, models, face.fit, face.texture).reflectance
+def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    image = read_photo(item, work.photo)
+    faces = fit_faces(item, image, work.photo)
+    written: Written = {}
+    for face in reversed(faces):  # the first one's files mark the photo as finished
+        written.update(_relight_face(item, image, face, work))
+    return written, facts_of(faces)
 
-    def _turned(self, fit: "FaceFit") -> "tuple[FaceFit, Tensor | None]":
-        """The fit in the target's pose, and the turn [3, 3] that brings it there, if there is one."""
-        from facerf_cli.pipeline import turn_to
 
-        rotation = parse_pose(self.pose)
-        return (fit, None) if rotation is None else (replace(fit, rotation=rotation), turn_to(fit, rotation))
+def _relight_face(
+    item: Item, image: LinearImage, face: FittedFace, work: Relight
+) -> Iterator[tuple[Path, float]]:
+    models, head = load_models_once(work.photo), face.head
+    target = _target(head.fit, image, work)
+    composition = Composition(models.face, image.pixels, head, target)
+    reflectance = reflectance_of(models, head, work.reflectance, work.network_alone, work.memory_bytes)
+    directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
-    def _backdrop(self, image: "LinearImage", size_px: tuple[int, int]) -> Backdrop | None:
-        if self.composite == "face":
-            return None
-        matte = None if self.matte is None else read_matte(self.matte, size_px)
-        return Backdrop(image, self.surround, matte)
+    def textures(rows: slice) -> Tensor:
+        return relit_textures(head, reflectance, directions, weights[rows], target)
 
-    def _relight_stack(self, item: Item) -> tuple[dict[Path, float], dict[str, Any]]:
-        import torch
+    metadata = provenance(item, work.photo, models.checkpoint_name)
+    if work.reflectance != "field":
+        metadata["facerf:reflectance"] = work.reflectance
+    alpha = image.alpha if work.composite == "photo" else None
+    bytes_each = head.face.texture.nbytes
+    shown = _Shown(composition, directions, weights, textures, bytes_each, alpha)
+    yield from _write_setups(item, face.tag, shown, work, metadata)
 
-        from facerf_cli.files.olat_stack import read_olat_stack
-        from facerf_cli.pipeline import weigh_batches
 
-        if self.pose is not None or self.asked_for_photo:
-            raise InputError(f"{item.input_path}: a stack is one pose of a face without its photo")
-        if self.reflectance != "field":
-            raise InputError(
-                f"{item.input_path}: a stack is of the field; for {self.reflectance} give its photo"
-            )
-        stack = read_olat_stack(item.input_path)
-        canvas, facts = self._stack_canvas(item, stack)
-        weights = light_stack(self.shots, torch.from_numpy(stack.header.directions).float(), self.sampling)
+def _target(fit: FaceFit, image: LinearImage, work: Relight) -> Target:
+    """The head in the pose of `--pose`, composed as the options choose."""
+    rotation = rotation_of(work.pose)
+    posed = None if rotation is None else replace(fit, rotation=rotation)
+    in_photo = work.matte is not None and work.composite == "photo"
+    matte = read_matte(work.matte, image.pixels.shape[:2]) if in_photo and work.matte else None
+    return Target(posed, work.composite, work.keep_background, matte)
 
-        def relit(rows: slice) -> "Tensor":
-            batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
-            return weigh_batches(batches, weights[rows])
 
-        metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
-        return dict(self._write_shots(item, "", canvas, relit, metadata)), facts
+def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    if work.pose is not None or work.asked_for_photo:
+        raise InputError(
+            f"{item.input_path}: a stack holds one pose of a face without its photo; give the photo"
+        )
+    if work.reflectance != "field":
+        raise InputError(f"{item.input_path}: a stack holds the field; for {work.reflectance} give its photo")
+    stack = read_olat_stack(item.input_path)
+    composer, facts = _stack_composer(item, stack, work)
+    directions = torch.from_numpy(stack.header.directions).float()
+    weights = weights_over_stack(work.setups, directions, work.sampling)
 
-    def _stack_canvas(self, item: Item, stack: "OlatStack") -> tuple[Canvas | ImageCanvas, dict[str, Any]]:
-        """What a stack's pictures are seen on, the crop's own frame; and what is known of its fit."""
-        import torch
+    def textures(rows: slice) -> Tensor:
+        batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
+        return weighted_sum(batches, weights[rows])
 
-        from facerf_cli.face.crop import Crop
-        from facerf_cli.face.fit import fit_from_arrays
-        from facerf_cli.face.topology import LAYOUT_VERSION
-        from facerf_cli.pipeline import FaceTexture
+    metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
+    bytes_each = 12 * stack.header.seen.size
+    shown = _Shown(composer, directions, weights, textures, bytes_each)
+    return dict(_write_setups(item, "", shown, work, metadata)), facts
 
-        header = stack.header
-        if header.kind == "image":
-            return ImageCanvas(torch.from_numpy(header.seen), header.normals), {}
-        try:
-            if header.layout_version != LAYOUT_VERSION:
-                raise ValueError("it has another UV layout")
-            fit = fit_from_arrays(header.fit)
-            posed = replace(fit, rotation=torch.from_numpy(header.rotation).float())
-            vertices = posed.vertices_camera(face_model(self.photo))
-        except (ValueError, TypeError, KeyError) as error:
-            raise InputError(f"{item.input_path}: the fit in it is of no use: {error}") from None
-        side_px = fit.crop.size_px
+
+def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Composer, dict[str, Any]]:
+    """What composes a stack's images in the crop's own frame, and facts of the fit in it."""
+    header = stack.header
+    if header.kind == "image":
+        return _RenderedStack(header.seen, header.normals), {}
+    try:
+        if header.layout_version != LAYOUT_VERSION:
+            raise ValueError("it has another UV layout")
+        fit = fit_from_arrays(header.fit)
+        posed = replace(fit, rotation=torch.from_numpy(header.rotation).float())
         texture, normals = (torch.from_numpy(x).permute(2, 0, 1) for x in (header.source, header.normals))
-        face = FaceTexture(texture, torch.from_numpy(header.seen), normals)
-        whole = Crop(0.0, 0.0, float(side_px), side_px)
-        return Canvas(vertices, whole, (side_px, side_px), face, None), {
-            "error_iod": round(fit.error_iod, 5),
-            "quality": fit.quality,
-        }
+        head = Head(header.source, posed, FaceTexture(texture, torch.from_numpy(header.seen), normals))
+        composition = Composition(face_model(work.photo), None, head, Target(composite="face"))
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
+    return composition, {"error_iod": round(fit.error_iod, 5), "quality": fit.quality}
 
-    def _write_shots(
-        self,
-        item: Item,
-        tag: str,
-        canvas: Canvas | ImageCanvas,
-        relit: "Callable[[slice], Tensor]",
-        metadata: dict[str, Any],
-    ) -> Iterator[tuple[Path, float]]:
-        """All shots, as many at a time as fit the memory; one prediction serves those.
 
-        Where they do not fit at once, automatic exposure costs a round of its own.
-        """
-        at_once = max(1, self.memory_bytes // (_HELD * 12 * canvas.seen.numel()))
-        parts = [slice(first, first + at_once) for first in range(0, len(self.shots), at_once)]
-        whole = relit(parts[0]) if len(parts) == 1 else None
+@dataclass(frozen=True, eq=False)
+class _RenderedStack:
+    """Composes stacks of images that are rendered already; seen [H, W] is the face's coverage."""
 
-        def textures_of(part: slice) -> "Tensor":
-            return relit(part) if whole is None else whole
+    seen: np.ndarray
+    normals: np.ndarray  # [H, W, 3]
 
-        exposures_ev = self._exposures_ev(parts, textures_of, canvas)
-        for part in parts:
-            for shot, texture in zip(self.shots[part], textures_of(part), strict=True):
-                path = shot.output(item, tag, ".exr")
-                canvas.write(path, texture, exposures_ev[shot.name], metadata)
-                yield path, exposures_ev[shot.name]
+    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
+        return RelitImage(relit.permute(1, 2, 0).numpy(), self.seen, {"normal": self.normals})
 
-    def _exposures_ev(
-        self,
-        parts: Iterable[slice],
-        textures_of: "Callable[[slice], Tensor]",
-        canvas: Canvas | ImageCanvas,
-    ) -> dict[str, float]:
-        """By name of the light: one for all its frames, so that a turning sky does not pump."""
-        if self.exposure_ev is not None:
-            return dict.fromkeys((shot.name for shot in self.shots), self.exposure_ev)
-        found: dict[str, float] = {}
-        for part in parts:
-            for shot, texture in zip(self.shots[part], textures_of(part), strict=True):
-                chosen_ev = round(canvas.auto_exposure_ev(texture), 2)
-                found[shot.name] = min(chosen_ev, found.get(shot.name, chosen_ev))
-        return found
+    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+        return image.pixels * 2**ev
+
+    def auto_exposure_ev(self, relit: Tensor) -> float:
+        return auto_exposure_ev(relit.permute(1, 2, 0).numpy(), self.seen)
+
+
+def _write_setups(
+    item: Item, tag: str, shown: _Shown, work: Relight, metadata: Mapping[str, Any]
+) -> Iterator[tuple[Path, float]]:
+    """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
+
+    Where they do not fit at once, automatic exposure needs a prediction of its own.
+    """
+    at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
+    parts = [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
+    whole = shown.textures(parts[0]) if len(parts) == 1 else None
+
+    def textures_of(part: slice) -> Tensor:
+        return shown.textures(part) if whole is None else whole
+
+    exposures_ev = _exposures_ev(parts, textures_of, shown.composer, work)
+    for part in parts:
+        for setup, weights, texture in zip(
+            work.setups[part], shown.weights[part], textures_of(part), strict=True
+        ):
+            path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
+            light = RigLight(shown.directions, weights)
+            image = shown.composer.image(light, texture)
+            _write(path, image, shown.composer.exposed(light, texture, image, ev), shown.alpha, ev, metadata)
+            yield path, ev
+
+
+def _exposures_ev(
+    parts: Iterable[slice], textures_of: Callable[[slice], Tensor], composer: Composer, work: Relight
+) -> dict[str, float]:
+    """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
+    if work.exposure_ev is not None:
+        return dict.fromkeys((setup.name for setup in work.setups), work.exposure_ev)
+    found: dict[str, float] = {}
+    for part in parts:
+        for setup, texture in zip(work.setups[part], textures_of(part), strict=True):
+            chosen_ev = round(composer.auto_exposure_ev(texture), 2)
+            found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
+    return found
+
+
+def _write(
+    path: Path,
+    image: RelitImage,
+    exposed: np.ndarray,
+    photo_alpha: np.ndarray | None,
+    exposure_ev: float,
+    metadata: Mapping[str, Any],
+) -> None:
+    """Write an image as EXR, and exposed as PNG."""
+    metadata = {**metadata, "facerf:exposure_ev": exposure_ev}  # of the PNG, in both
+    alpha = photo_alpha if image.alpha is None else image.alpha
+    write_display(path.with_suffix(".png"), exposed, 0.0, alpha, metadata)
+    write_exr(path, image.pixels, alpha, image.layers, metadata)
+    log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)

@@ -93,12 +93,12 @@ def trained_networks(stage: Stage) -> tuple[str, ...]:
 
 def _chart(options: TrainOptions) -> "Objective":
     from facerf_cli.training.pretrained import load_light_features
-    from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
+    from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 
     light = load_light_features(options.light_features) if options.light_features else None
     network = options.networks.get("reflectance") or _reflectance(options)
-    settings = ChartSettings(held_out_heads=options.sizes.held_out_heads)
-    return ChartObjective(_samples(options), network, light, settings)
+    settings = TextureObjectiveSettings(held_out_heads=options.sizes.held_out_heads)
+    return TextureObjective(_samples(options), network, light, settings)
 
 
 def _light_features(options: TrainOptions) -> "Objective":
@@ -124,13 +124,14 @@ def _diffuse_sh(options: TrainOptions) -> "Objective":
 
 
 def _geometry(options: TrainOptions) -> "Objective":
-    from facerf_cli.synth.image_samples import RenderedFaces, add_pictures
+    from facerf_cli.synth.face_crops import RenderedFaces
+    from facerf_cli.synth.head_images import add_head_images
     from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 
     folder = options.bank or options.output / "bank"
     provenance, sizes = _bake(options, folder), options.sizes
     images = folder / "pictures"
-    add_pictures(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
+    add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
     faces = RenderedFaces(images, provenance)
     network: Any = options.networks.get("geometry")
     network = network or _geometry_network(options, faces.mean_translation_m())
@@ -179,34 +180,36 @@ def _photos(options: TrainOptions, side: int) -> Any:
 
 
 def _reflectance(options: TrainOptions) -> Any:
-    from facerf_cli.network.reflectance import ReflectanceNetwork, ReflectanceSettings
+    from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
     from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 
     normals = not options.without_normals
     if options.preset == "paper":
         return PaperReflectanceNetwork(PaperReflectanceSettings(normals=normals))
     if options.preset == "tiny":
-        return ReflectanceNetwork(
-            ReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 2, _TINY_LIGHTS, normals)
+        return DefaultReflectanceNetwork(
+            DefaultReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 2, _TINY_LIGHTS, normals)
         )
-    return ReflectanceNetwork(ReflectanceSettings(normals=normals))
+    return DefaultReflectanceNetwork(DefaultReflectanceSettings(normals=normals))
 
 
 def _geometry_network(options: TrainOptions, mean_m: tuple[float, float, float] | None = None) -> Any:
-    from facerf_cli.network.geometry import GeometryNetwork, GeometrySettings
+    from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 
     form: Any = "paper" if options.preset == "paper" else "default"
-    return GeometryNetwork(GeometrySettings(form, mean_translation_m=mean_m or (0.0, 0.0, -1.1)))
+    return GeometryNetwork(GeometryNetworkSettings(form, mean_translation_m=mean_m or (0.0, 0.0, -1.1)))
 
 
 def _samples(options: TrainOptions) -> "SampleSource":
     """A dataset's textures, or the bank."""
-    from facerf_cli.dataset.textures import open_captured
+    from facerf_cli.dataset.samples import open_dataset_textures
     from facerf_cli.light.sphere import RIG_LIGHTS
 
     if options.dataset:
         rig = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS  # of the mean face's shadows
-        return open_captured(options.dataset, options.fit_with, options.texture_size, options.jobs, rig)
+        return open_dataset_textures(
+            options.dataset, options.fit_with, options.texture_size, options.jobs, rig
+        )
     return _fill_bank(options, options.bank or options.output / "bank")
 
 
@@ -227,16 +230,16 @@ def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     """Bake the heads that are missing; what they are made of."""
     from facerf_cli.face.morphable import load_face_model
     from facerf_cli.light.transport import BakeSettings
-    from facerf_cli.synth.heads_bank import GeometrySettings, build_geometries
+    from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
 
-    heads, held_out, bake = options.sizes.heads, options.sizes.held_out_heads, GeometrySettings()
+    heads, held_out, bake = options.sizes.heads, options.sizes.held_out_heads, HeadBakeSettings()
     if heads < held_out + 2:
         raise UsageError(f"--heads {heads}: the mean face and {held_out} heads are held out; give more")
     if options.preset == "tiny":
-        bake = GeometrySettings(32, _TINY_LIGHTS, bake=BakeSettings(lamp_samples=1, bounce_samples=2))
+        bake = HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
     drawn = load_face_model(options.heads_from)
     load_face_model(options.fit_with)  # a bad one is named before anything is baked
-    build_geometries(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
+    bake_heads(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
     found = len(list((folder / "heads").glob("*.safetensors")))
     return {
         "heads": f"{found} synthetic heads drawn from {drawn.credit}",

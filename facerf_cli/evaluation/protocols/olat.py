@@ -1,69 +1,73 @@
-"""OLATs of held-out people from pictures in natural light, in the same pose and in others (paper, Table 1).
+"""OLATs of held-out people from images in natural light, in the same pose and in others (paper, Table 1).
 
-A pair of a prepared dataset is taken as a user's photo is: its source is unwrapped by its fit, the method
-relights it by one light of the target camera's stack, and the texture is rendered into that camera's crop.
-Beside the methods stands a naive twin, 'lambert': the source's own texture under the light's cosine.
+Each pair of a prepared dataset is a user's photo: its source is unwrapped by its fit and relit by one light
+of the target camera's stack. In the same pose the image is that of `facerf relight`, the photo with its face
+relit; in another pose it is the face alone, as with `--pose`. The naive method 'lambert' is the source's own
+texture under the cosine of the light.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.composite import Composition, Target
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.methods import Method, angle_class, angle_of, turn_class
-from facerf_cli.evaluation.people import Person, Shot
+from facerf_cli.evaluation.crop_view import angle_class, angle_of, turn_class
+from facerf_cli.evaluation.methods import Method
+from facerf_cli.evaluation.people import CameraCrop, Person
+from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.light.sphere import direction_to_azel
+from facerf_cli.light.sphere import RigLight, direction_to_azel
 from facerf_cli.metrics import tone_drift_deg
-from facerf_cli.pipeline import turn_to
 
 LAMBERT = "lambert"
 _NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shape
+_WHITE = torch.ones(1, 1, 3)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Question:
-    """A pair's target: its light [3], the turn [3, 3] to its pose, and its crop."""
+    """A pair's target: its light [3], the turn [3, 3] of the head to its pose, and its crop."""
 
     light: Tensor
     turn: Tensor
-    shot: Shot
+    crop: CameraCrop
+    same_pose: bool
 
 
 @torch.no_grad()
 def compare_olats(
-    person: Person, pairs: Iterable[Pair], methods: Sequence[Method], held_to_photo: bool
+    person: Person, pairs: Iterable[Pair], methods: Sequence[Method], network_alone: bool
 ) -> Iterator[Comparison]:
-    """The person's pairs: each method's picture under one light beside the stack's own, unclipped."""
+    """The person's pairs: each method's image under one light next to the stack's own, unclipped."""
     for pair in pairs:
-        source = person.shot(pair.source_camera)
-        shot = person.posed_as(source.view.fit, pair.target_camera)
-        light = torch.from_numpy(shot.header.directions[pair.target_light]).float()
-        asked = _Question(light, turn_to(source.view.fit, shot.view.fit.rotation), shot)
-        yield _compare(person, pair, asked, methods, held_to_photo)
+        fit = person.crop(pair.source_camera).view.fit
+        crop = person.posed_as(fit, pair.target_camera)
+        light = torch.from_numpy(crop.header.directions[pair.target_light]).float()
+        same_pose = pair.source_camera == pair.target_camera
+        asked = _Question(light, crop.view.fit.rotation @ fit.rotation.T, crop, same_pose)
+        yield _compare(person, pair, asked, methods, network_alone)
 
 
 def _compare(
-    person: Person, pair: Pair, asked: _Question, methods: Sequence[Method], held_to_photo: bool
+    person: Person, pair: Pair, asked: _Question, methods: Sequence[Method], network_alone: bool
 ) -> Comparison:
-    image, face = person.source(pair)
-    fit, white = person.shot(pair.source_camera).view.fit, torch.ones(1, 1, 3)
-    cosine = torch.einsum("c,cd,dij->ij", asked.light, asked.turn, face.normals).clamp_min(0)
-    textures = {
-        method.name: method.reflectance(fit, face, held_to_photo).relit(asked.light[None], white, asked.turn)[
-            0
-        ]
+    image = person.source(pair)
+    head, view = person.head(pair, image), asked.crop.view
+    photo = image if asked.same_pose else None
+    target = Target() if asked.same_pose else Target(view.fit, "face")
+    directions = asked.light[None]
+    predictions = {
+        method.name: next(method.images(photo, head, directions, _WHITE, target, network_alone))
         for method in methods
     }
-    textures[LAMBERT] = face.texture * cosine
+    predictions[LAMBERT] = _lambert(person, head, asked)
     stack = person.dataset.stack_path(pair.subject, pair.target_camera)
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
-    view = asked.shot.view
-    predictions = {name: view.image(texture) for name, texture in textures.items()}
     comparison = Comparison(
         Case(f"{pair.subject}/{pair.index:05d}", pair.subject, _facts(person, pair, asked)),
         truth.permute(1, 2, 0).numpy(),
@@ -74,13 +78,20 @@ def _compare(
     return _with_drift(comparison, person.albedo, view.region("skin"))
 
 
+def _lambert(person: Person, head: Head, asked: _Question) -> np.ndarray:
+    """The source's texture under the light's cosine, rendered in the target's crop."""
+    cosine = torch.einsum("c,cd,dij->ij", asked.light, asked.turn, head.face.normals).clamp_min(0)
+    composition = Composition(person.model, None, head, Target(asked.crop.view.fit, "face"))
+    return composition.image(RigLight(asked.light[None], _WHITE[0]), head.face.texture * cosine).pixels
+
+
 def _facts(person: Person, pair: Pair, asked: _Question) -> dict[str, str | float]:
-    light, same = asked.light, pair.source_camera == pair.target_camera
+    light = asked.light
     turn_deg = angle_of(asked.turn)
     angle_deg = float(torch.rad2deg(light[2].clamp(-1, 1).acos()))
     azimuth_deg, elevation_deg = direction_to_azel(light)
     return {
-        "pose": "same pose" if same else "different pose",
+        "pose": "same pose" if asked.same_pose else "different pose",
         "angle": angle_class(angle_deg),
         "turn": turn_class(turn_deg),
         **person.facts,
@@ -92,7 +103,7 @@ def _facts(person: Person, pair: Pair, asked: _Question) -> dict[str, str | floa
 
 
 def _with_drift(comparison: Comparison, albedo: np.ndarray | None, skin: np.ndarray) -> Comparison:
-    """With the drift of the skin's tone (ITA on true albedo), where the light is near the camera's axis."""
+    """Add the drift of the skin tone (ITA on true albedo) if the light is near the camera's axis."""
     near = float(comparison.case.facts["angle_deg"]) <= _NEAR_AXIS_DEG
     if albedo is None or not near:
         return comparison
@@ -101,4 +112,4 @@ def _with_drift(comparison: Comparison, albedo: np.ndarray | None, skin: np.ndar
         drift = tone_drift_deg(image, comparison.truth, skin * comparison.mask, albedo)
         if drift is not None:
             extra[name] = {"tone_drift_deg": abs(drift), "tone_shift_deg": drift}
-    return Comparison(**{**comparison.__dict__, "extra": extra})
+    return replace(comparison, extra=extra)

@@ -13,7 +13,8 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.evaluation.case import Case, Comparison, Facts, folder_name, read_array, read_facts
+from facerf_cli.evaluation import folder_name
+from facerf_cli.evaluation.case import Case, Comparison, Facts, read_array, read_facts
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import LinearImage, read_image
 

@@ -1,6 +1,7 @@
-"""Photos explained by a method's reflectance and light, and put together again (paper, Table 2).
+"""Photos explained by a method's reflectance and light, and rendered again (paper, Table 2).
 
-The field is taken as the network has it: held to its photo it would be exact by construction.
+The face is rendered alone, by the network's own field: with the photo's correction or the photo's own detail
+it would be right by construction.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,34 +10,42 @@ import numpy as np
 import torch
 
 from facerf_cli.colour import luminance
+from facerf_cli.composite import Target
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.methods import Method, View, relit_by
+from facerf_cli.evaluation.crop_view import CropView
+from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person
+from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.metrics import light_error_deg
-from facerf_cli.pipeline import FaceTexture
 
 
 @torch.no_grad()
 def reconstruct(
     case: Case,
-    view: View,
-    image: np.ndarray,
-    face: FaceTexture,
+    view: CropView,
+    head: Head,
     methods: Sequence[Method],
     true_light: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Comparison:
-    """A picture [S, S, 3] of the view beside each method's own.
+    """A head's crop next to each method's reconstruction.
 
     `true_light`, directions [L, 3] and weights [L, 3], gives each the error of its brightest direction.
     """
     predictions, extra = {}, {}
     for method in methods:
-        explained = method.explained(view.fit, face)
-        predictions[method.name] = view.image(relit_by(explained.reflectance, explained))
-        extra[method.name] = light_errors(explained.light, true_light)
+        predictions[method.name], light = reconstruction(method, head)
+        extra[method.name] = light_errors(light, true_light)
+    image = head.cropped
     return Comparison(case, image, view.mask, predictions, image, view.fit.landmarks_px.numpy(), extra)
+
+
+def reconstruction(method: Method, head: Head) -> tuple[np.ndarray, RigLight]:
+    """The face rendered by its own reflectance under its own light [S, S, 3], and that light."""
+    explained = method.explained(head)
+    target = Target(head.fit, "face")
+    return method.image(head, explained.reflectance, explained.light, target), explained.light
 
 
 def reconstruct_person(
@@ -44,14 +53,14 @@ def reconstruct_person(
 ) -> Iterator[Comparison]:
     """The sources of a person's pairs."""
     for pair in pairs:
-        image, face = person.source(pair)
         case = Case(f"{pair.subject}/{pair.index:05d}", pair.subject, person.facts | {"map": pair.envmap})
-        view = person.shot(pair.source_camera).view
-        yield reconstruct(case, view, image, face, methods, person.light(pair))
+        head = person.head(pair, person.source(pair))
+        view = person.crop(pair.source_camera).view
+        yield reconstruct(case, view, head, methods, person.light(pair))
 
 
 def light_errors(light: RigLight, truth: tuple[np.ndarray, np.ndarray] | None) -> dict[str, float]:
-    """'light_error_deg' between the brightest single lights; nothing where the truth is not known."""
+    """'light_error_deg' between the brightest single lights; empty if the truth is not known."""
     if truth is None:
         return {}
     found = brightest(light.directions.numpy(), light.weights.numpy())

@@ -1,65 +1,66 @@
-"""Two pictures of one person in different poses and lights, reflectances exchanged (paper, Table 2).
+"""Two images of one person in different poses and lights, with their reflectances exchanged (paper, Table 2).
 
-Picture A is made of B's reflectance, turned to A's pose, on A's fitted mesh under A's light; the light is
-that which the same method finds with A's own reflectance. So what is measured is a reflectance where it was
-not read off.
+Image A is rendered from B's reflectance, turned to A's pose, on A's fitted mesh under A's light; the same
+method estimates that light with A's own reflectance. So a reflectance is measured where it was not read.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 
 from facerf_cli.baselines.base import Explained
+from facerf_cli.composite import Target
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.methods import Method, View, angle_of, relit_by, turn_class
+from facerf_cli.evaluation.crop_view import CropView, angle_of, turn_class
+from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person
-from facerf_cli.pipeline import FaceTexture, turn_to
+from facerf_cli.face.head import Head
 
 Sides = tuple["Side", "Side"]
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of two pictures [S, S, 3], its view and its texture, and what its comparison is called."""
+    """One of two images: the name of its comparison, its view and its head."""
 
     case: Case
-    view: View
-    image: np.ndarray
-    face: FaceTexture
+    view: CropView
+    head: Head
 
 
 @torch.no_grad()
-def transfer(sides: Sides, methods: Sequence[Method], held_to_photo: bool = False) -> Iterator[Comparison]:
-    """Both pictures, each by the other's reflectance, which may be held to that other photo."""
+def transfer(sides: Sides, methods: Sequence[Method], network_alone: bool = True) -> Iterator[Comparison]:
+    """Both images, each by the other's reflectance."""
     explained = [
-        {method.name: method.explained(side.view.fit, side.face, held_to_photo) for method in methods}
-        for side in sides
+        {method.name: method.explained(side.head, network_alone) for method in methods} for side in sides
     ]
     for side, own, other, others in zip(sides, explained, sides[::-1], explained[::-1], strict=True):
-        yield _made_of(side, own, other, others)
+        yield _rendered(side, own, other, others, methods)
 
 
-def _made_of(
-    side: Side, own: Mapping[str, Explained], other: Side, others: Mapping[str, Explained]
+def _rendered(
+    side: Side,
+    own: Mapping[str, Explained],
+    other: Side,
+    others: Mapping[str, Explained],
+    methods: Sequence[Method],
 ) -> Comparison:
-    """A picture by its own light and the other's reflectance."""
-    view = side.view
-    turn = turn_to(other.view.fit, view.fit.rotation)
+    """An image from its own light and the other's reflectance."""
+    view, target = side.view, Target(side.view.fit, "face")
     predictions = {
-        name: view.image(relit_by(others[name].reflectance, explained, turn))
-        for name, explained in own.items()
+        method.name: method.image(other.head, others[method.name].reflectance, own[method.name].light, target)
+        for method in methods
     }
-    turn_deg = angle_of(turn)
+    turn_deg = angle_of(view.fit.rotation @ other.view.fit.rotation.T)
     facts = {**side.case.facts, "turn": turn_class(turn_deg), "turn_deg": turn_deg}
     return Comparison(
         replace(side.case, facts=facts),
-        side.image,
+        side.head.cropped,
         view.mask,
         predictions,
-        other.image,
+        other.head.cropped,
         view.fit.landmarks_px.numpy(),
     )
 
@@ -68,24 +69,22 @@ def transfer_person(
     person: Person,
     couples: Iterable[tuple[Pair, Pair]],
     methods: Sequence[Method],
-    held_to_photo: bool = False,
+    network_alone: bool = True,
 ) -> Iterator[Comparison]:
     """Couples of the sources of a person's pairs."""
     for first, second in couples:
-        yield from transfer(
-            (_side(person, first, second), _side(person, second, first)), methods, held_to_photo
-        )
+        sides = _side(person, first, second), _side(person, second, first)
+        yield from transfer(sides, methods, network_alone)
 
 
 def _side(person: Person, pair: Pair, other: Pair) -> Side:
-    image, face = person.source(pair)
     name = f"{pair.subject}/{pair.index:05d}_by_{other.index:05d}"
-    facts = person.facts | {"map": pair.envmap}
-    return Side(Case(name, pair.subject, facts), person.shot(pair.source_camera).view, image, face)
+    case = Case(name, pair.subject, person.facts | {"map": pair.envmap})
+    return Side(case, person.crop(pair.source_camera).view, person.head(pair, person.source(pair)))
 
 
 def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
-    """A person's pairs two by two, each once: sources of different cameras and different maps, in order."""
+    """Pair up a person's pairs, each once, in order: sources of different cameras and different maps."""
     couples: list[tuple[Pair, Pair]] = []
     waiting: list[Pair] = []
     for pair in pairs:

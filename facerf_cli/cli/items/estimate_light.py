@@ -1,0 +1,156 @@
+"""The light of one photo: estimated, and written as a map, as JSON and as an image to look at."""
+
+import logging
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.items.light_image import draw_estimate
+from facerf_cli.cli.items.photo import (
+    FittedFace,
+    directions_of,
+    fit_faces,
+    load_models_once,
+    prepare_photos,
+    provenance,
+    read_matte,
+    read_photo,
+)
+from facerf_cli.cli.light_options import LightOptions
+from facerf_cli.errors import InputError
+from facerf_cli.face.head import Head
+from facerf_cli.files.images import LinearImage, write_display, write_exr
+from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.sh import CONVENTION, rig_coefficients
+from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.pipeline import LightEstimate, estimate_light
+from facerf_cli.training.pretrained import load_light_features, load_vgg
+
+LIGHT_FEATURES = Path(__file__).parents[2] / "assets" / "light_features.safetensors"
+_UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
+log = logging.getLogger(LOGGER_NAME)
+
+
+def prepare_light(options: LightOptions) -> None:
+    """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
+    prepare_photos(options.photo)
+    if options.refine == "features":
+        _feature_network(options.vgg_weights)
+
+
+def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
+    """Estimate and write the light of each chosen face of a photo; their tags, and facts for the report."""
+    image = read_photo(item, options.photo)
+    faces = fit_faces(item, image, options.photo)
+    facts = [_write(item, image, face, options, width_px, sh_order) for face in reversed(faces)][::-1]
+    return [face.tag for face in faces], facts[0] if len(facts) == 1 else {"faces": facts}
+
+
+@cache
+def light_of_photo(path: Path, options: LightOptions) -> RigLight:
+    """The light of the (largest) face of a photo on disk, estimated once a process."""
+    item = Item(path, Path(path.stem), path.stem)
+    image = read_photo(item, options.photo)
+    face = fit_faces(item, image, options.photo)[0]
+    return _estimate(path, image, face.head, options)[0].light
+
+
+def _estimate(
+    path: Path, image: LinearImage, head: Head, options: LightOptions
+) -> tuple[LightEstimate, dict[str, Any]]:
+    """The light of one fitted face, and facts for the report."""
+    models = load_models_once(options.photo)
+    features, name = _feature_network(options.vgg_weights) if options.refine == "features" else (None, None)
+    try:
+        estimate = estimate_light(
+            models,
+            _unmasked(image, head, options),
+            options.reflectance,
+            directions_of(options.rig),
+            options.non_negative,
+            features,
+            options.keep_eyes,
+        )
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    residual = estimate.evidence.residual(estimate.explained)
+    if residual > _UNEXPLAINED:
+        log.warning(
+            "%s: no light explains this face well (%.0f %% of it is left over); look at _light.png: perhaps "
+            "the fit is off, or it is not a face",
+            path,
+            100 * residual,
+        )
+    return estimate, _facts(estimate, residual, options, name)
+
+
+def _unmasked(image: LinearImage, head: Head, options: LightOptions) -> Head:
+    """The head without what the photo's alpha or --matte leaves out."""
+    masks = [] if image.alpha is None else [image.alpha]
+    if options.matte is not None:
+        masks.append(read_matte(options.matte, image.pixels.shape[:2]))
+    for mask in masks:
+        in_crop = head.fit.crop.apply(mask[..., None])[..., 0]
+        head = head.without(load_models_once(options.photo).face, in_crop)
+    return head
+
+
+def _facts(
+    estimate: LightEstimate, residual: float, options: LightOptions, features: str | None
+) -> dict[str, Any]:
+    light, evidence = estimate.light, estimate.evidence
+    azel_deg = [round(float(angle), 1) for angle in direction_to_azel(brightest_direction(light))]
+    facts: dict[str, Any] = {
+        "reflectance": options.reflectance,
+        "brightest_azel_deg": azel_deg,
+        "residual": round(residual, 4),
+        "clipped": round(float(evidence.clipped.any(0).sum() / evidence.mask.sum()), 4),
+        "texels": int(evidence.mask.sum()),
+        "lights": len(light.directions),
+    }
+    if options.reflectance != "field":
+        return facts | {"non_negative": bool((light.weights >= 0).all())}
+    facts |= {"non_negative": options.non_negative, "features": features}
+    if (refined := estimate.refined) is not None and estimate.least_squares is not None:
+        facts |= {
+            "feature_loss": [float(f"{loss:.4g}") for loss in (refined.loss_before, refined.loss_after)],
+            "refine_steps": refined.steps,
+            "residual_before": round(evidence.residual(evidence.relit(estimate.least_squares)), 4),
+        }
+    return facts
+
+
+@cache
+def _feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
+    """V_f if its weights were given, else the shipped S_f; and its name for the report."""
+    if vgg_weights is not None:
+        return load_vgg(vgg_weights), "V_f (VGG-16, ImageNet)"
+    return load_light_features(LIGHT_FEATURES), "S_f (shipped)"
+
+
+def _write(
+    item: Item, image: LinearImage, face: FittedFace, options: LightOptions, width_px: int, sh_order: int
+) -> dict[str, Any]:
+    estimate, facts = _estimate(item.input_path, image, face.head, options)
+    models = load_models_once(options.photo)
+    said = {f"facerf:light_{name}": _as_metadata(value) for name, value in facts.items()}
+    metadata = provenance(item, options.photo, models.checkpoint_name) | said
+    envmap = rig_to_latlong(estimate.light, width_px // 2)
+    base = item.output(f"{face.tag}_light")
+    write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
+    light, rig = estimate.light, f"--lights {options.rig}"
+    harmonics = Harmonics(rig_coefficients(light, sh_order), CONVENTION)
+    record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
+    write_light(base.with_name(base.name + ".json"), record)
+    shown = draw_estimate(face.head, models.face, estimate.explained, envmap)
+    write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
+    return face.facts() | facts
+
+
+def _as_metadata(value: Any) -> str | int | float:
+    """A fact as a file's header can hold it: a word or a number."""
+    return value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))

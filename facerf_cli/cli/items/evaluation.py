@@ -1,0 +1,125 @@
+"""What the protocols of `facerf evaluate` measure: people of a dataset or photos, and the methods."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from facerf_cli.baselines import Kind
+from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.items.photo import face_model as face_model_of
+from facerf_cli.cli.items.photo import fit_faces, load_models_once, read_photo
+from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import Pair, read_pairs
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.case import Case
+from facerf_cli.evaluation.methods import Method
+from facerf_cli.evaluation.people import Portrait, evenly
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.models import load_models
+
+
+@dataclass(frozen=True)
+class MethodOptions:
+    """Which methods are compared; settings only, so that it can be sent to other processes."""
+
+    photo: PhotoOptions
+    reflectance: tuple[Kind, ...]
+    against: tuple[Path, ...]
+
+    @staticmethod
+    def of(photo: PhotoOptions, options: EvaluateOptions) -> "MethodOptions":
+        """The methods of the shared options."""
+        return MethodOptions(photo, options.reflectance, options.against)
+
+
+@cache
+def load_methods(options: MethodOptions) -> tuple[Method, ...]:
+    """The methods, in the order of their names, once a process."""
+    models = load_models_once(options.photo)
+    against = (load_models(path, options.photo.face_model, models.device) for path in options.against)
+    return (
+        *(Method(kind, kind, models) for kind in options.reflectance),
+        *(Method(path.stem, "field", other) for path, other in zip(options.against, against, strict=True)),
+    )
+
+
+def load_before(methods: MethodOptions, options: EvaluateOptions) -> None:
+    """Load the methods before any item, so that an error of a checkpoint is reported once."""
+    if not options.dry_run:
+        load_methods(methods)
+
+
+def read_split(
+    folder: Path, split: str, face_model: str, refit: bool
+) -> tuple[Dataset, dict[str, list[Pair]]]:
+    """A dataset and a split's pairs by person; UsageError if there are none, or for another face model."""
+    dataset = read_dataset(folder)
+    if not refit and load_face_model(face_model).name != dataset.face_model:
+        raise UsageError(f"{folder}: fitted with {dataset.face_model}; give that as --face-model, or --refit")
+    pairs: dict[str, list[Pair]] = {}
+    for pair in read_pairs(dataset):
+        if split in ("all", pair.split):
+            pairs.setdefault(pair.subject, []).append(pair)
+    if not pairs:
+        raise UsageError(
+            f"{folder}: no pairs in the split {split}; run facerf relight-dataset, or give another --split"
+        )
+    return dataset, pairs
+
+
+def every_nth(pairs: Mapping[str, Sequence[Pair]], step: int) -> dict[str, list[Pair]]:
+    """Every Nth of all pairs in their order, by subject."""
+    flat = [pair for of_subject in pairs.values() for pair in of_subject][::step]
+    return {name: kept for name in pairs if (kept := [pair for pair in flat if pair.subject == name])}
+
+
+def chosen_sources(
+    folder: Path, pairs: Mapping[str, Sequence[Pair]], options: EvaluateOptions, every: int, preset: int
+) -> dict[str, list[Pair]]:
+    """Choose the pairs whose sources are reconstructed: every Nth, or a preset's number of all people."""
+    if not options.preset:
+        return every_nth(pairs, every)
+    require_enough(sum(map(len, pairs.values())), preset, "sources", folder, preset / len(pairs))
+    return evenly(pairs, preset)
+
+
+def require_enough(found: int, needed: int, what: str, dataset: Path, per_subject: float) -> None:
+    """Raise UsageError where a preset needs more than a split has; `per_subject` pairs are enough."""
+    if found >= needed:
+        return
+    raise UsageError(
+        f"{dataset}: the split has {found} {what}, --preset paper measures {needed}; run facerf "
+        f"relight-dataset {dataset} --envmaps procedural:160 --per-subject {math.ceil(1.1 * per_subject)} "
+        "--overwrite, or prepare more people"
+    )
+
+
+def people_items(dataset: Path, subjects: Sequence[str], output: Path) -> list[Item]:
+    """An item for each person."""
+    return [Item(dataset / "olat" / name, output / "cases" / name, name) for name in sorted(subjects)]
+
+
+def photo_items(inputs: Sequence[str], options: EvaluateOptions, preset: int) -> list[Item]:
+    """The photos of the inputs; of a preset the first ones."""
+    items = collect_items(inputs, options.output, PHOTO_SUFFIXES)
+    if not options.preset:
+        return items
+    if len(items) < preset:
+        raise UsageError(f"{len(items)} photos, --preset paper measures {preset}; give a folder of more")
+    return items[:preset]
+
+
+def portraits(item: Item, photo: PhotoOptions, keep_eyes: bool) -> Iterator[tuple[Case, Portrait]]:
+    """Yield the chosen faces of a photo; each counts as a person."""
+    image = read_photo(item, photo)
+    for face in fit_faces(item, image, photo):
+        name = f"{item.name}{face.tag}"
+        try:
+            portrait = Portrait.of(face_model_of(photo), image, face.landmarks_px, face.head, keep_eyes)
+        except InputError as error:
+            raise InputError(f"{item.input_path}: {error}") from None
+        yield Case(name, name, {"quality": face.fit.quality}), portrait

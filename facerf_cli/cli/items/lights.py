@@ -1,0 +1,116 @@
+"""Light setups as weights of lights: their maps read, drawn or estimated from a photo."""
+
+import logging
+from collections.abc import Iterable, Sequence
+from functools import cache, lru_cache
+from itertools import groupby
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from facerf_cli.cli.items.estimate_light import light_of_photo
+from facerf_cli.cli.items.photo import directions_of, face_model
+from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.light_files import face_model_of_map, read_map_file
+from facerf_cli.light.envmap import ball, rotated_weights
+from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.logs import LOGGER_NAME, Provenance
+from facerf_cli.synth.sky.skies import draw_sky
+
+_DRAWN_WIDTH_PX = 512  # of a procedural map
+_LIGHT_WIDTH_PX = 512  # of the map of a photo's light
+_BALL_PX = 256
+log = logging.getLogger(LOGGER_NAME)
+
+
+def readable(setups: Iterable[LightSetup]) -> tuple[LightSetup, ...]:
+    """The setups whose maps can be read; each map that cannot is logged in one line."""
+    good: list[LightSetup] = []
+    for envmap, group in groupby(setups, lambda setup: setup.envmap):
+        try:
+            if isinstance(envmap, (Path, PhotoLight)):
+                read_map(envmap)
+            good += group
+        except InputError as error:
+            log.error("%s", error)
+    return tuple(good)
+
+
+def read_map(envmap: Path | DrawnMap | PhotoLight) -> Tensor:
+    """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
+    if isinstance(envmap, PhotoLight):
+        return _map_of_photo(envmap)
+    if isinstance(envmap, DrawnMap):
+        return torch.from_numpy(draw_sky(envmap.index, envmap.seed, _DRAWN_WIDTH_PX)[0])
+    return read_map_file(envmap)
+
+
+@cache
+def _map_of_photo(photo: PhotoLight) -> Tensor:
+    """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
+    return rig_to_latlong(light_of_photo(photo.path, photo.options), _LIGHT_WIDTH_PX // 2).half().float()
+
+
+@lru_cache(maxsize=1)
+def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    """Directions [L, 3] and rgb weights [M, L, 3] of M setups.
+
+    Maps are integrated over the rig's lights; single lights follow them as lights of their own.
+    """
+    single = [(row, light) for row, setup in enumerate(setups) for light in setup.lights]
+    directions = directions_of(rig) if any(setup.envmap for setup in setups) else torch.zeros(0, 3)
+    weights = torch.zeros(len(setups), len(directions) + len(single), 3)
+    weights[:, : len(directions)] = _map_weights(setups, directions, sampling)
+    for column, (row, light) in enumerate(single, len(directions)):
+        weights[row, column] = torch.tensor(light[2:])
+    own = [azel_to_direction(*light[:2]) for _, light in single]
+    return torch.cat([directions, *(direction[None] for direction in own)]), weights
+
+
+def weights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
+    """Weights [M, L, 3] of M setups over a stack's lights [L, 3]; a single light is moved to the nearest."""
+    weights = _map_weights(setups, directions, sampling)
+    for row, setup in enumerate(setups):
+        for light in setup.lights:
+            nearest = int((directions @ azel_to_direction(*light[:2])).argmax())
+            weights[row, nearest] += torch.tensor(light[2:])
+    return weights
+
+
+def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
+    """[M, L, 3], zero for setups without a map; a map is read once for all its rotations."""
+    weights = torch.zeros(len(setups), len(directions), 3)
+    for envmap, group in groupby(enumerate(setups), lambda row: row[1].envmap):
+        rows = list(group)
+        if envmap is not None:
+            angles = [setup.rotate_deg for _, setup in rows]
+            weights[[row for row, _ in rows]] = rotated_weights(
+                read_map(envmap), directions, angles, sampling
+            )
+    return weights
+
+
+def write_balls(setups: Sequence[LightSetup], paths: Sequence[Path], exposure_ev: float | None) -> None:
+    """Write, as EXR and PNG, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
+    for setup, path in zip(setups, paths, strict=True):
+        assert setup.envmap is not None
+        envmap = read_map(setup.envmap)
+        both = [ball(envmap, _BALL_PX, kind, setup.rotate_deg) for kind in ("mirror", "diffuse")]
+        pixels = torch.cat(both, 1).numpy()
+        metadata = _metadata_of(setup.envmap)
+        write_exr(path, pixels, metadata=metadata)
+        shown_ev: float | Literal["auto"] = "auto" if exposure_ev is None else exposure_ev
+        write_display(path.with_suffix(".png"), pixels, shown_ev, metadata=metadata)
+
+
+def _metadata_of(envmap: Path | DrawnMap | PhotoLight) -> dict[str, str | int]:
+    """Metadata of an image that shows a light; an estimated light depends on the face model."""
+    if isinstance(envmap, PhotoLight):
+        return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
+    made = Provenance(envmap.name).attributes()
+    return made if isinstance(envmap, DrawnMap) else {**made, **face_model_of_map(envmap)}

@@ -1,0 +1,111 @@
+"""The OLAT stack of one photo's face, and its contact sheet."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.items.photo import (
+    FittedFace,
+    directions_of,
+    facts_of,
+    fit_faces,
+    load_models_once,
+    provenance,
+    read_photo,
+    rotation_of,
+)
+from facerf_cli.cli.predict_olat import PredictOlat
+from facerf_cli.face.fit import FaceFit, fit_to_arrays
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.face.view import render_face, see_face
+from facerf_cli.files.drawings import contact_sheet, mark_light
+from facerf_cli.files.images import write_display
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.pipeline import predict_olat
+from facerf_cli.raster.camera import crop_camera
+
+_TILE_PX = 128  # of the contact sheet
+
+
+def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, Any]]:
+    """Predict and write the stack of each chosen face of a photo; the files, and facts for the report."""
+    directions = directions_of(work.lights)
+    faces = fit_faces(item, read_photo(item, work.photo), work.photo)
+    outputs: list[Path] = []
+    for face in reversed(faces):
+        stack, sheet = work.files_of(item, face.tag)
+        header = _header(item, face, directions, work)
+        tiles: list[np.ndarray] = []
+        write_olat_stack(stack, header, _olats(face, directions, work, tiles))
+        write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
+        outputs += [stack, sheet]
+    return outputs, facts_of(faces) | {"lights": len(directions)}
+
+
+def _olats(
+    face: FittedFace, directions: Tensor, work: PredictOlat, tiles: list[np.ndarray]
+) -> Iterator[Tensor]:
+    """Yield OLATs in batches [l, 3, H, W], textures or images; small images [l, h, w, 3] go to `tiles`."""
+    models = load_models_once(work.photo)
+    large, small = _see(face, work), _see(face, work, 2 * _TILE_PX)
+    olats = predict_olat(
+        models,
+        face.head,
+        directions,
+        rotation_of(work.pose),
+        work.network_alone,
+        work.memory_bytes,
+        work.precision == "bf16",
+    )
+    for textures in olats:
+        tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
+        yield render_face(textures, *large) if work.image else textures
+
+
+def _see(face: FittedFace, work: PredictOlat, side_px: int | None = None) -> tuple[Tensor, Tensor]:
+    """`see_face` in the asked pose, by the crop's camera, its image `side_px` wide."""
+    vertices = _posed(face, work).vertices_camera(load_models_once(work.photo).face)
+    return see_face(vertices, crop_camera(side_px or face.fit.crop.size_px))
+
+
+def _posed(face: FittedFace, work: PredictOlat) -> FaceFit:
+    rotation = rotation_of(work.pose)
+    return face.fit if rotation is None else replace(face.fit, rotation=rotation)
+
+
+def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat) -> StackHeader:
+    posed, uv_maps = _posed(face, work), face.head.face
+    source, normals, seen = uv_maps.texture, uv_maps.normals, uv_maps.visible
+    if work.image:
+        uv, seen = _see(face, work)
+        turn = posed.rotation @ face.fit.rotation.T
+        both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
+        source, normals = render_face(both, uv, seen)
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    return StackHeader(
+        kind="image" if work.image else "texture",
+        directions=directions.numpy(),
+        rotation=posed.rotation.numpy(),
+        source=source.permute(1, 2, 0).numpy(),
+        seen=seen.numpy(),
+        normals=normals.permute(1, 2, 0).numpy(),
+        layout_version=LAYOUT_VERSION,
+        fit=fit_to_arrays(face.fit),
+        metadata=metadata,
+    )
+
+
+def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarray:
+    """Every light's image, with a mark at the light's direction."""
+    images = np.concatenate(tiles)
+    white = float(np.percentile(images, 99.5))
+    for image, direction in zip(images, directions, strict=True):
+        mark_light(image, direction, white)
+    return contact_sheet(images)

@@ -1,0 +1,70 @@
+"""The face of a photo: its crop, the fitted face model, and its texture in UV space."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import grid_triangles
+from facerf_cli.raster.texture import inpaint, normal_map, unwrap
+
+_INSIDE_PHOTO = 0.99  # share of a texel's pixels that lie inside the photo, from which on it is visible
+_SEEN_WELL = 0.9  # share of a texel that a mask must show
+
+
+@dataclass(frozen=True)
+class FaceTexture:
+    """A photo in UV space: texture [3, T, T], hidden texels filled; visible [T, T]; normals [3, T, T].
+
+    The texture is scene-linear, `visible` in 0..1; normals are unit vectors in camera space.
+    """
+
+    texture: Tensor
+    visible: Tensor
+    normals: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """The face of a photo: its crop [S, S, 3], scene-linear, the fitted face model, and its texture."""
+
+    cropped: np.ndarray
+    fit: FaceFit
+    face: FaceTexture
+
+    def without(self, model: MorphableModel, mask: np.ndarray) -> "Head":
+        """The head without the texels that a mask [S, S] of the crop, 0..1, does not show.
+
+        They are filled from those around them. Raises InputError where nothing of the face is left.
+        """
+        side = self.face.texture.shape[-1]
+        image = torch.from_numpy(mask.astype(np.float32))[None]
+        vertices = self.fit.vertices_camera(model)
+        kept = unwrap(image, vertices, grid_triangles(), self.fit.camera, side)[0][0]
+        visible = self.face.visible * (kept > _SEEN_WELL)
+        if visible.max() < 0.5:
+            raise InputError("the face is masked out: nothing of it is left to look at; give another matte")
+        texture = inpaint(self.face.texture, visible)
+        return replace(self, face=replace(self.face, texture=texture, visible=visible))
+
+
+def unwrap_face(
+    model: MorphableModel, fit: FaceFit, cropped: np.ndarray, side: int, photo_shape: tuple[int, ...]
+) -> FaceTexture:
+    """Unwrap the crop [S, S, 3] of a photo [H, W, ...] to `side` texels (paper, 'Network Architecture').
+
+    Raises InputError where the fitted face lies outside the photo.
+    """
+    vertices = fit.vertices_camera(model)
+    inside = fit.crop.valid(*photo_shape[:2])  # outside the photo the crop only repeats its border
+    image = torch.from_numpy(np.dstack([cropped, inside.astype(np.float32)])).permute(2, 0, 1)
+    unwrapped, visible = unwrap(image, vertices, grid_triangles(), fit.camera, side)
+    texture, visible = unwrapped[:3], visible * (unwrapped[3] > _INSIDE_PHOTO)
+    if visible.max() < 0.5:
+        raise InputError("the fitted face lies outside the image; give its landmarks with --landmarks")
+    normals = normal_map(vertices, grid_triangles(), side)
+    return FaceTexture(inpaint(texture, visible), visible, normals)
