@@ -22,8 +22,8 @@ from capture_copy import Copy
 from scipy import ndimage
 
 from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.checks.align import with_alignment
 from facerf_cli.capture.checks.findings import frames_left_out
-from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.yale_b import read_shifts

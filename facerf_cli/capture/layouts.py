@@ -1,14 +1,12 @@
-"""The Extended Yale Face Database B as a capture: one camera, 64 flashes, the lights in the files' names.
+"""Readers of capture layouts: `stage.json`, and the Extended Yale Face Database B.
 
-Nothing in the database calibrates its camera, and the cropped pictures were cut out and scaled by hand. So
-this is a stated guess: focal length `FOCAL_PX`, the principal point in the picture's middle, square pixels.
-The flashes' angles are relative to the camera's axis, so the world is the camera's own space. All flashes
-count as equally bright, with intensity 1: the unit of light is unknown, too.
+Extended Yale B has one camera and 64 flashes, whose directions are in the file names. Nothing calibrates the
+camera, and the cropped images were cut out and scaled by hand, so a documented guess stands in: focal length
+`FOCAL_PX`, principal point in the middle, square pixels. The flashes' angles are relative to the camera's
+axis, so world space is camera space. All flashes have intensity 1; the unit of light is unknown.
 
-Pictures that the database marks as damaged (`.bad`) are `Capture.marked`. Those that are damaged without a
-mark are in it like the others: the checks are to find them.
-
-How captures of light stages lie on disk: an adapter for each layout that can be run here.
+Images that the database marks as damaged (`.bad`) become `Capture.marked`. Damaged images without that mark
+are kept: the checks of a capture find them.
 """
 
 from collections.abc import Callable
@@ -25,12 +23,12 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 
 CAMERA = "P00"  # the frontal pose, the only one of the cropped database
-FOCAL_PX = 1000.0
+FOCAL_PX = 1000.0  # at a distance of a metre, a face then fills the image
 _LICENCE = "Extended Yale Face Database B: free for research (Georghiades et al. 2001; Lee et al. 2005)"
 
 
 def read_yale_capture(folder: Path) -> Capture:
-    """The database in a folder as a capture; no pictures are decoded yet."""
+    """Read the database in a folder as a capture; no images are decoded yet."""
     database = read_yale_b(folder, leave_out={})
     marked = {subject: _marked(database, subject) for subject in database.subjects}
     flashes = sorted({flash for found in (*database.files.values(), *marked.values()) for flash in found})
@@ -42,7 +40,7 @@ def read_yale_capture(folder: Path) -> Capture:
         light_ids=tuple(flash.name for flash in flashes),
         directions_world=np.stack([flash.direction for flash in flashes]),
         intensities=np.ones((len(flashes), 3)),
-        cameras={CAMERA: guessed_camera()},
+        cameras={CAMERA: guess_camera()},
         subjects={subject: {} for subject in database.subjects},
         provenance={
             "database": "Extended Yale Face Database B, cropped",
@@ -57,8 +55,8 @@ def read_yale_capture(folder: Path) -> Capture:
     )
 
 
-def guessed_camera() -> PosedCamera:
-    """The camera of the cropped pictures, at the world's origin, looking down -z."""
+def guess_camera() -> PosedCamera:
+    """Camera of the cropped images, at the world origin, looking down -z."""
     return PosedCamera(
         focal_px=(FOCAL_PX, FOCAL_PX),
         centre_px=(WIDTH_PX / 2, HEIGHT_PX / 2),
@@ -70,7 +68,7 @@ def guessed_camera() -> PosedCamera:
 
 
 def _marked(database: YaleB, subject: str) -> set[Flash]:
-    """The flashes whose pictures of a subject end in .bad, where there is no other of the same."""
+    """Flashes of which a subject has an image that ends in .bad and no sound one."""
     prefix, suffix = f"{subject}_{CAMERA}", ".pgm.bad"
     names = (name for name in database.marked_damaged if name.startswith(prefix))
     found = {Flash.named(name.removeprefix(prefix).removesuffix(suffix)) for name in names}
@@ -83,12 +81,18 @@ LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": read_stage, "extended-
 def read_capture(
     folder: Path, layout: str = "stage", subtract_ambient: bool = False, align: bool = False
 ) -> Capture:
-    """Read a capture's description in one of `LAYOUTS`; no pictures yet."""
+    """Read a capture's description in one of `LAYOUTS`; no images yet.
+
+    UsageError for an unknown layout, or `subtract_ambient` without ambient images; InputError for a wrong
+    description.
+    """
     if layout not in LAYOUTS:
-        raise UsageError(f"--layout {layout}: not known; there is {', '.join(sorted(LAYOUTS))}")
+        raise UsageError(f"--layout {layout}: unknown layout; there is {', '.join(sorted(LAYOUTS))}")
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError(f"{folder}: no such folder; give the folder of a capture")
     capture = LAYOUTS[layout](folder)
     if subtract_ambient and not capture.ambient_pattern:
-        raise UsageError(f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' pictures")
+        raise UsageError(
+            f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them, or omit it"
+        )
     return replace(capture, subtract_ambient=subtract_ambient, align=align)

@@ -1,8 +1,8 @@
-"""Which of a subject's cameras and frames go into its stacks: those that are there and sound.
+"""Selection of the cameras and lights that go into a subject's OLAT stacks.
 
-A subject's stacks hold the same lights in every camera, for pairs weigh a map once for all of them. So a
-light whose frame is missing or broken in one camera is left out for the subject, and a camera that lacks most
-of its frames is left out itself, rather than cost the others their lights.
+All stacks of a subject hold the same lights, because pairs share the weights of an envmap between cameras. So
+a light whose frame is missing or broken in one camera is left out for the subject; a camera that lacks most
+of its frames is left out as a whole instead, so that the other cameras keep their lights.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,37 +13,37 @@ from facerf_cli.capture.checks.findings import Finding
 from facerf_cli.errors import InputError
 from facerf_cli.logs import counted
 
-LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # of the rig's: with fewer, what is left is no OLAT stack of the stage
+LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # lights, and share of the rig's, that a usable OLAT stack has
 MISSING, MARKED = "missing", "marked as damaged"
-_NAMED = 6  # of what is left out, in a line
+_LISTED = 6  # entries of a log line; the rest are counted
 
 
 @dataclass(frozen=True)
 class Selection:
-    """The lights (places in the capture's, ascending) and cameras of a subject's stacks, and what is not."""
+    """Lights and cameras of a subject's stacks, and the reasons for what is left out."""
 
-    lights: tuple[int, ...]
+    lights: tuple[int, ...]  # indices into the capture's lights, ascending
     cameras: tuple[str, ...]
-    left_out: dict[str, str] = field(default_factory=dict)  # why, by the light's id
-    dropped: dict[str, str] = field(default_factory=dict)  # why, by the camera's id
-    missing: tuple[str, ...] = ()  # camera/light of the frames that are not there
+    left_out: dict[str, str] = field(default_factory=dict)  # reason by light id
+    dropped: dict[str, str] = field(default_factory=dict)  # reason by camera id
+    missing: tuple[str, ...] = ()  # "camera/light" of the frames that do not exist
 
     def in_words(self) -> str:
-        """What is left out without being marked, for a line; empty where nothing is."""
+        """Log line about what is left out, except marked frames; empty where nothing is."""
         parts = []
         if lights := {light: why for light, why in self.left_out.items() if MARKED not in why}:
-            parts.append(f"{counted(len(lights), 'light')} left out ({_some(lights)})")
+            parts.append(f"{counted(len(lights), 'light')} left out ({_list(lights)})")
         if self.dropped:
-            parts.append(f"{counted(len(self.dropped), 'camera')} left out ({_some(self.dropped)})")
+            parts.append(f"{counted(len(self.dropped), 'camera')} left out ({_list(self.dropped)})")
         return ", ".join(parts)
 
 
 def select_frames(
     capture: Capture, subject: str, findings: Iterable[Finding] = (), strict: bool = False
 ) -> Selection:
-    """What of a subject is there and, by the findings, sound; an InputError where it is too little.
+    """Select the frames of a subject that exist and that no finding leaves out; InputError for too few.
 
-    With `strict` a frame that is missing without being marked is too much.
+    With `strict`, a missing frame that is not marked as damaged is an InputError too.
     """
     broken = {camera: _absent(capture, subject, camera) for camera in capture.cameras}
     missing = [(camera, light) for camera, lights in broken.items() for light in lights]
@@ -61,19 +61,19 @@ def select_frames(
     }
     cameras = tuple(camera for camera in capture.cameras if camera not in dropped)
     if not cameras:
-        raise InputError(f"{subject}: no camera has enough frames ({_some(dropped)})")
+        raise InputError(f"{subject}: no camera has enough frames ({_list(dropped)}); add the frames")
     left_out = _reasons(capture, {camera: broken[camera] for camera in cameras})
     kept = tuple(place for place, light in enumerate(capture.light_ids) if light not in left_out)
     if left_out and len(kept) < max(LEAST_SHARE * rig, min(LEAST_LIGHTS, rig)):
         raise InputError(
             f"{subject}: {len(kept)} of {rig} lights have a sound frame in every camera, which is too few "
-            f"({_some(left_out)}); add the frames, or take a camera out of the capture"
+            f"({_list(left_out)}); add the frames, or take a camera out of the capture"
         )
     return Selection(kept, cameras, left_out, dropped, tuple(map("/".join, missing)))
 
 
 def _absent(capture: Capture, subject: str, camera: str) -> dict[str, str]:
-    """The lights whose frame is not there, and why."""
+    """Reasons by light whose frame does not exist."""
     marked = capture.marked.get(subject, frozenset())
     return {
         light: MARKED if light in marked else MISSING
@@ -83,7 +83,7 @@ def _absent(capture: Capture, subject: str, camera: str) -> dict[str, str]:
 
 
 def _reasons(capture: Capture, broken: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Why lights are left out, by id in the capture's order, from the cameras' lights and reasons."""
+    """Reasons by light in the capture's order, from reasons by camera and light."""
     return {
         light: ", ".join(f"{camera}: {lights[light]}" for camera, lights in broken.items() if light in lights)
         for light in capture.light_ids
@@ -91,14 +91,14 @@ def _reasons(capture: Capture, broken: Mapping[str, Mapping[str, str]]) -> dict[
     }
 
 
-def is_mended(capture: Capture, subject: str, missing: Iterable[str]) -> bool:
-    """Whether any of the frames, as in `Selection.missing`, has come since."""
-    frames = (name.split("/") for name in missing)
-    return any(capture.frame_path(subject, camera, light).is_file() for camera, light in frames)
-
-
-def _some(reasons: Mapping[str, str]) -> str:
-    """The first of the reasons, and how many there are besides."""
-    words = [f"{name}: {why}" for name, why in list(reasons.items())[:_NAMED]]
+def _list(reasons: Mapping[str, str]) -> str:
+    """The first reasons, and the number of the others."""
+    words = [f"{name}: {why}" for name, why in list(reasons.items())[:_LISTED]]
     more = len(reasons) - len(words)
     return "; ".join([*words, f"and {more} more"] if more else words)
+
+
+def has_new_frames(capture: Capture, subject: str, missing: Iterable[str]) -> bool:
+    """Tell whether a frame of `Selection.missing` exists by now."""
+    frames = (name.split("/") for name in missing)
+    return any(capture.frame_path(subject, camera, light).is_file() for camera, light in frames)

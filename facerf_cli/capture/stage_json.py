@@ -1,4 +1,4 @@
-"""The layout 'stage': `stage.json` beside the pictures says what they are.
+"""Reader of `stage.json`, the description of a capture that stands beside its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
      "colour_space": "lin_rec709", "black_level": 0.0,
@@ -8,12 +8,15 @@
                   "world_to_camera": 3 x 4 or 4 x 4}],
      "subjects": {"0000": {traits}}, "provenance": {...}}
 
-Directions are unit vectors of the world toward the light. K is in pixels whose centres lie at index + 0.5.
-world_to_camera has OpenCV's axes (y down, z forward); it becomes DESIGN's (y up, z toward the camera) here
-and nowhere else. Intensities are linear Rec.709 in DESIGN's unit of light; the black level is linear too.
-Without `subjects` whoever has pictures is one. "ambient": "{subject}/{camera}/ambient.exr", which may be
-missing, names pictures without any lamp; --subtract-ambient takes them away in the black level's place.
-A pattern names {camera} unless there is one camera alone, and {subject} unless `subjects` is of one alone.
+Directions are unit vectors in world space toward the light. K is in pixels whose centres lie at index + 0.5.
+world_to_camera has OpenCV's axes (y down, z forward); only this file converts it to the axes of the package
+(y up, z toward the camera). Intensities are linear Rec.709: a light of rgb 1 gives a white surface that faces
+it radiance 1. The black level is linear too.
+
+Without `subjects`, every name that the pattern finds on disk is a subject. "ambient", for example
+"{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts in
+place of the black level. A pattern may lack {camera} if there is one camera, and {subject} if `subjects`
+lists one.
 """
 
 from pathlib import Path
@@ -21,7 +24,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from facerf_cli.capture.capture import FIELDS, Capture, found_subjects, require_pattern
+from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.pattern import FIELDS, find_subjects, require_pattern
 from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
@@ -31,15 +35,15 @@ from facerf_cli.files.images import PHOTO_LIMIT_PX
 STAGE_FILE, STAGE_FORMAT = "stage.json", "facerf-stage-1"
 MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 _LONGEST_SIDE_PX = 65_536
-_ORTHONORMAL_OFF = 1e-3
-_LEAST_INTENSITY = 1e-12  # what is less is no light, and 0 in float32 before long
-_ASPECT_OFF = 0.01  # of fx from fy: a face crop has square pixels
+_ORTHONORMAL_OFF = 1e-3  # of a singular value from 1, in rotations written with few digits
+_LEAST_INTENSITY = 1e-12  # frames are divided by it, in float32
+_ASPECT_OFF = 0.01  # of fx / fy from 1: a face crop has square pixels
 _OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
 
 
 def read_stage(folder: Path) -> Capture:
-    """The capture that `stage.json` in a folder describes; no pictures yet."""
-    root = read_document(folder / STAGE_FILE, "--describe drafts one from the pictures")
+    """Read the capture that `stage.json` in a folder describes; InputError names the first wrong entry."""
+    root = read_document(folder / STAGE_FILE, "--describe drafts one from the images")
     _require_filled(root)
     for key, value in (("format", STAGE_FORMAT), ("axes", "opencv"), ("unit", "m")):
         if root[key].value != value:
@@ -62,7 +66,7 @@ def read_stage(folder: Path) -> Capture:
         intensities=np.stack([_intensity(node) for node in lights]),
         cameras={name: _camera(node) for name, node in zip(camera_ids, cameras, strict=True)},
         subjects=(
-            {name: {} for name in found_subjects(folder, pattern, camera_ids, light_ids)}
+            {name: {} for name in find_subjects(folder, pattern, camera_ids, light_ids)}
             if subjects is None
             else {name: node.table() for name, node in sorted(subjects.entries(MOST_SUBJECTS).items())}
         ),
@@ -74,9 +78,9 @@ def read_stage(folder: Path) -> Capture:
 
 
 def _require_filled(root: Node) -> None:
-    """Raise where something is null, as in a draft of --describe; traits and provenance may be."""
-    said = (root[key] for key in root.table() if key not in ("subjects", "provenance"))
-    if gaps := [gap for node in said for gap in node.nulls()]:
+    """Raise for null values, which a draft of --describe has; traits and provenance may hold them."""
+    required = (root[key] for key in root.table() if key not in ("subjects", "provenance"))
+    if gaps := [gap for node in required for gap in node.nulls()]:
         more = f" (and {len(gaps) - 1} more)" if len(gaps) > 1 else ""
         raise InputError(f"{gaps[0].where} is null; fill it in{more}")
 
@@ -93,14 +97,16 @@ def _intensity(light: Node) -> np.ndarray:
     intensity = light["intensity"].array(3)
     if not (intensity > _LEAST_INTENSITY).all():
         name = light["id"].name()
-        raise light["intensity"].wrong(f"light in every channel (lamp {name} cannot be divided out)")
+        raise light["intensity"].wrong(
+            f"a positive value in every channel (frames of light {name} are divided by it)"
+        )
     return intensity
 
 
 def _camera(node: Node) -> PosedCamera:
     width, height = (node[key].whole(1, _LONGEST_SIDE_PX) for key in ("width", "height"))
     if width * height > PHOTO_LIMIT_PX:
-        raise node["width"].wrong(f"a picture of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels")
+        raise node["width"].wrong(f"an image of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels")
     k = node["K"].array(3, 3)
     fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
     if not (min(fx, fy) > 0 and np.allclose(k, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * fx)):
@@ -119,7 +125,7 @@ def _camera(node: Node) -> PosedCamera:
 
 
 def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3], the nearest to what is written, and translation [3]."""
+    """Rotation [3, 3] nearest to the given one, and translation [3]."""
     rows = len(node.value) if isinstance(node.value, list) else 0
     matrix = node.array(4 if rows == 4 else 3, 4)
     if rows == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
@@ -131,6 +137,6 @@ def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _needed_fields(camera_ids: list[str], subjects: Node | None) -> set[str]:
-    """What a pattern must name: there may be one camera alone, or one subject alone."""
-    alone = {"camera": len(camera_ids) == 1, "subject": subjects is not None and len(subjects.table()) == 1}
-    return {field for field in FIELDS if not alone.get(field)}
+    """Fields that a pattern must name: all but those with a single value."""
+    single = {"camera": len(camera_ids) == 1, "subject": subjects is not None and len(subjects.table()) == 1}
+    return {field for field in FIELDS if not single.get(field)}

@@ -1,13 +1,13 @@
-"""Reader of the Extended Yale Face Database B, cropped: real people under one flash at a time.
+"""Reader of the cropped Extended Yale Face Database B: real people under one flash at a time.
 
 A. Georghiades, P. Belhumeur, D. Kriegman, *From few to many: illumination cone models for face recognition
 under variable lighting and pose*, PAMI 2001; K.-C. Lee, J. Ho, D. Kriegman, *Acquiring linear subspaces for
 face recognition under variable lighting*, PAMI 2005 (the cropped form).
 
-As distributed: `yaleBXX/yaleBXX_P00A+035E-20.pgm`, 168 x 192 grey pixels of 8 bit, close to linear in light.
-A is the flash's azimuth in degrees, positive to the viewer's left, E its elevation, positive above.
-Pictures that the database itself marks as damaged end in `.bad`; `yaleBXX_P00_Ambient.pgm` shows the room
-without a flash, for some subjects not cropped.
+Files are `yaleBXX/yaleBXX_P00A+035E-20.pgm`, 168 x 192 grey pixels of 8 bit, close to linear in light. A is
+the flash's azimuth in degrees, positive to the viewer's left; E is its elevation, positive above. Images that
+the database marks as damaged end in `.bad`. `yaleBXX_P00_Ambient.pgm` shows the subject without a flash; for
+some subjects it is not cropped.
 """
 
 import csv
@@ -31,30 +31,30 @@ _SHIFTS_LIMIT_BYTES = 4 << 20  # all 38 subjects take 130 kB
 
 @dataclass(frozen=True, order=True)
 class Flash:
-    """A flash of the rig, by the angles in its pictures' names: the azimuth has the opposite sign of ours."""
+    """A flash of the rig, with the angles of the file names; their azimuth has the opposite sign of ours."""
 
     azimuth_deg: int  # > 0: to the viewer's left
     elevation_deg: int
 
     @property
     def name(self) -> str:
-        """As the files have it, `A+035E-20`."""
+        """Name in the file names, such as `A+035E-20`."""
         return f"A{self.azimuth_deg:+04d}E{self.elevation_deg:+03d}"
 
     @property
     def direction(self) -> np.ndarray:
-        """Unit vector [3] toward the flash in DESIGN's axes, float64."""
+        """Unit vector [3] toward the flash, x right, y up, z toward the camera, float64."""
         angles = torch.tensor([-self.azimuth_deg, self.elevation_deg], dtype=torch.float64)
         return azel_to_direction(angles[0], angles[1]).numpy()
 
     @property
     def angle_deg(self) -> float:
-        """Between the flash and the camera."""
+        """Angle between the flash and the camera."""
         return float(np.degrees(np.arccos(np.clip(self.direction[2], -1, 1))))
 
     @staticmethod
     def named(name: str) -> "Flash | None":
-        """The flash of that name; None where it is none."""
+        """Parse a flash's name; None for any other text."""
         match = _FLASH.fullmatch(name)
         return Flash(int(match[1]), int(match[2])) if match else None
 
@@ -78,44 +78,46 @@ Shifts = Mapping[tuple[str, Flash], tuple[int, int]]  # (down, right) in pixels
 
 @dataclass(frozen=True, eq=False)
 class YaleB:
-    """The database on disk; `left_out` names what is there and not given out.
+    """The database on disk.
 
-    `shifts` move a picture onto its subject's frontal one, for heads drift by a pixel or so.
+    `shifts` align an image with its subject's frontal one: heads drift by a pixel or so.
     """
 
     folder: Path
     files: Mapping[str, Mapping[Flash, Path]]  # by subject, sorted
-    marked_damaged: Sequence[str]
-    left_out: Sequence[str]
+    marked_damaged: Sequence[str]  # file names that end in .bad
+    left_out: Sequence[str]  # stems of the files that exist and are excluded as damaged
     shifts: Shifts
 
     @property
     def subjects(self) -> list[str]:
-        """Whoever is there, sorted."""
+        """Subjects on disk, sorted."""
         return list(self.files)
 
     def flashes(self, subject: str) -> list[Flash]:
-        """The subject's flashes, by azimuth and then elevation."""
+        """Flashes of a subject, sorted by azimuth and then elevation."""
         return list(self.files[subject])
 
     def image(self, subject: str, flash: Flash) -> np.ndarray:
-        """The subject [192, 168] under one flash, as given: float32 in 0..1 without any curve.
+        """Read the image [192, 168] of a subject under one flash, float32 in 0..1, without a display curve.
 
-        InputError where the subject lacks it or it cannot be read or has another size.
+        InputError for an image that is missing, unreadable or of another size.
         """
         if flash not in self.files[subject]:
-            raise InputError(f"{self.folder / subject}: has no sound picture under {flash.name}")
+            raise InputError(
+                f"{self.folder / subject}: no sound image under {flash.name}; copy the folder again"
+            )
         image = _read_cropped(self.files[subject][flash])
         if image is None:
             raise InputError(_wrong_size(self.files[subject][flash]))
-        return _moved(image, *self.shifts.get((subject, flash), (0, 0)))
+        return _shifted(image, *self.shifts.get((subject, flash), (0, 0)))
 
     def images(self, subject: str) -> np.ndarray:
-        """The subject under all its `flashes` [L, 192, 168]."""
+        """Read the images [L, 192, 168] of a subject under all its `flashes`."""
         return np.stack([self.image(subject, flash) for flash in self.flashes(subject)])
 
     def ambient(self, subject: str) -> np.ndarray | None:
-        """The subject [192, 168] without a flash; None where there is no such picture, or none cropped."""
+        """Read the image [192, 168] of a subject without a flash; None if it is missing or not cropped."""
         path = self.folder / subject / f"{subject}_P00_Ambient.pgm"
         return _read_cropped(path) if path.is_file() else None
 
@@ -125,17 +127,17 @@ def read_yale_b(
     shifts: Shifts | None = None,
     leave_out: Mapping[str, Collection[Flash]] = UNMARKED_DAMAGE,
 ) -> YaleB:
-    """List the database's pictures, without `leave_out`; nothing is decoded yet.
+    """List the database's images without those of `leave_out`; nothing is decoded yet.
 
-    InputError where the folder holds no subjects or one of them no pictures.
+    InputError for a folder without subjects, or a subject without images.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder")
+        raise InputError(f"{folder}: no such folder; give the folder of the database")
     subjects = sorted(
         path.name for path in folder.iterdir() if path.is_dir() and _SUBJECT.fullmatch(path.name)
     )
     if not subjects:
-        raise InputError(f"{folder}: no folders yaleB01 to yaleB39 in it; give the one that holds them")
+        raise InputError(f"{folder}: no folders yaleB01 to yaleB39; give the folder that holds them")
     files, marked, dropped = {}, [], []
     for subject in subjects:
         found = _images_of(folder / subject)
@@ -147,17 +149,17 @@ def read_yale_b(
 
 
 def _images_of(folder: Path) -> dict[Flash, Path]:
-    """The pictures of a subject in the order of their flashes."""
+    """Images of a subject in the order of their flashes."""
     prefix = f"{folder.name}_P00"
     named = {path: Flash.named(path.stem.removeprefix(prefix)) for path in folder.glob(f"{prefix}A*.pgm")}
     found = {flash: path for path, flash in named.items() if flash is not None}
     if not found:
-        raise InputError(f"{folder}: no pictures {prefix}A+000E+00.pgm and so on; copy the folder anew")
+        raise InputError(f"{folder}: no images {prefix}A+000E+00.pgm and so on; copy the folder again")
     return dict(sorted(found.items()))
 
 
 def _read_cropped(path: Path) -> np.ndarray | None:
-    """A grey picture [192, 168] in 0..1; None where it has another size."""
+    """Read a grey image [192, 168] in 0..1; None if it has another size."""
     pixels = read_image(path, "linear").pixels[..., 0]
     return pixels if pixels.shape == (HEIGHT_PX, WIDTH_PX) else None
 
@@ -165,45 +167,47 @@ def _read_cropped(path: Path) -> np.ndarray | None:
 def _wrong_size(path: Path) -> str:
     height, width = read_image(path, "linear").pixels.shape[:2]
     return (
-        f"{path}: {width} x {height} pixels, not {WIDTH_PX} x {HEIGHT_PX}; take the cropped database as "
-        "distributed (CroppedYale.zip), for some public copies are shrunk"
+        f"{path}: {width} x {height} pixels, not {WIDTH_PX} x {HEIGHT_PX}; use the cropped database as "
+        "distributed (CroppedYale.zip); some public copies are shrunk"
     )
 
 
-def _moved(image: np.ndarray, down: int, right: int) -> np.ndarray:
-    """The picture moved by whole pixels, its border repeated."""
+def _shifted(image: np.ndarray, down: int, right: int) -> np.ndarray:
+    """Shift an image by whole pixels; the border is repeated."""
     rows = np.clip(np.arange(HEIGHT_PX) - down, 0, HEIGHT_PX - 1)
     columns = np.clip(np.arange(WIDTH_PX) - right, 0, WIDTH_PX - 1)
     return image[rows][:, columns]
 
 
 def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
-    """Read `subject,light,dy,dx` rows (yaleB01,A-130E+20,2,-1): pixels down and right; further columns pass.
+    """Read rows `subject,light,dy,dx`, such as yaleB01,A-130E+20,2,-1, in pixels down and right.
 
-    InputError names the first row that is wrong.
+    Other columns are ignored. InputError names the first wrong row.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file of shifts")
+        raise InputError(f"{path}: no such file; give a list of shifts with lines subject,light,dy,dx")
     if path.stat().st_size > _SHIFTS_LIMIT_BYTES:
-        raise InputError(f"{path}: too large for a list of shifts; its lines are subject,light,dy,dx")
+        raise InputError(f"{path}: too large for a list of shifts; give lines subject,light,dy,dx")
     try:
         with path.open(encoding="utf-8", errors="replace", newline="") as stream:
             rows = list(csv.DictReader(stream))
     except csv.Error as error:
-        raise InputError(f"{path}: no list of shifts ({error}); its lines are subject,light,dy,dx") from None
+        raise InputError(f"{path}: not a list of shifts ({error}); give lines subject,light,dy,dx") from None
     shifts = {}
     for number, row in enumerate(rows, start=2):
         shift = _shift(row)
         if shift is None:
-            raise InputError(f"{path}: line {number} is no shift; give subject,light,dy,dx under such a head")
+            raise InputError(
+                f"{path}: line {number} is not a shift; give subject,light,dy,dx under such a header"
+            )
         shifts[shift[:2]] = shift[2:]
     if not shifts:
-        raise InputError(f"{path}: no shifts in it; its first line is subject,light,dy,dx")
+        raise InputError(f"{path}: no shifts; give lines subject,light,dy,dx under a header of these names")
     return shifts
 
 
 def _shift(row: Mapping[str, str | None]) -> tuple[str, Flash, int, int] | None:
-    """Subject, flash, pixels down and right of a row; None where they are not in it."""
+    """Parse a row into subject, flash, pixels down and right; None if it is wrong."""
     subject, flash = row.get("subject"), Flash.named(row.get("light") or "")
     try:
         down, right = int(row.get("dy") or ""), int(row.get("dx") or "")

@@ -110,9 +110,9 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"lights": {}}, "a list"),
         ({"lights": light(direction=[0, 0, 2])}, "length 1"),
         ({"lights": light(direction=[0, 1])}, "finite"),
-        ({"lights": light(intensity=[1, 0, 1])}, "lamp L0"),
-        ({"lights": light(intensity=[1, -1, 1])}, "lamp L0"),
-        ({"lights": light(intensity=[1, 1e-60, 1])}, "lamp L0"),
+        ({"lights": light(intensity=[1, 0, 1])}, "light L0"),
+        ({"lights": light(intensity=[1, -1, 1])}, "light L0"),
+        ({"lights": light(intensity=[1, 1e-60, 1])}, "light L0"),
         ({"lights": light(id="L1")}, "no other"),
         ({"lights": light(id="../L0")}, "a name"),
         ({"lights": light(id=".L0")}, "a name"),
@@ -200,7 +200,7 @@ def test_a_frame_that_is_missing_torn_or_of_another_size_is_named(tmp_path: Path
     capture = read_capture(capture_at(tmp_path))
     path = capture.frame_path("0000", "C0", "L1")
     write_exr(path, np.zeros((60, 60, 3), np.float32))
-    with pytest.raises(InputError, match=r"L1\.exr: 60 x 60 pixels; camera C0 has 64 x 60"):
+    with pytest.raises(InputError, match=r"L1\.exr: 60 x 60 pixels, but camera C0 has 64 x 60"):
         capture.frame("0000", "C0", 1)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(InputError, match=r"L1\.exr: .*(read|damaged)"):

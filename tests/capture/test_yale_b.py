@@ -53,7 +53,7 @@ def test_damaged_images_are_left_out_and_counted(folder: Path) -> None:
     assert database.left_out == ["yaleB05_P00A+035E+40"]  # known to be two fields in one
     assert Flash(35, 40) not in database.flashes("yaleB05") and Flash(35, 40) in database.flashes("yaleB07")
     assert Flash(35, 40) in read_yale_b(folder, leave_out={}).flashes("yaleB05")
-    with pytest.raises(InputError, match=r"yaleB05: has no sound picture under A\+035E\+40"):
+    with pytest.raises(InputError, match=r"yaleB05: no sound image under A\+035E\+40"):
         database.image("yaleB05", Flash(35, 40))
     assert sum(map(len, UNMARKED_DAMAGE.values())) == 16
 
@@ -107,7 +107,7 @@ def test_folders_that_are_not_the_database(folder: Path, tmp_path: Path) -> None
     with pytest.raises(InputError, match="no folders yaleB01"):
         read_yale_b(folder / "yaleB05")
     (folder / "yaleB09").mkdir()
-    with pytest.raises(InputError, match="yaleB09: no pictures"):
+    with pytest.raises(InputError, match="yaleB09: no images"):
         read_yale_b(folder)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.capture.layouts import guessed_camera, read_capture
+from facerf_cli.capture.layouts import guess_camera, read_capture
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
@@ -69,7 +69,7 @@ def test_no_database(tmp_path: Path) -> None:
 
 
 def test_a_metre_before_the_camera_a_face_fills_the_image() -> None:
-    camera = guessed_camera()
+    camera = guess_camera()
     across_px = 0.089 * camera.focal_px[0]  # the outer corners of the eyes, a metre away
     assert 0.4 * camera.width_px < across_px < 0.6 * camera.width_px
 

@@ -1,7 +1,7 @@
-"""What the checks of a capture say: findings, each about a subject, a camera or one frame.
+"""Findings of a capture's checks, each about a subject, a camera or one frame.
 
-An error stops its subject, unless it `leaves_out` a frame: then the frame alone is to be left out of the
-stack, and the subject goes on without it. A warning stops nothing.
+An error stops its subject, unless it `leaves_out` a frame: then the subject goes on without that frame. A
+warning stops nothing.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,14 +13,14 @@ Severity = Literal["error", "warning"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong, in words that say what to do, with the figures that show it.
+    """A fault, with a message that says what to do and the measured figures.
 
-    An empty camera or light means all of them. `leaves_out`: the frame (camera and light are given) is broken
-    and the rest of the subject is sound.
+    An empty camera or light means all of them. `leaves_out` means that this frame alone is broken; camera and
+    light are then given.
     """
 
     severity: Severity
-    check: str  # the name of the check, 'missing', 'unlit' and so on
+    check: str  # name of the check, such as 'missing' or 'unlit'
     subject: str
     words: str
     camera: str = ""
@@ -30,11 +30,11 @@ class Finding:
 
     @property
     def place(self) -> str:
-        """Where it is, `subject/camera/light` as far as they are given."""
+        """Place of the fault, `subject/camera/light` as far as given."""
         return "/".join(name for name in (self.subject, self.camera, self.light) if name)
 
     def row(self) -> dict[str, Any]:
-        """As a row of findings.jsonl."""
+        """Row of findings.jsonl."""
         return {
             "severity": self.severity,
             "check": self.check,
@@ -48,12 +48,12 @@ class Finding:
 
 
 def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]:
-    """Those that stop their subject; with `strict` any finding does."""
+    """Select the findings that stop their subject; with `strict` all do."""
     return [found for found in findings if strict or (found.severity == "error" and not found.leaves_out)]
 
 
 def frames_left_out(findings: Iterable[Finding]) -> dict[str, set[str]]:
-    """By camera, the ids of the lights whose frames are broken."""
+    """Collect the ids of the lights whose frames are left out, by camera."""
     broken: dict[str, set[str]] = {}
     for found in findings:
         if found.leaves_out:

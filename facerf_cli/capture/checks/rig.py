@@ -1,10 +1,8 @@
-"""Normals of a mean face laid onto a camera's frames: what photometric stereo should find there.
+"""Checks of the rig against the face: lights mirrored or turned as a whole, cameras swapped or misplaced.
 
-All lamps mirrored or turned together, two cameras' frames swapped, a camera misplaced: the face tells.
-
-Frames then agree with each other. But the face's normals, known from a mean face laid over it, are mirrored
-or turned against those of photometric stereo: by what is wrong with the rig, or by the turn from one camera
-to the other.
+Such faults leave the frames consistent with each other. But the normals of photometric stereo are then
+mirrored or turned against those of a mean face fitted to the frames: by the fault of the rig, or by the
+rotation from one camera to another.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,27 +14,135 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.capture.checks.findings import Finding
-from facerf_cli.capture.checks.frames import CameraFrames, Stereo
-from facerf_cli.capture.checks.shading import angle_deg
+from facerf_cli.capture.checks.frames import CameraFrames
+from facerf_cli.capture.checks.numerics import angle_deg
+from facerf_cli.capture.checks.stereo import Stereo
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera, fit_views
 from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
 
-_FACING = 0.3  # cosine: vertices seen more obliquely are hidden behind the nose or are not skin
+_TURN_DEG = 20.0  # sound rigs give 1 to 11, on Extended Yale B and synthetic faces
+_SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # least turn of a swapped camera; largest distance from the other's pose
+_BETTER = 0.03  # least gain in mean cosine of a mirrored rig
+# The mean face fitted to a side view may be turned by 42 degrees, on synthetic faces. Normals that face away
+# from the camera tell this from a wrong pose. After the turn their share drops by 0.02 at most on sound
+# cameras, by 0.04 to 0.3 where one is turned to a side by 40 degrees or more.
+_LOOK_AWAY = 0.03
+_APART_DEG = 45.0  # between normals after the first turn; beyond it are outliers such as glasses and hair
+_LEAST_PX, _LEAST_NEAR = 100, 50  # pixels to compare, and those kept without outliers
+_LEAN = 0.3  # correlation of a normal's x with the pixel's x, which is 0.6 to 0.9 on heads
+_FACING = 0.3  # cosine to the camera: vertices at lower ones are hidden by the nose, or not skin
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """Best rotation of the measured normals onto those of the face."""
+
+    rotation: np.ndarray  # [3, 3]
+    likeness: float  # mean cosine between the normals after it
+
+    @property
+    def degrees(self) -> float:
+        """Angle of the rotation."""
+        return float(np.degrees(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1))))
+
+    def apply(self, normals: np.ndarray) -> np.ndarray:
+        """Rotate normals [N, 3]."""
+        return normals @ self.rotation.T
+
+
+@dataclass(frozen=True, eq=False)
+class RigFit:
+    """Fit of the lights to the face that a camera sees, as declared and mirrored left to right."""
+
+    camera: str
+    turn: Turn
+    mirrored: Turn
+    turn_in_world: np.ndarray  # [3, 3] rotation of `turn`; equal in all cameras of a turned rig
+    looking_away: float  # share of normals that face away from the camera, before less after the turn
+    other: str  # camera whose pose would explain the turn; empty if none
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Tell whether the lights fit the face better when mirrored."""
+        return self.mirrored.likeness > self.turn.likeness + _BETTER
+
+    @property
+    def is_off(self) -> bool:
+        """Tell whether the lights do not fit the face."""
+        return self.is_mirrored or self.turn.degrees > _TURN_DEG
+
+
+def check_rigs(subject: str, rigs: Sequence[RigFit]) -> Iterator[Finding]:
+    """Report swapped cameras, and either a rig that is off in most cameras or each camera that is off."""
+    others = {rig.camera: rig.other for rig in rigs}
+    swapped = [rig for rig in rigs if rig.other and others.get(rig.other) == rig.camera]
+    for rig in swapped:
+        words = (
+            f"is lit as camera {rig.other} should be, and that one as this; swap their frames, or K and poses"
+        )
+        figures = {"turned_deg": round(rig.turn.degrees, 1)}
+        yield Finding("error", "camera", subject, words, rig.camera, figures=figures)
+    rest = [rig for rig in rigs if rig not in swapped]
+    off = [rig for rig in rest if rig.is_off]
+    if 2 * len(off) > len(rest) and _is_of_all(rest):
+        advice = "their directions, their names or world_to_camera"
+        yield _off(subject, off[0], "rig", "the lights are", advice)
+        return
+    for rig in off:
+        if rig.is_mirrored or rig.looking_away > _LOOK_AWAY:
+            what = "unlike in other cameras, the lights are"
+            yield _off(subject, rig, "camera", what, "its world_to_camera, or its frames")
+
+
+def _is_of_all(rigs: Sequence[RigFit]) -> bool:
+    """Tell whether most cameras find the lights mirrored, or their mean turn is large.
+
+    A mean face fitted to views from the left and from the right is turned in opposite ways; the mean cancels
+    that.
+    """
+    if 2 * sum(rig.is_mirrored for rig in rigs) > len(rigs):
+        return True
+    u, _, vh = np.linalg.svd(np.mean([rig.turn_in_world for rig in rigs], axis=0))
+    return Turn(u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh, 1.0).degrees > _TURN_DEG
+
+
+def _off(subject: str, rig: RigFit, check: str, what: str, advice: str) -> Finding:
+    """Error of lights that are mirrored or turned against the face."""
+    turn = rig.mirrored if rig.is_mirrored else rig.turn
+    ways = ["mirrored left to right"] if rig.is_mirrored else []
+    ways += [f"turned by {turn.degrees:.0f} degrees"] if turn.degrees > _TURN_DEG else []
+    words = f"{what} {' and '.join(ways)} against the face as this camera sees it; correct {advice}"
+    figures = {
+        "turned_deg": round(rig.turn.degrees, 1),
+        "likeness": round(rig.turn.likeness, 3),
+        "mirrored": round(rig.mirrored.likeness, 3),
+    }
+    return Finding("error", check, subject, words, rig.camera, figures=figures)
+
+
+def check_rig_roughly(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
+    """Report mirrored lights without a face: the object's normals then point left on its right side."""
+    columns = np.nonzero(stereo.lit)[1].astype(float)
+    leaning = float(np.corrcoef(stereo.normals[:, 0], columns)[0, 1])
+    if leaning < -_LEAN:
+        words = "the object looks hollow from left to right; check whether lights or images are mirrored"
+        figures = {"leaning": round(leaning, 2)}
+        yield Finding("error", "rig", frames.subject, words, frames.camera, figures=figures)
 
 
 @dataclass(frozen=True, eq=False)
 class FaceNormals:
-    """Pixels [N] of a camera's small frames, laid flat, where a vertex is seen, and its normal [N, 3]."""
+    """Normals of the fitted mean face at the pixels of a camera's small frames."""
 
-    pixels: np.ndarray
-    normals: np.ndarray  # unit, camera space
+    pixels: np.ndarray  # [N] indices into the flattened image, one for each visible vertex
+    normals: np.ndarray  # [N, 3] unit, camera space
 
 
 def find_face_normals(frames: CameraFrames, posed: PosedCamera) -> FaceNormals | None:
-    """A mean face fitted to the landmarks found on the mean of all frames; None where there is no face."""
+    """Fit the mean face to the landmarks in the mean of all frames; None without a face."""
     rgb = np.repeat(frames.lit[..., None], 3, -1).clip(0)
     faces = detect_landmarks(to_display(rgb)) if rgb.max() > 0 else []
     if not faces:
@@ -55,7 +161,7 @@ def _mean_face() -> MorphableModel:
 
 
 def _on_pixels(frames: CameraFrames, posed: PosedCamera, vertices: torch.Tensor) -> FaceNormals:
-    """Vertices [V, 3] of the world, and their normals, where the camera sees them."""
+    """Project the vertices [V, 3] in world space, and their normals, to the pixels that see them."""
     corners = vertices[grid_triangles().long()]  # [F, 3, 3]
     flat = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     summed = torch.zeros_like(vertices).index_add(
@@ -68,70 +174,20 @@ def _on_pixels(frames: CameraFrames, posed: PosedCamera, vertices: torch.Tensor)
     return FaceNormals(px[seen, 1] * width + px[seen, 0], normals[seen])
 
 
-_TURN_DEG = 20.0  # sound rigs are found turned by 1 to 11, on Extended Yale B and synthetic faces
-_SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # and two cameras each turned to the other, as near as that
-_BETTER = 0.03  # of the mean cosine between normals, by which a mirrored rig must win
-# A face seen from the side may be laid on turned by 42 degrees, on synthetic faces. What tells that from a
-# wrong pose are normals that look away from the camera, less of them after the turn: by 0.02 of all at most
-# on sound cameras, by 0.04 to 0.3 where one is turned to a side by 40 degrees or more.
-_LOOK_AWAY = 0.03
-_APART_DEG = 45.0  # between normals after the first turn: glasses, hair
-_LEAN = 0.3  # correlation of a normal's x with the pixel's: 0.6 to 0.9 on heads
-
-
-@dataclass(frozen=True, eq=False)
-class Turn:
-    """The rotation [3, 3] that takes the normals found onto those of the face, and their mean cosine then."""
-
-    rotation: np.ndarray
-    likeness: float
-
-    @property
-    def degrees(self) -> float:
-        """How far it turns."""
-        return float(np.degrees(np.arccos(np.clip((np.trace(self.rotation) - 1) / 2, -1, 1))))
-
-    def of(self, normals: np.ndarray) -> np.ndarray:
-        """Normals [N, 3], turned."""
-        return normals @ self.rotation.T
-
-
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """How the lamps lie against the face that a camera sees, as they are and mirrored left to right."""
-
-    camera: str
-    turn: Turn
-    mirrored: Turn
-    turn_in_world: np.ndarray  # [3, 3] the turn's rotation; all cameras of a turned rig have the same
-    looking_away: float  # share of the normals that look away from the camera, less that after the turn
-    other: str  # the camera whose place explains the turn, if there is one
-
-    @property
-    def is_mirrored(self) -> bool:
-        """Whether the lights fit the face better when mirrored."""
-        return self.mirrored.likeness > self.turn.likeness + _BETTER
-
-    @property
-    def is_off(self) -> bool:
-        """Whether the lights do not fit the face."""
-        return self.is_mirrored or self.turn.degrees > _TURN_DEG
-
-
 def measure_rig(
     frames: CameraFrames, stereo: Stereo, face: FaceNormals, cameras: Mapping[str, PosedCamera]
-) -> Rig | None:
-    """None where too little of the face is lit."""
+) -> RigFit | None:
+    """Compare the normals of photometric stereo with the face; None where too little of it is lit."""
     place = np.full(stereo.lit.size, -1)
     place[stereo.lit.ravel()] = np.arange(stereo.lit.sum())
     rows = place[face.pixels]
     found, known = stereo.normals[rows[rows >= 0]], face.normals[rows >= 0]
-    if len(found) < 100:
+    if len(found) < _LEAST_PX:
         return None
     turn = best_turn(found, known)
     to_camera = cameras[frames.camera].rotation.double().numpy()
-    before, after = ((normals[:, 2] < 0).mean() for normals in (stereo.normals, turn.of(stereo.normals)))
-    return Rig(
+    before, after = ((normals[:, 2] < 0).mean() for normals in (stereo.normals, turn.apply(stereo.normals)))
+    return RigFit(
         camera=frames.camera,
         turn=turn,
         mirrored=best_turn(found * [-1, 1, 1], known),
@@ -142,20 +198,20 @@ def measure_rig(
 
 
 def best_turn(found: np.ndarray, known: np.ndarray) -> Turn:
-    """Of normals onto others [N, 3] (Kabsch)."""
+    """Fit the rotation of normals [N, 3] onto others by the Kabsch algorithm, once more without outliers."""
     near = np.ones(len(found), bool)
     for _ in range(2):
         u, _, vh = np.linalg.svd(found[near].T @ known[near])
         rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vh))]) @ vh).T
         turned = found @ rotation.T
         near = angle_deg(turned, known) < _APART_DEG
-        if near.sum() < 50:
+        if near.sum() < _LEAST_NEAR:
             near[:] = True
     return Turn(rotation, float((turned * known).sum(1).mean()))
 
 
 def _other_camera(turn: Turn, camera: str, cameras: Mapping[str, PosedCamera]) -> str:
-    """The camera that one would have to be for its normals to be the face's; empty where none comes near."""
+    """Camera whose pose would turn the normals onto the face's; empty if none is near."""
     back = turn.rotation @ cameras[camera].rotation.double().numpy()
     off_deg = {
         name: Turn(back @ posed.rotation.double().numpy().T, 1.0).degrees
@@ -164,63 +220,3 @@ def _other_camera(turn: Turn, camera: str, cameras: Mapping[str, PosedCamera]) -
     }
     nearest = min(off_deg, key=lambda name: off_deg[name], default="")
     return nearest if nearest and turn.degrees > _SWAP_DEG and off_deg[nearest] < _LIKE_DEG else ""
-
-
-def check_rigs(subject: str, rigs: Sequence[Rig]) -> Iterator[Finding]:
-    """An error for the rig where most cameras find the lights off alike, else one for each that does.
-
-    Before that one for each camera whose place is that of another, and the other's its own.
-    """
-    others = {rig.camera: rig.other for rig in rigs}
-    swapped = [rig for rig in rigs if rig.other and others.get(rig.other) == rig.camera]
-    for rig in swapped:
-        words = (
-            f"is lit as camera {rig.other} would be, and that one as this; swap their frames, or K and poses"
-        )
-        figures = {"turned_deg": round(rig.turn.degrees, 1)}
-        yield Finding("error", "camera", subject, words, rig.camera, figures=figures)
-    rest = [rig for rig in rigs if rig not in swapped]
-    off = [rig for rig in rest if rig.is_off]
-    if 2 * len(off) > len(rest) and _is_of_all(rest):
-        what = "their directions or world_to_camera, or names that are one off"
-        yield _off(subject, off[0], "rig", "the lights are", what)
-        return
-    for rig in off:
-        if rig.is_mirrored or rig.looking_away > _LOOK_AWAY:
-            here = "unlike in other cameras, the lights are"
-            yield _off(subject, rig, "camera", here, "its world_to_camera, or its frames")
-
-
-def _is_of_all(rigs: Sequence[Rig]) -> bool:
-    """Whether most cameras find the lights mirrored, or all in the mean that they are turned the same way.
-
-    Faces seen from the left and from the right are laid on wrongly in opposite ways.
-    """
-    if 2 * sum(rig.is_mirrored for rig in rigs) > len(rigs):
-        return True
-    u, _, vh = np.linalg.svd(np.mean([rig.turn_in_world for rig in rigs], axis=0))
-    return Turn(u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh, 1.0).degrees > _TURN_DEG
-
-
-def _off(subject: str, rig: Rig, check: str, what: str, mend: str) -> Finding:
-    """An error: what is mirrored or turned against the face, and what to mend."""
-    turn = rig.mirrored if rig.is_mirrored else rig.turn
-    ways = ["mirrored left to right"] if rig.is_mirrored else []
-    ways += [f"turned by {turn.degrees:.0f} degrees"] if turn.degrees > _TURN_DEG else []
-    words = f"{what} {' and '.join(ways)} against the face as this camera sees it; mend {mend}"
-    figures = {
-        "turned_deg": round(rig.turn.degrees, 1),
-        "likeness": round(rig.turn.likeness, 3),
-        "mirrored": round(rig.mirrored.likeness, 3),
-    }
-    return Finding("error", check, subject, words, rig.camera, figures=figures)
-
-
-def check_rig_roughly(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
-    """One error where normals lean left on the right of the object: for cameras without a face to compare."""
-    columns = np.nonzero(stereo.lit)[1].astype(float)
-    leaning = float(np.corrcoef(stereo.normals[:, 0], columns)[0, 1])
-    if leaning < -_LEAN:
-        words = "what is lit is hollow from left to right; are the lights mirrored, or the pictures?"
-        figures = {"leaning": round(leaning, 2)}
-        yield Finding("error", "rig", frames.subject, words, frames.camera, figures=figures)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from facerf_cli.capture.capture import moved
-from facerf_cli.capture.checks import motion as path_module
-from facerf_cli.capture.checks.motion import align_shifts, head_path, with_alignment
+from facerf_cli.capture.capture import shift_image
+from facerf_cli.capture.checks import align as path_module
+from facerf_cli.capture.checks.align import align_shifts, head_path, with_alignment
 from facerf_cli.capture.layouts import read_capture
 from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
 
@@ -48,13 +48,17 @@ def test_frames_are_read_where_the_head_was(stage: Path) -> None:
 
 def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
     image = np.arange(12, dtype=np.float32).reshape(3, 4, 1)
-    assert (moved(image, 1, 0)[1:] == image[:-1]).all() and (moved(image, 1, 0)[0] == image[0]).all()
-    assert (moved(image, 0, -1)[:, :-1] == image[:, 1:]).all()
+    assert (shift_image(image, 1, 0)[1:] == image[:-1]).all() and (
+        shift_image(image, 1, 0)[0] == image[0]
+    ).all()
+    assert (shift_image(image, 0, -1)[:, :-1] == image[:, 1:]).all()
     ramp = np.repeat(np.arange(8, dtype=np.float32)[None, :, None], 2, 0)
-    assert moved(ramp, 0, 0.25)[:, 2:-2, 0] == pytest.approx(ramp[:, 2:-2, 0] - 0.25)  # with the border away
-    there_and_back = moved(moved(ramp**2, 0, 0.5), 0, -0.5)
+    assert shift_image(ramp, 0, 0.25)[:, 2:-2, 0] == pytest.approx(
+        ramp[:, 2:-2, 0] - 0.25
+    )  # with the border away
+    there_and_back = shift_image(shift_image(ramp**2, 0, 0.5), 0, -0.5)
     assert there_and_back[:, 4, 0] == pytest.approx(ramp[:, 4, 0] ** 2)  # parabolas come back, too
-    assert moved(image, 0, 0) is image
+    assert shift_image(image, 0, 0) is image
 
 
 def test_a_shift_in_the_capture_moves_its_frame_alone(stage: Path) -> None:

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.capture.checks.rig import Rig, Turn, check_rigs
-from facerf_cli.capture.checks.shading import vertex
+from facerf_cli.capture.checks.numerics import parabola_vertex
+from facerf_cli.capture.checks.rig import RigFit, Turn, check_rigs
 
 
-def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrored: float = 0.8) -> Rig:
+def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrored: float = 0.8) -> RigFit:
     """With a likeness of 0.9 to the face, mirrored of `mirrored`."""
     rotation = Rotation.from_euler("y", turned_deg, degrees=True).as_matrix()
-    return Rig(camera, Turn(rotation, 0.9), Turn(np.eye(3), mirrored), rotation, looking_away, "")
+    return RigFit(camera, Turn(rotation, 0.9), Turn(np.eye(3), mirrored), rotation, looking_away, "")
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrore
         ([], []),
     ],
 )
-def test_the_rig_is_blamed_where_most_cameras_agree(rigs: list[Rig], said: list[tuple[str, str]]) -> None:
+def test_the_rig_is_blamed_where_most_cameras_agree(rigs: list[RigFit], said: list[tuple[str, str]]) -> None:
     assert [(found.check, found.camera) for found in check_rigs("s", rigs)] == said
 
 
@@ -45,6 +45,6 @@ def test_a_turn_and_a_mirror_are_told_in_words() -> None:
 def test_the_vertex_of_a_parabola_that_is_sampled_unevenly(sign: int) -> None:
     x = np.array([0.0, 1.0, 1.5, 3.0])
     y = sign * (x - 1.3) ** 2
-    assert vertex(x, y, 2) == pytest.approx(1.3)
-    assert vertex(x, y, 0) == 0.0 and vertex(x, y, 3) == 3.0
-    assert vertex(x, np.ones(4), 2) == 1.5
+    assert parabola_vertex(x, y, 2) == pytest.approx(1.3)
+    assert parabola_vertex(x, y, 0) == 0.0 and parabola_vertex(x, y, 3) == 3.0
+    assert parabola_vertex(x, np.ones(4), 2) == 1.5

@@ -159,7 +159,7 @@ def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:
 def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
-    with pytest.raises(InputError, match=r"yaleB07: has no sound picture under A\+000E\+00"):
+    with pytest.raises(InputError, match=r"yaleB07: no sound image under A\+000E\+00"):
         list(compare_sitter(read_yale_b(folder), "yaleB07", []))
 
 

@@ -8,7 +8,7 @@ import pytest
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.findings import Finding
 from facerf_cli.capture.layouts import read_yale_capture
-from facerf_cli.capture.select import is_mended, select_frames
+from facerf_cli.capture.select import has_new_frames, select_frames
 from facerf_cli.capture.yale_b import Flash
 from facerf_cli.errors import InputError
 from tests.capture.yale_fixture import write_yale_b
@@ -53,9 +53,9 @@ def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None
         select_frames(capture, "yaleB05", [*findings, broken(another)])
     with pytest.raises(InputError, match=f"yaleB05/P00/{re.escape(missing)}: missing .*strict"):
         select_frames(capture, "yaleB05", strict=True)
-    assert not is_mended(capture, "yaleB05", chosen.missing)
+    assert not has_new_frames(capture, "yaleB05", chosen.missing)
     gone.write_bytes(content)
-    assert is_mended(capture, "yaleB05", chosen.missing)
+    assert has_new_frames(capture, "yaleB05", chosen.missing)
     select_frames(capture, "yaleB05", strict=True)  # what is marked is known
 
 
