@@ -1,6 +1,7 @@
-"""Light on disk: JSON of a rig's weights and spherical-harmonic coefficients; the text files of others.
+"""Lights on disk: JSON of a rig's weights and spherical harmonics, plain numbers, and environment maps.
 
-Environment maps that a user brings, and lights that stand for one.
+A JSON light is written by `facerf estimate-light` and `convert-light`; text files of numbers are the formats
+of DPR and SfSNet; any image can be an environment map.
 """
 
 import json
@@ -16,7 +17,9 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_header, read_image
+from facerf_cli.files.documents import json_text
+from facerf_cli.files.image_metadata import read_header
+from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
@@ -26,13 +29,16 @@ FORMAT = "facerf-light-1"
 AXES = "camera: x to the picture's right, y up, z toward the camera; directions point to the light"
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _LIMIT_BYTES = 4 << 20
-_MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441
+_MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
+_TEXT_LIMIT_BYTES = 1 << 16  # of a text file of numbers; the longest format has 27
+_LARGEST = 1e30  # magnitude of a number; its square still fits double precision
+_LENGTH_TOLERANCE = 1e-2  # a direction's length may differ from 1 by this, since other programs round
 _ADVICE = "give a .json that estimate-light or convert-light wrote"
 
 
 @dataclass(frozen=True, eq=False)
 class Harmonics:
-    """Coefficients [(order + 1)^2, 3], and the convention that they are in, in words."""
+    """Spherical-harmonic coefficients [(order + 1)^2, 3], and their convention in words."""
 
     coefficients: Tensor
     convention: str
@@ -40,10 +46,10 @@ class Harmonics:
 
 @dataclass(frozen=True, eq=False)
 class LightRecord:
-    """What a light's JSON holds: directions and weights [L, 3] of a rig, or coefficients, or both.
+    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients, or both.
 
-    Without a rig, `directions` and `weights` have no rows. `rig` says in words what the directions are;
-    `attributes` are the provenance (`records.Provenance.attributes`), and how the light was found.
+    Without a rig, `directions` and `weights` have no rows. `rig` describes the directions in words;
+    `attributes` are the provenance (`logs.Provenance.attributes`) and how the light was estimated.
     """
 
     directions: Tensor
@@ -54,7 +60,7 @@ class LightRecord:
 
 
 def write_light(path: Path, record: LightRecord) -> None:
-    """Write a light as JSON of plain numbers, a light or a coefficient a line, through a temporary name."""
+    """Write a light as JSON atomically, with a light's direction, weight or coefficient in each line."""
     fields: dict[str, Any] = {"format": FORMAT, "axes": AXES, "units": UNITS}
     if len(record.directions):
         fields |= {"rig": record.rig, "directions": record.directions, "weights": record.weights}
@@ -68,7 +74,7 @@ def write_light(path: Path, record: LightRecord) -> None:
 
 
 def _text_of(value: Any, indent: str) -> str:
-    """JSON with the rows of a matrix a line each."""
+    """Return JSON with each row of a matrix in one line."""
     deeper = indent + "  "
     if isinstance(value, Tensor):
         lines = [f"[{', '.join(map(_number, row))}]" for row in value.float().tolist()]
@@ -76,24 +82,24 @@ def _text_of(value: Any, indent: str) -> str:
     if isinstance(value, dict) and value:
         lines = [f"{json.dumps(name)}: {_text_of(entry, deeper)}" for name, entry in value.items()]
         return f"{{\n{deeper}" + f",\n{deeper}".join(lines) + f"\n{indent}}}"
-    return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    return json_text(value)
 
 
 def _number(value: float) -> str:
-    """Decimals that the same float32 is read back from, whatever numpy's print options are."""
+    """Return the shortest decimals that read back as the same float32."""
     if not math.isfinite(value):
-        raise ValueError(f"a light of {value}")
+        raise ValueError(f"a light has the value {value}")
     return f"{value:.9g}"
 
 
 def read_light(path: Path) -> LightRecord:
-    """The light of a JSON file, checked; directions are made unit vectors."""
+    """Read and check a JSON light; directions are normalized to unit length."""
     fields = _parsed(path)
     try:
         if fields.get("format") != FORMAT:
-            raise ValueError(f"its format is not {FORMAT}")
+            raise ValueError(f"the format is not {FORMAT}")
         if "directions" not in fields and "sh" not in fields:
-            raise ValueError("it holds neither directions nor sh")
+            raise ValueError("both directions and sh are missing")
         directions, weights = torch.zeros(0, 3), torch.zeros(0, 3)
         if "directions" in fields:
             directions, weights = _rig(fields)
@@ -110,19 +116,19 @@ def _parsed(path: Path) -> dict[str, Any]:
     if path.suffix.lower() != ".json" or not path.is_file():
         raise InputError(f"{path}: {'not a .json file' if path.is_file() else 'no such file'}; {_ADVICE}")
     if path.stat().st_size > _LIMIT_BYTES:
-        raise InputError(f"{path}: larger than a light can be ({_LIMIT_BYTES >> 20} MiB); {_ADVICE}")
+        raise InputError(f"{path}: larger than {_LIMIT_BYTES >> 20} MiB; {_ADVICE}")
     try:
         fields = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
     except (OSError, ValueError, RecursionError) as error:
-        reason = "nested too deep" if isinstance(error, RecursionError) else error
+        reason = "nested too deeply" if isinstance(error, RecursionError) else error
         raise InputError(f"{path}: cannot be read as JSON ({reason}); {_ADVICE}") from None
     if not isinstance(fields, dict):
-        raise InputError(f"{path}: not a light of facerf (no JSON object); {_ADVICE}")
+        raise InputError(f"{path}: not a light of facerf (not a JSON object); {_ADVICE}")
     return fields
 
 
 def _is_attribute(value: Any) -> bool:
-    """Whether a picture's header can hold it."""
+    """Return whether an image's header can store the value."""
     if isinstance(value, str):
         return True
     return isinstance(value, int | float) and math.isfinite(value) and abs(value) < 1 << 31
@@ -134,65 +140,62 @@ def _rig(fields: dict[str, Any]) -> tuple[Tensor, Tensor]:
     if len(directions) != len(weights):
         raise ValueError(f"{len(directions)} directions but {len(weights)} weights")
     lengths = directions.norm(dim=1, keepdim=True)
-    if float((lengths - 1).abs().max()) > 1e-2:
-        raise ValueError("its directions are not unit vectors")
+    if float((lengths - 1).abs().max()) > _LENGTH_TOLERANCE:
+        raise ValueError("directions are not unit vectors")
     return directions / lengths, weights
 
 
 def _harmonics(fields: Any) -> Harmonics:
     if not isinstance(fields, dict):
-        raise ValueError("sh is no JSON object")
+        raise ValueError("sh is not a JSON object")
     coefficients = _rows(fields, "coefficients", _MOST_COEFFICIENTS)
     if math.isqrt(len(coefficients)) ** 2 != len(coefficients):
-        raise ValueError(f"{len(coefficients)} coefficients; there are 1, 4, 9, 16, ...")
+        raise ValueError(f"{len(coefficients)} coefficients instead of 1, 4, 9, 16, ...")
     return Harmonics(coefficients, str(fields.get("convention", "")))
 
 
 def _rows(fields: dict[str, Any], name: str, most: int) -> Tensor:
-    """A matrix [N, 3] of finite numbers."""
+    """Return an entry that is a matrix [N, 3] of finite numbers."""
     rows = fields.get(name)
     if not isinstance(rows, list) or not 1 <= len(rows) <= most:
-        raise ValueError(f"{name} is no list of 1 to {most} rows")
+        raise ValueError(f"{name} is not a list of 1 to {most} rows")
     if not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise ValueError(f"{name} has a row that is not 3 numbers")
     if not all(_is_finite_number(value) for row in rows for value in row):
-        raise ValueError(f"{name} has an entry that is no finite number")
+        raise ValueError(f"{name} has an entry that is not a finite number")
     return torch.tensor(rows, dtype=torch.float32)
 
 
 def _is_finite_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e30
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST
 
 
 def write_numbers(path: Path, numbers: Tensor) -> None:
-    """Write numbers [N], one a line, as DPR and SfSNet keep their lights."""
+    """Write numbers [N], one in each line, in the format of DPR and SfSNet."""
     with atomic_path(path) as temporary:
         temporary.write_text("".join(f"{value:.9g}\n" for value in numbers.tolist()), encoding="utf-8")
 
 
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Tensor:
-    """Numbers [N] of a text file, separated by any white space; N must be one of `counts`."""
+    """Read numbers [N] from a text file, separated by white space; N must be one of `counts`."""
     wanted = " or ".join(map(str, counts))
     try:
         with path.open("rb") as stream:
-            words = stream.read(1 << 16).decode("ascii").split()
+            words = stream.read(_TEXT_LIMIT_BYTES).decode("ascii").split()
         values = [float(word) for word in words]
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except ValueError:
-        raise InputError(f"{path}: not a text file of numbers; a light is {wanted} of them") from None
-    if len(values) not in counts or not all(abs(value) < 1e30 for value in values):
-        raise InputError(f"{path}: {len(values)} numbers; a light is {wanted} finite ones")
+        raise InputError(f"{path}: not a text file of numbers; a light has {wanted}") from None
+    if len(values) not in counts or not all(abs(value) < _LARGEST for value in values):
+        raise InputError(f"{path}: {len(values)} numbers; a light has {wanted}, all finite")
     return torch.tensor(values)
 
 
 def read_map_file(path: Path | str) -> Tensor:
-    """A lat-long map [H, W, 3], linear Rec.709; an InputError says what is wrong with it.
-
-    A light of `facerf estimate-light` or `convert-light` (.json) is drawn as one.
-    """
+    """Read a lat-long map [H, W, 3], linear Rec.709; a JSON light is converted to one."""
     if Path(path).suffix.lower() == ".json":
-        return _drawn(Path(path))
+        return _latlong(Path(path))
     envmap = torch.from_numpy(read_image(path, limit_px=ENVMAP_LIMIT_PX).pixels)
     try:
         check_envmap(envmap)
@@ -202,26 +205,26 @@ def read_map_file(path: Path | str) -> Tensor:
 
 
 def face_model_of_map(path: Path) -> dict[str, str]:
-    """The marks of the face model that a light was estimated with, if its file has them."""
+    """Return the attributes that name the face model with which a light was estimated, if there are any."""
     if path.suffix.lower() == ".json":
-        marks = read_light_file(path)[1]
+        attributes = read_light_file(path)[1]
     else:
         header = read_header(path)
-        marks = header.metadata if header else {}
-    return {name: str(mark) for name, mark in marks.items() if name.startswith("facerf:face_model")}
+        attributes = header.metadata if header else {}
+    return {name: str(value) for name, value in attributes.items() if name.startswith("facerf:face_model")}
 
 
-@lru_cache(maxsize=2)  # a rig's takes a while, and relight asks more than once
-def _drawn(path: Path) -> Tensor:
+@lru_cache(maxsize=2)  # converting a rig takes seconds, and relight reads the same light several times
+def _latlong(path: Path) -> Tensor:
     return read_light_file(path)[0].latlong()
 
 
 def read_light_file(path: Path) -> tuple[LightForms, Mapping[str, str | int | float]]:
-    """A JSON light's rig, or its coefficients where it has no rig; and its provenance."""
+    """Read a JSON light's rig, or its coefficients if it has no rig; and its provenance."""
     record = read_light(path)
     if len(record.directions):
         return LightForms(rig=RigLight(record.directions, record.weights)), record.attributes
     assert record.sh is not None
     if record.sh.convention != CONVENTION:
-        raise InputError(f"{path}: spherical harmonics of another convention; they are to be: {CONVENTION}")
+        raise InputError(f"{path}: spherical harmonics of another convention; convert them to: {CONVENTION}")
     return LightForms(coefficients=record.sh.coefficients), record.attributes

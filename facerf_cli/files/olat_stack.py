@@ -22,7 +22,8 @@ from torch import Tensor
 from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import HALF_MAX, Attributes, utf8_path
+from facerf_cli.files.image_metadata import Attributes, utf8_path
+from facerf_cli.files.images import HALF_MAX
 from facerf_cli.logs import one_line
 
 FORMAT = "facerf-olat-1"

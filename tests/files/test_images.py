@@ -1,4 +1,4 @@
-"""Pictures on disk: round trips, what files say of themselves, and files that are broken."""
+"""Image files: round trips, metadata, and damaged files."""
 
 import logging
 from pathlib import Path
@@ -9,6 +9,7 @@ import pytest
 
 from facerf_cli import colour
 from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.image_metadata import space_of_file
 from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr
 from facerf_cli.logs import Provenance
 
@@ -94,7 +95,7 @@ def test_pnm_by_its_bytes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_alpha_comes_apart_from_colour(tmp_path: Path, suffix: str) -> None:
+def test_alpha_is_separated_from_colour(tmp_path: Path, suffix: str) -> None:
     image = read_image(save(tmp_path / f"a.{suffix}", VALUES, "uint16"))
     np.testing.assert_allclose(image.alpha, VALUES[..., 3], atol=1e-5)
     np.testing.assert_allclose(colour.linear_to_srgb(image.pixels), VALUES[..., :3], atol=1e-5)
@@ -159,8 +160,6 @@ def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour
 def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
     spec = oiio.ImageSpec(4, 4, 3, "uint8")
     spec.attribute("ICCProfile:profile_description", "Display P3")
-    from facerf_cli.files.images import space_of_file
-
     assert space_of_file(tmp_path, spec) is colour.DISPLAY_P3
     spec.attribute("ICCProfile:profile_description", "Scanner 7")
     assert space_of_file(tmp_path, spec) is colour.SRGB
@@ -169,7 +168,7 @@ def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFix
 
 @pytest.mark.parametrize("space", [colour.ACESCG, colour.REC2020, colour.DISPLAY_P3, colour.LINEAR],
                          ids=lambda space: space.name)  # fmt: skip
-def test_the_user_s_word_stands_over_the_file_s(tmp_path: Path, space: colour.ColourSpace) -> None:
+def test_the_user_overrides_the_file_s_colour_space(tmp_path: Path, space: colour.ColourSpace) -> None:
     path = save(tmp_path / "a.png", VALUES[..., :3], "uint16")
     expected = colour.to_linear_rec709(VALUES[..., :3], space)
     np.testing.assert_allclose(read_image(path, space.name).pixels, expected, atol=1e-4)
@@ -226,15 +225,15 @@ def test_a_jpeg_that_lacks_its_last_byte_and_a_png_with_a_flipped_bit(
     "name", ["a.exr", "a.png", "a.jpg", "a.hdr", "a.tif", "a.pgm", "a.txt", "a", "a b#%04d.png"]
 )
 def test_a_text_file_is_no_image(tmp_path: Path, name: str, capfd: pytest.CaptureFixture) -> None:
-    (tmp_path / name).write_text("not a picture\n" * 20)
-    with pytest.raises(InputError, match="not a picture that can be read"):
+    (tmp_path / name).write_text("not an image\n" * 20)
+    with pytest.raises(InputError, match="not a readable image"):
         read_image(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 
 
 def test_an_unreadable_image_says_what_to_do_without_the_library_s_codes(tmp_path: Path) -> None:
     (tmp_path / "a.exr").write_text("hello, I am text\n")
-    with pytest.raises(InputError, match=r"save it anew as .* \(EXR Error: File is not an OpenEXR file\)$"):
+    with pytest.raises(InputError, match=r"save it again as .* \(EXR Error: File is not an OpenEXR file\)$"):
         read_image(tmp_path / "a.exr")
     (tmp_path / "b.jpg").touch()
     with pytest.raises(InputError, match="the file is empty"):
@@ -267,9 +266,9 @@ def test_nan_and_infinity_are_counted(tmp_path: Path, warned: pytest.LogCaptureF
     path = save(tmp_path / "a.exr", values)
     with pytest.raises(InputError, match="2 of 782 pixels are NaN or infinite"):
         read_image(path)
-    mended = read_image(path, non_finite="zero").pixels
+    replaced = read_image(path, non_finite="zero").pixels
     assert "2 pixels are NaN or infinite" in warned.text
-    np.testing.assert_array_equal(mended, np.where(np.isfinite(values), values, 0))
+    np.testing.assert_array_equal(replaced, np.where(np.isfinite(values), values, 0))
 
 
 def test_exr_round_trip_with_layers_and_provenance(tmp_path: Path) -> None:
@@ -300,7 +299,7 @@ def test_exr_round_trip_with_layers_and_provenance(tmp_path: Path) -> None:
     assert not list(path.parent.glob(".*"))
 
 
-def test_exr_keeps_what_display_would_clip_and_says_what_half_cannot_hold(tmp_path: Path) -> None:
+def test_exr_keeps_values_beyond_1_and_counts_those_beyond_half(tmp_path: Path) -> None:
     values = np.array([[[-3, 1e-4, 6e4], [1e6, -1e6, 0]]], np.float32)
     assert write_exr(tmp_path / "a.exr", values) == 2
     expected = np.array([[[-3, 1e-4, 6e4], [HALF_MAX, -HALF_MAX, 0]]])
@@ -321,7 +320,7 @@ def test_display_round_trip_with_exposure(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(colour.linear_to_srgb(shown.pixels), expected, atol=tolerance)
 
 
-def test_display_auto_exposure_is_told_and_alpha_is_kept_straight(tmp_path: Path) -> None:
+def test_display_auto_exposure_is_returned_and_alpha_is_not_premultiplied(tmp_path: Path) -> None:
     linear, alpha = VALUES[..., :3] * 0.01, VALUES[..., 3]
     chosen_ev = write_display(tmp_path / "a.png", linear, "auto", alpha, Provenance("me.jpg").attributes())
     assert chosen_ev == colour.auto_exposure_ev(linear, alpha)
@@ -352,6 +351,6 @@ def test_real_files(shared_data: Path) -> None:
     assert face.pixels.shape == (192, 168, 3) and face.colourspace_name == "sRGB"
 
 
-def test_no_hour_is_written_so_that_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
+def test_no_time_is_written_so_that_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", VALUES[..., :3])
     assert b"capDate" not in (tmp_path / "a.exr").read_bytes()

@@ -18,56 +18,58 @@ from facerf_cli.files.light_files import (
 )
 
 
-def drawn(rows: int) -> torch.Tensor:
+def random_rows(rows: int) -> torch.Tensor:
     return torch.randn(rows, 3, generator=torch.Generator().manual_seed(rows))
 
 
-def a_light() -> LightRecord:
-    directions = torch.nn.functional.normalize(drawn(7), dim=-1)
-    return LightRecord(directions, drawn(7), "seven", Harmonics(drawn(9), "ours"), {"facerf:input": "ä.jpg"})
+def make_light() -> LightRecord:
+    directions = torch.nn.functional.normalize(random_rows(7), dim=-1)
+    return LightRecord(
+        directions, random_rows(7), "seven", Harmonics(random_rows(9), "ours"), {"facerf:input": "ä.jpg"}
+    )
 
 
 def test_a_light_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    before, path = a_light(), tmp_path / "deep" / "light.json"
+    before, path = make_light(), tmp_path / "deep" / "light.json"
     with np.printoptions(legacy="1.13"):  # as colour-science sets it for its whole process
         write_light(path, before)
     after = read_light(path)
-    torch.testing.assert_close(after.directions, before.directions, rtol=0, atol=1e-6)  # made unit again
+    torch.testing.assert_close(after.directions, before.directions, rtol=0, atol=1e-6)  # normalized again
     assert torch.equal(after.weights, before.weights)
     assert before.sh and after.sh and torch.equal(after.sh.coefficients, before.sh.coefficients)
     assert (after.rig, after.sh.convention, after.attributes) == ("seven", "ours", before.attributes)
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_file_is_plain_json_that_says_its_units(tmp_path: Path) -> None:
-    write_light(tmp_path / "a.json", a_light())
+def test_the_file_is_plain_json_with_its_units(tmp_path: Path) -> None:
+    write_light(tmp_path / "a.json", make_light())
     fields = json.loads((tmp_path / "a.json").read_text())
     assert fields["format"] == FORMAT and "white" in fields["units"] and "camera" in fields["axes"]
     assert [len(row) for row in fields["weights"]] == [3] * 7 and fields["sh"]["order"] == 2
 
 
-def test_coefficients_alone_are_a_light(tmp_path: Path) -> None:
-    write_light(tmp_path / "a.json", LightRecord(torch.zeros(0, 3), torch.zeros(0, 3), sh=a_light().sh))
+def test_a_light_may_have_coefficients_alone(tmp_path: Path) -> None:
+    write_light(tmp_path / "a.json", LightRecord(torch.zeros(0, 3), torch.zeros(0, 3), sh=make_light().sh))
     after = read_light(tmp_path / "a.json")
     assert len(after.directions) == 0 and after.sh is not None and len(after.sh.coefficients) == 9
 
 
 BAD: dict[str, dict[str, Any]] = {
     "format is not": {"format": "other"},
-    "neither directions": {"directions": None},
+    "both directions and sh": {"directions": None},
     "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
     "not unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
     "weights has a row that is not 3": {"weights": [[1, 1, 1], [1, 1]]},
     "weights has an entry": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
     "weights has an entry that": {"weights": [[1, 1, 1], [1, 1, "2"]]},
-    "directions is no list of 1 to 4096": {"directions": []},
+    "directions is not a list of 1 to 4096": {"directions": []},
     "8 coefficients": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
-    "sh is no": {"sh": 5},
+    "sh is not": {"sh": 5},
 }
 
 
 @pytest.mark.parametrize("complaint", BAD)
-def test_what_is_wrong_is_said_in_a_line(complaint: str, tmp_path: Path) -> None:
+def test_an_error_is_one_line_that_names_the_fault(complaint: str, tmp_path: Path) -> None:
     good = {"format": FORMAT, "directions": [[1, 0, 0], [0, 1, 0]], "weights": [[1, 1, 1], [2, 2, 2]]}
     fields = {name: value for name, value in (good | BAD[complaint]).items() if value is not None}
     (tmp_path / "a.json").write_text(json.dumps(fields))
@@ -85,12 +87,12 @@ def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
         read_light(tmp_path / "b.json")
 
 
-def test_numbers_one_a_line(tmp_path: Path) -> None:
+def test_numbers_are_written_one_in_each_line(tmp_path: Path) -> None:
     path = tmp_path / "light.txt"
-    write_numbers(path, drawn(3).reshape(9))
+    write_numbers(path, random_rows(3).reshape(9))
     assert len(path.read_text().splitlines()) == 9
-    assert torch.equal(read_numbers(path, (9, 27)), drawn(3).reshape(9))
-    with pytest.raises(InputError, match="9 numbers; a light is 27"):
+    assert torch.equal(read_numbers(path, (9, 27)), random_rows(3).reshape(9))
+    with pytest.raises(InputError, match="9 numbers; a light has 27"):
         read_numbers(path, (27,))
     path.write_text("1 2 three")
     with pytest.raises(InputError, match="not a text file of numbers"):

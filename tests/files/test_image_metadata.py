@@ -1,8 +1,10 @@
-"""Headers of pictures, read without their pixels."""
+"""Headers of images and their XMP packets."""
 
 import math
 import os
+import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import OpenImageIO as oiio
@@ -10,8 +12,12 @@ import pytest
 
 from facerf_cli.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import read_header, read_image, write_display, write_exr
+from facerf_cli.files.image_metadata import read_header, xmp_packet
+from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import is_olat_stack
+from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, Provenance
+
+IPTC = "{http://iptc.org/std/Iptc4xmpExt/2008-02-29/}DigitalSourceType"
 
 
 def test_size_kind_and_space(tmp_path: Path) -> None:
@@ -51,7 +57,7 @@ def write_primaries(path: Path, chromaticities: tuple[float, ...], kind: str = "
 @pytest.mark.parametrize(
     "space", [ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020], ids=lambda space: space.name
 )
-def test_primaries_that_are_known_have_their_name(tmp_path: Path, space: ColourSpace) -> None:
+def test_known_primaries_get_their_name(tmp_path: Path, space: ColourSpace) -> None:
     assert space.chromaticities is not None
     path = write_primaries(tmp_path / "a.exr", space.chromaticities)
     header = read_header(path)
@@ -71,24 +77,24 @@ def test_primaries_that_are_known_have_their_name(tmp_path: Path, space: ColourS
     ],
     ids=["one point", "zero", "NaN", "huge", "a primary without luminance", "white outside"],
 )
-def test_primaries_that_span_no_colours_are_left(
+def test_impossible_primaries_are_ignored(
     tmp_path: Path, chromaticities: tuple[float, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
     path = write_primaries(tmp_path / "a.exr", chromaticities)
     header = read_header(path)
     assert header is not None and header.space == LINEAR
-    assert "no colours that can be" in caplog.text
+    assert "impossible primaries" in caplog.text
     assert read_image(path).pixels == pytest.approx(0.5)
 
 
-def test_primaries_of_another_form_are_none(tmp_path: Path) -> None:
+def test_primaries_of_another_type_are_ignored(tmp_path: Path) -> None:
     header = read_header(write_primaries(tmp_path / "a.exr", (0.3,) * 6, "float[6]"))
     assert header is not None and header.space == LINEAR
 
 
-def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
+def test_a_name_that_is_not_utf8_is_an_error(tmp_path: Path) -> None:
     name = tmp_path / os.fsdecode(b"\xff.png")
-    name.write_bytes(b"no picture")
+    name.write_bytes(b"not an image")
     for read in (read_header, read_image, is_olat_stack):
         with pytest.raises(InputError, match="not UTF-8; rename"):
             read(name)
@@ -96,7 +102,27 @@ def test_a_name_that_is_not_utf8_is_said(tmp_path: Path) -> None:
         write_display(name, np.zeros((2, 2, 3), np.float32))
 
 
-def test_no_image_has_no_header(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"no picture")
+def test_a_file_that_is_no_image_has_no_header(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"not an image")
     assert read_header(tmp_path / "a.png") is None and read_header(tmp_path / "b.png") is None
     assert read_header(tmp_path) is None and oiio.geterror() == ""
+
+
+def properties(data: bytes) -> dict[str, str]:
+    (packet,) = re.findall(rb"<x:xmpmeta.*?</x:xmpmeta>", data, re.S)
+    return ElementTree.fromstring(packet)[0][0].attrib
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_xmp_marks_a_display_image_as_synthetic(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    pixels = np.full((9, 14, 3), 0.25, np.float32)
+    write_display(path, pixels, metadata=Provenance('a "b" <c> ü.jpg', "default").attributes())
+    found = properties(path.read_bytes())
+    assert found[IPTC] == COMPOSITE_SOURCE_TYPE and found["{urn:facerf:1}synthetic"] == "1"
+    assert found["{urn:facerf:1}input"] == 'a "b" <c> ü.jpg'
+    np.testing.assert_allclose(read_image(path).pixels, pixels, atol=0.01)  # and is still readable
+
+
+def test_attributes_without_an_xmp_name_are_left_out() -> None:
+    assert b"compression" not in xmp_packet({"compression": "zip"})

@@ -1,0 +1,174 @@
+"""Image files without their pixels: size, number format and colour space in the header; XMP provenance.
+
+Provenance is written as an XMP packet into PNG and JPEG files, where viewers look for IPTC's digital source
+type.
+"""
+
+import logging
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import OpenImageIO as oiio
+
+from facerf_cli.colour import (
+    ADOBE_RGB,
+    DISPLAY_P3,
+    LINEAR,
+    REC2020,
+    SRGB,
+    ColourSpace,
+    find_space,
+    linear_space,
+)
+from facerf_cli.errors import InputError
+from facerf_cli.logs import LOGGER_NAME
+
+Attributes = Mapping[str, str | int | float]
+
+# Colour spaces by a part of an ICC profile's description in lower case; the first match counts.
+_ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+_PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
+_XMP_NAMESPACES = {
+    "Iptc4xmpExt": "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
+    "xmp": "http://ns.adobe.com/xap/1.0/",
+    "facerf": "urn:facerf:1",
+}
+# Attributes that XMP calls by another name.
+_XMP_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "Software": "xmp:CreatorTool"}
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class Header:
+    """An image's upright size and the kind of its values."""
+
+    width_px: int
+    height_px: int
+    is_floating: bool
+    bits: int  # of a value
+    space: ColourSpace  # as the file states; without a statement linear for floats, sRGB for integers
+    metadata: dict[str, Any]
+
+
+def read_header(path: Path) -> Header | None:
+    """Read the header of an image's first part; return None if the file is not a readable image."""
+    stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
+    if stream is None:
+        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        return None
+    spec = stream.spec()
+    stream.close()
+    width, height = spec.full_width, spec.full_height
+    if spec.get_int_attribute("Orientation", 1) >= 5:  # rotated by 90 degrees
+        width, height = height, width
+    floating, bits = is_floating(spec), 8 * spec.format.size()
+    return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+
+
+def utf8_path(path: Path) -> str:
+    """Return the path for OpenImageIO, which takes only UTF-8; raise an InputError for any other name."""
+    try:
+        path.as_posix().encode()
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
+        ) from None
+    return str(path)
+
+
+def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
+    """Return the attributes that are text, numbers or tuples, without the orientation."""
+    plain = (str, int, float, tuple)
+    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
+    attributes.pop("Orientation", None)  # `read_image` turns the image upright
+    return attributes
+
+
+def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
+    """Return the colour space that the file states; by default floats are linear Rec.709, integers sRGB."""
+    default = LINEAR if is_floating(spec) else SRGB
+    profile = spec.get_string_attribute("ICCProfile:profile_description")
+    name = profile or spec.get_string_attribute("oiio:ColorSpace")
+    if profile:
+        named = next((space for part, space in _ICC_SPACES.items() if part in profile.lower()), None)
+    elif name in ("", "Rec709"):  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
+        named = default
+    else:
+        named = find_space(name)
+    if named is None:
+        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
+        named = default
+    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
+    if not chromaticities or not named.is_linear:
+        return named
+    by_primaries = linear_space(chromaticities)
+    if by_primaries is None:
+        log.warning("%s: impossible primaries in the header; those of %s are used", path, named.name)
+    return named if by_primaries in (None, LINEAR) else by_primaries
+
+
+def is_floating(spec: oiio.ImageSpec) -> bool:
+    """Return whether values are half, single or double precision floats."""
+    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
+
+
+def require_whole_png(path: Path) -> None:
+    """Check the chunks and checksums of a PNG file to its end; a file of another kind passes.
+
+    OpenImageIO does not report such damage reliably.
+    """
+    with path.open("rb") as stream:
+        if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
+            return
+        kind = b""
+        while kind != b"IEND":
+            head = stream.read(8)
+            length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
+            body, checksum = stream.read(length), stream.read(4)
+            if len(body) != length or len(checksum) != 4:
+                raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
+            if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
+                raise InputError(f"{path}: damaged: a checksum of the PNG file is wrong; copy it again")
+
+
+def embed_xmp(path: Path, metadata: Attributes) -> None:
+    """Insert an XMP packet into a finished PNG or JPEG; a file of another kind stays as it is."""
+    data = path.read_bytes() if path.suffix.lower() in (".png", ".jpg", ".jpeg") else b""
+    packet = xmp_packet(metadata)
+    if data.startswith(_JPEG_START):
+        body = _JPEG_XMP_SIGNATURE + packet
+        segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
+        at = len(_JPEG_START)
+        if data[at : at + 2] == b"\xff\xe0":  # the JFIF segment must stay first
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    elif data.startswith(_PNG_SIGNATURE):
+        body = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + packet
+        segment = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        at = len(_PNG_SIGNATURE) + 25  # after the header chunk, whose length is fixed
+    else:
+        return
+    path.write_bytes(data[:at] + segment + data[at:])
+
+
+def xmp_packet(metadata: Attributes) -> bytes:
+    """Return an XMP packet with the attributes that have an XMP name; the others are left out."""
+    named = {_XMP_PROPERTIES.get(name, name): value for name, value in metadata.items()}
+    properties = [
+        f"{name}={quoteattr(str(value))}"
+        for name, value in named.items()
+        if name.split(":")[0] in _XMP_NAMESPACES
+    ]
+    namespaces = [f'xmlns:{prefix}="{address}"' for prefix, address in _XMP_NAMESPACES.items()]
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" {" ".join([*namespaces, *properties])}/></rdf:RDF></x:xmpmeta>'
+        '<?xpacket end="w"?>'
+    ).encode()
