@@ -18,12 +18,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from facerf_cli.baselines.field import Field, explain_by_field
 from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
-from facerf_cli.baselines.field import Field, explain_by_field
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs
 from facerf_cli.evaluation.methods import View
@@ -34,9 +34,10 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.metrics import mean_interval, si_mse_clipped
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.pipeline import FaceTexture, Models, estimate_photo_light, load_models, turn_to, weigh
-from facerf_cli.synth.heads_bank import Bank, geometry_of
+from facerf_cli.synth.head_fields import head_fields
+from facerf_cli.synth.heads_bank import Bank
 from facerf_cli.synth.texture_samples import Sample, draw_light
-from facerf_cli.training.diffuse_sh_objective import draw_sums, explained, summed
+from facerf_cli.training.diffuse_sh_objective import draw_sums, predicted_images, sum_lights
 from facerf_cli.training.losses import clipped_si_mse
 from facerf_cli.training.objective import seeded
 
@@ -88,9 +89,10 @@ def on_heads(models: Models, network: DiffuseNetwork, folder: Path, draws: int) 
             generator = seeded(12345, int(head), draw)
             sample = bank.draw(head[None], _LIGHTS, generator)
             weights = draw_sums(_SUMS, _LIGHTS, generator)
-            batch = summed(sample, weights, head[None])
+            batch = sum_lights(sample, weights, head[None])
             estimate = network(batch.source, batch.normals_source, batch.visible)
-            found = {"network": explained(estimate, batch), "field": _by_field(models, sample, weights)}
+            by_field = _by_field(models, sample, weights)
+            found = {"network": predicted_images(estimate, batch), "field": by_field}
             for method, (own, relit) in found.items():
                 of_source = clipped_si_mse(own, batch.source[:, None], batch.visible)
                 of_sums = clipped_si_mse(relit, batch.targets, batch.weight)
@@ -103,7 +105,7 @@ def _held_out(folder: Path) -> Bank:
     """The mean face and the held-out heads of a bank."""
     heads = sorted((folder / "heads").glob("*.safetensors"))[: _HELD_OUT + 1]
     views = [load_file(folder / "views-builtin" / path.name) for path in heads]
-    return Bank([geometry_of(load_file(path)) for path in heads], views, {})
+    return Bank([head_fields(load_file(path)) for path in heads], views, {})
 
 
 def _by_field(models: Models, sample: Sample, weights: Tensor) -> tuple[Tensor, Tensor]:

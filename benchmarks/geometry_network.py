@@ -46,7 +46,7 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.image_samples import RenderedFaces
+from facerf_cli.synth.face_crops import RenderedFaces
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 
 CROP_PX = 256

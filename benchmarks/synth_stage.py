@@ -18,7 +18,7 @@ from facerf_cli.face.landmarks import detect_landmarks, to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.raster.camera import project
-from facerf_cli.synth.stage import stage_cameras
+from facerf_cli.synth.stage_cameras import stage_cameras
 
 ITA_CLASSES = (
     (55, "very light"),

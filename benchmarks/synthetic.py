@@ -34,7 +34,8 @@ from facerf_cli.metrics import TONES, Interval, ita_deg, mean_interval, tone_dri
 from facerf_cli.pipeline import load_models
 from facerf_cli.synth.appearance import skin as appearance
 from facerf_cli.synth.appearance.people import People, draw_people
-from facerf_cli.synth.heads_bank import Bank, geometry_of
+from facerf_cli.synth.head_fields import head_fields
+from facerf_cli.synth.heads_bank import Bank
 from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.losses import clipped_si_mse, si_mse
 from facerf_cli.training.objective import seeded
@@ -94,8 +95,8 @@ def held_out_bank(folder: Path, fit_with: str, count: int) -> tuple[Bank, Tensor
     if len(paths) <= count:
         raise SystemExit(f"{folder}: {len(paths)} heads with {views.name}, {count + 1} are needed")
     held = paths[: count + 1]
-    geometries = [geometry_of(load_file(path)) for path in held]
-    return Bank(geometries, [load_file(views / path.name) for path in held], {}), torch.arange(1, count + 1)
+    baked = [head_fields(load_file(path)) for path in held]
+    return Bank(baked, [load_file(views / path.name) for path in held], {}), torch.arange(1, count + 1)
 
 
 @torch.no_grad()

@@ -33,7 +33,7 @@ from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
-from facerf_cli.synth.views import StageCamera
+from facerf_cli.synth.stage_cameras import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and what a picture's side takes in
 CHART = 128  # texels along the chart's side
@@ -122,7 +122,7 @@ def render_both(
     """Diffuse pictures [L, 3, H, W] of each camera by both renderers; their seconds go into `times`."""
     head = build_head(model, alpha, torch.zeros(len(model.expression)))
     wanted = seen_vertices(head, cameras)
-    bake = BakeSettings(lamp_radius_deg=0, bounce_samples=64 if settings.bounces else 0)
+    bake = BakeSettings(light_radius_deg=0, bounce_samples=64 if settings.bounces else 0)
     started = time.perf_counter()
     transport = bake_mesh(head.vertices, head.normals, head.triangles, directions, bake, seed, wanted)
     times["bake"].append(time.perf_counter() - started)

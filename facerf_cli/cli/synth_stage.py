@@ -47,7 +47,8 @@ def synth_stage(
     --subjects adds people and changes none.
     """
     from facerf_cli.synth.path_tracer import load_mitsuba
-    from facerf_cli.synth.stage import StageSettings, close_capture, open_capture, subject_model
+    from facerf_cli.synth.stage import StageSettings, close_capture, open_capture
+    from facerf_cli.synth.subjects import subject_model
 
     if transport and renderer != "bake":
         raise UsageError("--transport keeps the bake, and --renderer mitsuba makes none")
@@ -82,7 +83,8 @@ class _Photograph:
         return [item.output_base] if transport is None else [item.output_base, transport]
 
     def __call__(self, item: Item) -> Outcome:
-        from facerf_cli.synth.stage import draw_subject, subject_model, write_subject
+        from facerf_cli.synth.stage import write_subject
+        from facerf_cli.synth.subjects import draw_subject, subject_model
         from facerf_cli.synth.threads import one_thread
 
         model = subject_model(self.stage.face_model)

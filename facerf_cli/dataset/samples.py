@@ -24,8 +24,8 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map
-from facerf_cli.synth.heads_bank import GeometrySettings, bake_head
-from facerf_cli.synth.texture_samples import Sample, draw_light, draw_target_lights, photograph
+from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_head
+from facerf_cli.synth.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
 
 _SAME_POSE_SHARE = 0.5  # of samples without pairs, as `pairs.py` draws them
 _MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network
@@ -59,7 +59,7 @@ class DatasetTextures:
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the face model's mean."""
-        settings = GeometrySettings(_MEAN_SIDE, self.rig_lights, bake=BakeSettings(bounce_samples=0))
+        settings = HeadBakeSettings(_MEAN_SIDE, self.rig_lights, bake=BakeSettings(bounce_samples=0))
         mean = bake_head(self.model, 0, 0, settings)
         normals = normal_map(mean["vertices"], grid_triangles(), _MEAN_SIDE)
         return normals, mean["visibility"].float() / 255, mean["directions"]
@@ -74,7 +74,7 @@ class DatasetTextures:
         lights = min(lights, *(len(self.dataset.lights_of(subject)) for subject in subjects))
         faces = [self._draw_face(subject, lights, generator) for subject in subjects]
         visible = torch.stack([face.source.visible for face in faces])
-        source, target = photograph(
+        source, target = simulate_camera(
             torch.stack([face.texture for face in faces]),
             torch.stack([face.target for face in faces]),
             torch.stack([face.source.lit for face in faces]),

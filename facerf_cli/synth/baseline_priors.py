@@ -1,9 +1,8 @@
-"""The priors of the baselines, learnt from procedural skins and maps.
+"""Learn the priors of the baselines from procedural skins and envmaps.
 
-`python -m facerf_cli.synth.baseline_priors FILE` writes the asset that `baselines/priors.py` loads; no dataset
-uses its seeds. Light differs by direction: there is more from above than from below, and its colours vary
-together. Its prior has the mean and covariance of procedural maps, turned about the vertical, each of mean
-radiance 1.
+`python -m facerf_cli.synth.baseline_priors FILE` writes the asset that `baselines/priors.py` loads. Its seeds
+are used by no dataset. The prior of light is the mean and covariance of procedural maps of mean radiance 1,
+rotated about the vertical: more light comes from above, and the colours of directions are correlated.
 """
 
 import sys
@@ -19,27 +18,28 @@ from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
 from facerf_cli.network.checkpoint import save_checkpoint
 from facerf_cli.synth.appearance.people import draw_people
 from facerf_cli.synth.appearance.skin import paint_skin
-from facerf_cli.synth.random_fields import UV_SPAN, Window, mask
+from facerf_cli.synth.random_fields import Window, mask
 from facerf_cli.synth.sky.skies import draw_sky
 
 SEED = 52017
 SKINS, MAPS = 1500, 600
 DIFFUSE_MODES, GLOSS_MODES, LIGHT_MODES = 50, 8, 160
 LIGHT_ORDER = 8
-_AT_ONCE, _MAP_PX = 50, 64
-_TURNS = 8  # of a map about the vertical
-_TEETH, _DARK = 0.5, 0.06  # as `synth/appearance/skin.py` has them
-_SHINE = 0.3  # deviation of the logarithm of all of a face's gloss, as photographs differ in it
+_AT_ONCE = 50  # skins painted at a time
+_MAP_PX = 64  # width of an envmap
+_TURNS = 8  # random azimuths per map
+_TEETH, _DARK = 0.5, 0.06  # albedo in an open mouth, as in `synth/appearance/skin.py`
+_SHINE = 0.3  # standard deviation of the logarithm of a face's overall gloss
 
 
 def learn_skin(skins: int = SKINS) -> tuple[LogGaussian, LogGaussian]:
-    """Diffuse albedo and gloss of procedural skins with painted eyes; nobody wears random colours."""
+    """Learn diffuse albedo and gloss from procedural skins with painted eyes, without random colours."""
     generator = torch.Generator().manual_seed(SEED)
     diffuse, gloss = [], []
     for first in range(0, skins, _AT_ONCE):
         people = draw_people(min(_AT_ONCE, skins - first), generator)
         people = replace(people, random_texture=torch.zeros_like(people.random_texture))
-        skin = paint_skin(people, Window(SIDE, UV_SPAN), generator, painted_eyes=True)
+        skin = paint_skin(people, Window(SIDE), generator, painted_eyes=True)
         shine = _SHINE * torch.randn(len(skin.specular), 1, 1, 1, generator=generator)
         diffuse.append(_with_mouths(skin.albedo, generator).log())
         gloss.append(skin.specular.log() + shine)
@@ -47,15 +47,15 @@ def learn_skin(skins: int = SKINS) -> tuple[LogGaussian, LogGaussian]:
 
 
 def _with_mouths(albedo: Tensor, generator: torch.Generator) -> Tensor:
-    """Lips [B, 3, t, t] as they are when closed, or open on teeth, or on the dark."""
-    inside = mask(Window(SIDE, UV_SPAN), "mouth", 1.0)
+    """Leave the lips of skins [B, 3, t, t] closed, or open them on teeth or on a dark mouth."""
+    inside = mask(Window(SIDE), "mouth", 1.0)
     kind = torch.randint(3, (len(albedo), 1, 1, 1), generator=generator)
     between = torch.where(kind == 1, _TEETH, _DARK)
     return torch.where(kind == 0, albedo, albedo + inside * (between - albedo))
 
 
 def learn_light(maps: int = MAPS) -> LightPrior:
-    """Coefficients of procedural maps of mean radiance 1, at random azimuths."""
+    """Learn spherical-harmonic coefficients from procedural maps at random azimuths."""
     random = torch.Generator().manual_seed(SEED)
     basis = sh_basis(latlong_directions(_MAP_PX // 2, _MAP_PX), LIGHT_ORDER)
     basis = basis * latlong_solid_angles(_MAP_PX // 2, _MAP_PX)[..., None]
@@ -69,7 +69,7 @@ def learn_light(maps: int = MAPS) -> LightPrior:
 
 
 def _principal(samples: Tensor, modes: int) -> LogGaussian:
-    """Mean and principal components of samples [N, ...], each scaled by its standard deviation."""
+    """Compute the mean and the principal components of samples [N, ...], scaled to standard deviations."""
     mean = samples.mean(0)
     centred = (samples - mean).flatten(1).double()
     wide = centred.shape[1] > len(centred)
@@ -81,7 +81,7 @@ def _principal(samples: Tensor, modes: int) -> LogGaussian:
 
 
 def main(path: Path) -> None:
-    """Write the asset."""
+    """Learn the priors and write them to `path`."""
     diffuse, gloss = learn_skin()
     light = learn_light()
     parts = {"diffuse": diffuse, "gloss": gloss, "light": light}

@@ -1,8 +1,8 @@
-"""The same photographs by a path tracer, Mitsuba 3 in its variant scalar_rgb: the bake renderer's yardstick.
+"""Images of a synthetic head by path tracing in Mitsuba 3 (scalar_rgb): the reference for the bake renderer.
 
-Geometry, normals, textures, relief, lamps at infinity, bounces of diffuse light and the two glossy lobes are
-in it. Scattering under the skin is not, and hair is diffuse and glossy like any other surface; no lamp has a
-size, so every shadow is hard. Needs the extra: pip install 'facerf[synth]'.
+The scene has geometry, normals, textures, relief, directional lights, diffuse bounces and the two specular
+lobes. It has no subsurface scattering, hair is shaded like any other surface, and all shadows are hard.
+Requires the extra: pip install 'facerf[synth]'.
 """
 
 import math
@@ -19,14 +19,14 @@ from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.random_fields import CANVAS_SPAN
 from facerf_cli.synth.shading import LOBES
-from facerf_cli.synth.views import StageCamera
+from facerf_cli.synth.stage_cameras import StageCamera
 
-_LIGHT = "light.to_world"
+_LIGHT = "light.to_world"  # parameter that turns the light
 
 
 @dataclass(frozen=True)
 class PathSettings:
-    """Paths a pixel for diffuse and for glossy light; diffuse bounces after the first hit."""
+    """Paths per pixel for diffuse light and for highlights, and diffuse bounces after the first hit."""
 
     samples: int = 64
     gloss_samples: int = 32
@@ -43,7 +43,7 @@ def photograph(
     settings: PathSettings = PathSettings(),
     seed: int = 0,
 ) -> tuple[Tensor, Tensor]:
-    """Pictures [L, 3, H, W] linear float32, lights of rgb 1 in `directions` [L, 3], and coverage [H, W]."""
+    """Render linear images [L, 3, H, W] under lights of rgb 1 at `directions` [L, 3], and coverage [H, W]."""
     mi = load_mitsuba()
     diffuse = _Scene(mi, _scene(mi, head, appearance, camera, settings, glossy=False))
     glossy = (
@@ -60,12 +60,12 @@ def photograph(
 
 
 def load_mitsuba() -> types.ModuleType:
-    """The module with its variant set; UsageError where it is not installed."""
+    """Import mitsuba and set its variant; raise UsageError if it is not installed."""
     try:
         import mitsuba
     except ImportError as error:
         raise UsageError(
-            f"the renderer 'mitsuba' is not installed ({error}): pip install 'facerf[synth]'"
+            f"renderer mitsuba: not installed ({error}); run pip install 'facerf[synth]'"
         ) from error
     if mitsuba.variant() != "scalar_rgb":
         mitsuba.set_variant("scalar_rgb")
@@ -73,7 +73,7 @@ def load_mitsuba() -> types.ModuleType:
 
 
 class _Scene:
-    """A loaded scene, whose one lamp moves."""
+    """A loaded scene with one movable light."""
 
     def __init__(self, mi: types.ModuleType, description: dict[str, Any]) -> None:
         self._mi = mi
@@ -81,14 +81,14 @@ class _Scene:
         self._parameters = mi.traverse(self._scene)
 
     def render(self, direction: np.ndarray, samples: int, seed: int) -> np.ndarray:
-        """One picture [H, W, 4] and its coverage under a light from the unit direction [3]."""
+        """Render an image with coverage [H, W, 4] under a light at the unit direction [3]."""
         self._parameters[_LIGHT] = self._mi.ScalarTransform4f(_looking_along(-direction))
         self._parameters.update()
         return np.array(self._mi.render(self._scene, seed=seed, spp=samples), np.float32)
 
 
 def _looking_along(direction: np.ndarray) -> np.ndarray:
-    """A rigid motion [4, 4] whose z axis is the unit direction [3]."""
+    """Rotation [4, 4] whose z axis is the unit direction [3]."""
     helper = np.eye(3)[np.argmin(np.abs(direction))]
     x = np.cross(helper, direction)
     x /= np.linalg.norm(x)
@@ -105,6 +105,7 @@ def _scene(
     settings: PathSettings,
     glossy: bool,
 ) -> dict[str, Any]:
+    """Describe the scene with only diffuse or only specular surfaces."""
     meshes = {}
     for index in np.unique(head.part):
         name = PARTS[index]
@@ -127,7 +128,7 @@ def _scene(
 
 
 def _mesh(mi: types.ModuleType, head: HeadMesh, part: int, surface: Any) -> Any:
-    """The triangles of one part, with normals and places in its texture."""
+    """Triangles of one part, with normals and texture coordinates."""
     triangles = head.triangles[head.part[head.triangles[:, 0]] == part]
     used, corners = np.unique(triangles, return_inverse=True)
     properties = mi.Properties()
@@ -153,7 +154,7 @@ def _mesh(mi: types.ModuleType, head: HeadMesh, part: int, surface: Any) -> Any:
 
 
 def _sensor(mi: types.ModuleType, stage_camera: StageCamera) -> dict[str, Any]:
-    """Mitsuba's camera looks along its z axis with x to the left; its box filter is a pixel's square."""
+    """Describe the camera. Mitsuba's looks along +z with x to the left; a box filter covers one pixel."""
     camera = stage_camera.camera
     head_to_camera = np.eye(4)
     head_to_camera[:3, :3] = stage_camera.head_to_camera.double().numpy()
@@ -184,7 +185,7 @@ def _diffuse(mi: types.ModuleType, material: Material) -> dict[str, Any]:
 
 
 def _gloss(mi: types.ModuleType, material: Material) -> dict[str, Any]:
-    """The two lobes of `shading.LOBES`: as a metal, `principled` is all gloss, under Schlick's Fresnel."""
+    """Describe the two lobes of `shading.LOBES`; a metallic `principled` has no diffuse part."""
     lobes = [
         {
             "type": "principled",
@@ -198,7 +199,7 @@ def _gloss(mi: types.ModuleType, material: Material) -> dict[str, Any]:
 
 
 def _bumped(mi: types.ModuleType, material: Material, surface: dict[str, Any]) -> dict[str, Any]:
-    """A surface under normals tilted by its relief; Mitsuba's second axis points against v."""
+    """Tilt the normals of a surface by its relief; Mitsuba's second tangent points against v."""
     along_u, along_v = material.relief
     normals = torch.stack([-along_u, along_v, torch.ones_like(along_u)])
     normals = normals / normals.norm(dim=0, keepdim=True)
@@ -206,6 +207,6 @@ def _bumped(mi: types.ModuleType, material: Material, surface: dict[str, Any]) -
 
 
 def _texture(mi: types.ModuleType, texture: Tensor) -> dict[str, Any]:
-    """A texture [C, H, W] of plain numbers, bilinear, clamped at the borders."""
+    """Describe a texture [C, H, W] of raw values, bilinear, clamped at the borders."""
     pixels = np.ascontiguousarray(texture.permute(1, 2, 0).float().numpy())
     return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": "clamp"}

@@ -1,8 +1,6 @@
-"""A square window of the chart's plane that skin is painted in: the chart itself, or the wider canvas.
+"""Fields painted on a window of UV space: region masks, smooth noise and single hairs.
 
-Noise and strokes on a window of the chart, in millimetres, so that they look the same at every size.
-
-Random numbers between bounds, by a generator of one's own.
+Sizes are in millimetres on the unrolled mean face, so that a field looks the same at every resolution.
 """
 
 from dataclasses import dataclass
@@ -13,86 +11,99 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.face.topology import CHART_MM, LANDMARK_UV, inside_mm
+from facerf_cli.face.topology import LANDMARK_UV, UV_SIZE_MM, inside_mm
 from facerf_cli.raster.texture import texel_centres_uv
 
-CHART_SPAN, CANVAS_SPAN = (0.0, 1.0), (-0.5, 1.5)  # of u and of v
-LANDMARK_MM = (LANDMARK_UV - [0.5, 0]) * CHART_MM  # [68, 2]
-_PAIRED = ("eyes", "brows", "nostrils")  # regions that are measured on the picture's left alone
+# Range of u and of v: the UV map of the face, and the wider canvas for the skin of the whole head.
+UV_SPAN, CANVAS_SPAN = (0.0, 1.0), (-0.5, 1.5)
+LANDMARK_MM = (LANDMARK_UV - [0.5, 0]) * UV_SIZE_MM  # [68, 2], as `places_mm`
+_PAIRED = ("eyes", "brows", "nostrils")  # `inside_mm` covers only the left part of these
+
+
+@dataclass(frozen=True, eq=False)
+class Uniform:
+    """Uniform random numbers of a default `shape`, which a call may override."""
+
+    generator: torch.Generator
+    shape: tuple[int, ...] = ()
+
+    def __call__(self, low: float, high: float, *shape: int) -> Tensor:
+        """Draw numbers between `low` and `high`."""
+        return low + (high - low) * torch.rand(shape or self.shape, generator=self.generator)
 
 
 @dataclass(frozen=True)
 class Window:
-    """`side` x `side` texels over (u, v) in `span`, rows down.
+    """`side` x `side` texels over (u, v) in `span`, with v down.
 
-    Places on it are also given in millimetres on the mean face unrolled: x from the midline to the picture's
-    right, y down from the chart's upper edge.
+    Positions in millimetres lie on the unrolled mean face: x from the midline to the image's right, y down
+    from the upper edge of the UV map.
     """
 
     side: int
-    span: tuple[float, float] = CHART_SPAN
+    span: tuple[float, float] = UV_SPAN
 
     @property
     def texel_mm(self) -> tuple[float, float]:
-        """Width and height of a texel."""
-        texel = CHART_MM * (self.span[1] - self.span[0]) / self.side
+        """Width and height of a texel, in millimetres."""
+        texel = UV_SIZE_MM * (self.span[1] - self.span[0]) / self.side
         return float(texel[0]), float(texel[1])
 
     def to_texels(self, mm: Tensor) -> Tensor:
-        """Places [..., 2] in texels, whose centres are at whole numbers."""
-        origin = torch.tensor([(self.span[0] - 0.5) * CHART_MM[0], self.span[0] * CHART_MM[1]])
+        """Convert positions [..., 2] from millimetres to texels, whose centres are at integers."""
+        origin = torch.tensor([(self.span[0] - 0.5) * UV_SIZE_MM[0], self.span[0] * UV_SIZE_MM[1]])
         return (mm - origin.float()) / torch.tensor(self.texel_mm) - 0.5
 
 
 @lru_cache(maxsize=8)
 def places_mm(window: Window) -> tuple[Tensor, Tensor]:
-    """x and y [T, T] of every texel's centre."""
+    """Compute x and y [T, T] of every texel centre, in millimetres."""
     low, high = window.span
     u, v = (low + (high - low) * texel_centres_uv(window.side)).unbind(-1)
-    return (u - 0.5) * float(CHART_MM[0]), v * float(CHART_MM[1])
+    return (u - 0.5) * float(UV_SIZE_MM[0]), v * float(UV_SIZE_MM[1])
 
 
 @lru_cache(maxsize=64)
 def inside(window: Window, region: str) -> Tensor:
-    """Millimetres [1, 1, T, T] from the region's outline, positive inside; symmetric.
+    """Compute the signed distance [1, 1, T, T] in millimetres to the outline of a region, positive inside.
 
-    Beyond the chart it is continued from the chart's edge.
+    The field is symmetric. Outside the UV map it repeats the value at the nearest edge.
     """
     side = max(8, min(256, int(window.side / (window.span[1] - window.span[0]))))
     distance = inside_mm(region, texel_centres_uv(side, torch.float64).numpy())
     mirrored = distance[:, ::-1]
     both = np.maximum(distance, mirrored) if region in _PAIRED else (distance + mirrored) / 2
     x, y = places_mm(window)
-    at = torch.stack([x / float(CHART_MM[0]) + 0.5, y / float(CHART_MM[1])], -1)
+    at = torch.stack([x / float(UV_SIZE_MM[0]) + 0.5, y / float(UV_SIZE_MM[1])], -1)
     field = torch.from_numpy(both).float()[None, None]
     return F.grid_sample(field, 2 * at[None] - 1, padding_mode="border", align_corners=False)
 
 
 @lru_cache(maxsize=64)
 def mask(window: Window, region: str, edge_mm: float, grow_mm: float = 0.0) -> Tensor:
-    """1 inside the region grown by `grow_mm`, 0 outside [1, 1, T, T]; its edge is no sharper than a texel."""
+    """Compute a mask [1, 1, T, T] of a region grown by `grow_mm`, with an edge at least a texel wide."""
     ramp = (inside(window, region) + grow_mm) / max(edge_mm, max(window.texel_mm)) + 0.5
     return smooth(ramp)
 
 
 def smooth(ramp: Tensor) -> Tensor:
-    """0 below 0, 1 above 1, smoothly in between."""
+    """Map a ramp to 0 below 0 and 1 above 1, with a smooth step between."""
     ramp = ramp.clamp(0, 1)
     return ramp * ramp * (3 - 2 * ramp)
 
 
 @lru_cache(maxsize=64)
 def blob(window: Window, at: int | tuple[float, float], radius_mm: float, tall: float = 1.0) -> Tensor:
-    """A bump [1, 1, T, T] of height 1 about a landmark or (u, v); `tall`: its height over its width."""
+    """Compute a Gaussian bump [1, 1, T, T] of peak 1 at a landmark or (u, v); `tall` is height over width."""
     u, v = LANDMARK_UV[at] if isinstance(at, int) else at
     x, y = places_mm(window)
-    dx, dy = x - float((u - 0.5) * CHART_MM[0]), y - float(v * CHART_MM[1])
+    dx, dy = x - float((u - 0.5) * UV_SIZE_MM[0]), y - float(v * UV_SIZE_MM[1])
     return torch.exp(-((dx / radius_mm) ** 2) - (dy / (radius_mm * tall)) ** 2)[None, None]
 
 
 @lru_cache(maxsize=64)
 def blobs(window: Window, u: float, v: float, radius_mm: float, tall: float = 1.0) -> Tensor:
-    """A bump on either side, at u and 1 - u."""
+    """Compute two Gaussian bumps [1, 1, T, T], at u and 1 - u."""
     return blob(window, (u, v), radius_mm, tall) + blob(window, (1 - u, v), radius_mm, tall)
 
 
@@ -103,7 +114,7 @@ def noise(
     generator: torch.Generator,
     octaves: int = 3,
 ) -> Tensor:
-    """Smooth noise [B, 1, T, T] of about unit deviation, bumps that wide (and high), finer octaves."""
+    """Draw smooth noise [B, 1, T, T] of standard deviation about 1; `bump_mm` is the size of coarse bumps."""
     width, height = bump_mm if isinstance(bump_mm, tuple) else (bump_mm, bump_mm)
     side = window.side
     total, power = torch.zeros(faces, 1, side, side), 0.0
@@ -120,7 +131,7 @@ def noise(
 
 
 def _enlarged(grid: Tensor, side: int) -> Tensor:
-    """A grid [B, 1, h, w] at [B, 1, side, side], bicubic; as two small products where that is quicker."""
+    """Enlarge a grid [B, 1, h, w] to [B, 1, side, side], bicubic; by matrix products where that is faster."""
     rows, columns = grid.shape[-2:]
     if rows == columns == side:
         return grid
@@ -131,7 +142,7 @@ def _enlarged(grid: Tensor, side: int) -> Tensor:
 
 @lru_cache(maxsize=256)
 def _bicubic(cells: int, side: int) -> Tensor:
-    """[side, cells]: what each cell gives to each texel."""
+    """Bicubic interpolation matrix [side, cells]."""
     each = torch.eye(cells)[None, None]
     return F.interpolate(each, (side, cells), mode="bicubic", align_corners=False)[0, 0]
 
@@ -139,9 +150,9 @@ def _bicubic(cells: int, side: int) -> Tensor:
 def splat(
     window: Window, places: Tensor, area_mm2: Tensor, face: Tensor | None = None, faces: int = 1
 ) -> Tensor:
-    """How many layers of little areas [N] at places [N, 2] in millimetres lie on each texel [B, 1, T, T].
+    """Splat small areas [N] at positions [N, 2] (mm) onto texels: layers of cover [B, 1, T, T].
 
-    `face` [N] says whose they are, where there are several.
+    `face` [N] is the index of the face of each area, below `faces`.
     """
     side = window.side
     at = window.to_texels(places)
@@ -164,10 +175,10 @@ def splat(
 
 @dataclass(frozen=True)
 class Strokes:
-    """N single hairs on a window: roots [N, 2] and lengths [N] in millimetres.
+    """N single hairs on a window: roots [N, 2], lengths [N] and widths [N] at the root, in millimetres.
 
-    angles [N] at the root, counter-clockwise from the picture's right; bends [N]: how far each has turned
-    at its tip; widths [N] in millimetres at the root.
+    angles [N] hold the direction at the root, in radians counter-clockwise from the image's right; bends [N]
+    the change of direction from root to tip.
     """
 
     roots: Tensor
@@ -178,24 +189,24 @@ class Strokes:
 
 
 def hairs(window: Window, strokes: Strokes, face: Tensor | None = None, faces: int = 1) -> Tensor:
-    """Layers of hair [B, 1, T, T] of single hairs, each tapering to its tip."""
+    """Paint single hairs that taper to their tips: layers of cover [B, 1, T, T]."""
     if len(strokes.roots) == 0:
         return torch.zeros(faces, 1, window.side, window.side)
     longest = float(strokes.lengths.max())
     steps = max(2, min(40, int(1.2 * longest / min(window.texel_mm)) + 1))
     along = (torch.arange(steps) + 0.5) / steps  # [S]
-    turned = strokes.angles[:, None] + strokes.bends[:, None] * along / 2  # mean direction up to there
+    turned = strokes.angles[:, None] + strokes.bends[:, None] * along / 2  # mean direction from the root
     reach = strokes.lengths[:, None] * along
     x = strokes.roots[:, :1] + reach * turned.cos()
     y = strokes.roots[:, 1:] - reach * turned.sin()
     taper = 1.3 * (1 - along**2).clamp_min(0.1) / steps
     area = (strokes.lengths * strokes.widths)[:, None] * taper
-    whose = None if face is None else face.repeat_interleave(steps)
-    return splat(window, torch.stack([x, y], -1).view(-1, 2), area.reshape(-1), whose, faces)
+    face_of_area = None if face is None else face.repeat_interleave(steps)
+    return splat(window, torch.stack([x, y], -1).view(-1, 2), area.reshape(-1), face_of_area, faces)
 
 
 def blurred(field: Tensor, window: Window, sigma_mm: float) -> Tensor:
-    """A field [B, C, T, T] spread by a Gaussian."""
+    """Blur a field [B, C, T, T] by a Gaussian of standard deviation `sigma_mm`."""
     for axis, texel in ((-1, window.texel_mm[0]), (-2, window.texel_mm[1])):
         sigma = sigma_mm / texel
         reach = int(3 * sigma + 0.5)
@@ -212,7 +223,7 @@ def blurred(field: Tensor, window: Window, sigma_mm: float) -> Tensor:
 
 
 def slopes(height_mm: Tensor, window: Window) -> Tensor:
-    """Slopes [B, 2, T, T] along u and v of a height [B, 1, T, T]."""
+    """Compute slopes [B, 2, T, T] along u and v of a height field [B, 1, T, T] in millimetres."""
     width, height = window.texel_mm
     along_u = (height_mm.roll(-1, -1) - height_mm.roll(1, -1)) / (2 * width)
     along_v = (height_mm.roll(-1, -2) - height_mm.roll(1, -2)) / (2 * height)
@@ -220,22 +231,10 @@ def slopes(height_mm: Tensor, window: Window) -> Tensor:
 
 
 def plain_noise(size: tuple[int, int], bumps: int, generator: torch.Generator) -> Tensor:
-    """Smooth noise [1, H, W] of about unit deviation, `bumps` along the height, with one finer octave."""
+    """Draw two octaves of smooth noise [1, H, W], standard deviation about 1, `bumps` along the height."""
     total = torch.zeros(1, 1, *size)
     for octave, weight in ((1, 1.0), (2, 0.5)):
         cells = [max(2, round(octave * bumps * length / size[0])) for length in size]
         grid = torch.randn(1, 1, *cells, generator=generator)
         total += weight * F.interpolate(grid, size, mode="bicubic", align_corners=False)
     return total[0] / 0.87
-
-
-@dataclass(frozen=True, eq=False)
-class Uniform:
-    """Draws even numbers of a shape, that of `shape` where a call names none."""
-
-    generator: torch.Generator
-    shape: tuple[int, ...] = ()
-
-    def __call__(self, low: float, high: float, *shape: int) -> Tensor:
-        """Numbers from `low` to `high`."""
-        return low + (high - low) * torch.rand(shape or self.shape, generator=self.generator)

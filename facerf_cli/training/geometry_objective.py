@@ -1,8 +1,8 @@
-"""Stage `geometry`: the Geometry Network alone, on rendered faces whose landmarks are known.
+"""Stage `geometry`: the Geometry Network alone, on rendered faces with known landmarks.
 
-The landmarks of the estimated head are compared with the true ones in the picture, as in the paper's landmark
-loss but for the contour: here every point is known, also those that are hidden, so none has to slide. The
-fit to the same landmarks says what pose and coefficients are wanted; it is what the network is a start for.
+The estimated head's landmarks are compared with the true ones in the image, as in the paper's landmark loss.
+Contour landmarks do not slide, for here hidden ones are known, too. The targets of pose and coefficients are
+those of the fit to the same landmarks, for the network's estimate is where that fit starts.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.image_samples import FaceCrops, RenderedFaces
+from facerf_cli.synth.face_crops import FaceCrops, RenderedFaces
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20211
@@ -27,10 +27,10 @@ _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 
 @dataclass(frozen=True)
 class GeometryObjectiveSettings:
-    """Weights of the terms, and how many held-out heads are drawn how often for validation."""
+    """Weights of the terms, and the held-out heads and draws of each for validation."""
 
-    landmarks: float = 10.0  # of the distances in units of the inter-ocular distance
-    contour: float = 0.5  # of a contour landmark beside another one
+    landmarks: float = 10.0  # of distances in inter-ocular distances
+    contour: float = 0.5  # of a contour landmark, relative to the others
     rotation: float = 2.0  # of the chord between rotations
     depth: float = 2.0  # of the ratio of depths
     coefficients: float = 0.08  # of squared differences, in units of the fit's priors
@@ -39,7 +39,7 @@ class GeometryObjectiveSettings:
 
 
 class GeometryObjective(Objective):
-    """Landmarks, pose and coefficients of rendered faces."""
+    """Errors of landmarks, pose and coefficients on rendered faces."""
 
     mean_m: Tensor
     identity_m: Tensor
@@ -52,7 +52,9 @@ class GeometryObjective(Objective):
         settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
     ) -> None:
         super().__init__()
-        network = network or GeometryNetwork(GeometryNetworkSettings(mean_translation_m=faces.mean_translation_m()))
+        network = network or GeometryNetwork(
+            GeometryNetworkSettings(mean_translation_m=faces.mean_translation_m())
+        )
         self.networks = nn.ModuleDict({"geometry": network})
         self.chooses_by = "landmarks_percent"
         self.provenance = faces.provenance
@@ -69,7 +71,7 @@ class GeometryObjective(Objective):
         self._validation: FaceCrops | None = None
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> FaceCrops:
-        """`count` crops of random heads."""
+        """Draw `count` crops of random heads."""
         drawn = []
         for i in range(count):
             generator = generator_of(i)
@@ -78,7 +80,7 @@ class GeometryObjective(Objective):
         return concatenate(drawn)
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
-        """The weighted terms, each a mean over faces."""
+        """Compute the weighted terms, each a mean over faces."""
         with self.mixed_precision():
             estimate = GeometryEstimate(*(x.float() for x in self.estimate(batch.crops)))
         settings, fit = self.settings, FitSettings()
@@ -99,22 +101,21 @@ class GeometryObjective(Objective):
         }
 
     def estimate(self, crops: Tensor) -> GeometryEstimate:
-        """The network's estimate."""
+        """Run the network on crops [B, 3, S, S]."""
         found: GeometryEstimate = self.networks["geometry"](crops)
         return found
 
     def landmarks_px(self, estimate: GeometryEstimate, side: int) -> Tensor:
-        """The estimate's landmarks [B, 68, 2] in a crop of that side, differentiable."""
+        """Landmarks [B, 68, 2] of an estimate in a crop of a side, differentiable."""
         offset = torch.einsum("bk,knc->bnc", estimate.alpha, self.identity_m)
         offset = offset + torch.einsum("bk,knc->bnc", estimate.beta, self.expression_m)
         in_camera = (self.mean_m + offset) @ estimate.rotation.mT + estimate.translation_m[:, None]
         return project(in_camera, crop_camera(side))
 
     def distances_iod(self, estimate: GeometryEstimate, batch: FaceCrops) -> Tensor:
-        """Distances [B, 68] to the true landmarks in units of the inter-ocular distance.
+        """Distances [B, 68] to the true landmarks over the mean face's inter-ocular distance at their depth.
 
-        Here that is the mean face's at the head's depth: a turned head's eyes come close in the picture, and
-        its landmarks would weigh the more.
+        The eyes of a turned head lie close together in the image; their distance would give it more weight.
         """
         predicted = self.landmarks_px(estimate, batch.crops.shape[-1])
         unit_px = _frontal_iod_px(self.mean_m, batch)
@@ -122,7 +123,7 @@ class GeometryObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean errors on held-out heads; of landmarks in percent of the inter-ocular distance."""
+        """Measure mean errors on held-out heads; landmarks in percent of the inter-ocular distance."""
         if self._validation is None:
             self._validation = self._held_out()
         device = next(self.networks.parameters()).device
@@ -153,7 +154,7 @@ class GeometryObjective(Objective):
         )
 
     def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
-        """Held-out crops with true landmarks in green and the estimate's in red."""
+        """Held-out crops with the true landmarks in green and the estimated ones in red."""
         side, count, size = batch.crops.shape[-1], _SHEET_ROWS * _SHEET_COLUMNS, _SHEET_PX
         images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
         images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6) * 0.18
@@ -176,7 +177,7 @@ class GeometryObjective(Objective):
 
 
 def _frontal_iod_px(mean_m: Tensor, batch: FaceCrops) -> Tensor:
-    """Pixels [B] that the mean face's inter-ocular distance takes at each head's depth."""
+    """Inter-ocular distance of the mean face at each head's depth, in pixels [B]."""
     left, right = OUTER_EYE_CORNERS
     depth_m = -(mean_m[[left, right]].mean(0) @ batch.rotation.mT + batch.translation_m)[:, 2]
     iod_m: Any = (mean_m[left] - mean_m[right]).norm()

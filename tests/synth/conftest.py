@@ -3,16 +3,17 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.synth.heads_bank import Bank, GeometrySettings, add_views, build_geometries, load_bank
+from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
+from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
 
-TINY = GeometrySettings(side=32, lights=20, bake=BakeSettings(lamp_samples=1, bounce_samples=2))
+TINY = HeadBakeSettings(side=32, lights=20, bake=BakeSettings(light_samples=1, bounce_samples=2))
 
 
 @pytest.fixture(scope="session")
 def bank_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six tiny heads, baked and seen twice each."""
+    """Six tiny baked heads with two views each."""
     folder = tmp_path_factory.mktemp("bank")
-    build_geometries(folder / "heads", "builtin", 6, jobs=1, seed=1, settings=TINY)
+    bake_heads(folder / "heads", "builtin", 6, jobs=1, seed=1, settings=TINY)
     add_views(folder / "heads", folder / "views", "builtin", 2, jobs=1, seed=1)
     return folder
 

@@ -14,10 +14,10 @@ from facerf_cli.synth import bake_renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.bake_renderer import RenderSettings, photograph, scattered_irradiance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
-from facerf_cli.synth.views import StageCamera
+from facerf_cli.synth.stage_cameras import StageCamera
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
-POINT_LAMP = BakeSettings(lamp_radius_deg=0, bounce_samples=0)
+POINT_LIGHT = BakeSettings(light_radius_deg=0, bounce_samples=0)
 AHEAD = np.array([[0.0, 0, 1]], np.float32)
 
 
@@ -70,14 +70,14 @@ def camera(side_px: int = 64, field_m: float = 0.12, distance_m: float = 10.0) -
     return StageCamera(lens, torch.eye(3), torch.tensor([0.0, 0, -distance_m]))
 
 
-def bake(head: HeadMesh, lamps: np.ndarray, settings: BakeSettings = POINT_LAMP) -> MeshTransport:
+def bake(head: HeadMesh, lights: np.ndarray, settings: BakeSettings = POINT_LIGHT) -> MeshTransport:
     hair = head.part == PARTS.index("hair")
-    return bake_mesh(head.vertices, head.normals, head.triangles, lamps, settings, all_round=hair)
+    return bake_mesh(head.vertices, head.normals, head.triangles, lights, settings, two_sided=hair)
 
 
 def test_a_diffuse_ball_has_the_radiance_of_lambert_and_the_coverage_of_its_disc() -> None:
-    head, lamps = ball(), rig_directions(7).numpy()
-    images, coverage = photograph(head, appearance(material()), bake(head, lamps), camera(), DIFFUSE)
+    head, lights = ball(), rig_directions(7).numpy()
+    images, coverage = photograph(head, appearance(material()), bake(head, lights), camera(), DIFFUSE)
     assert abs(float(coverage.sum()) - np.pi * (0.05 / 0.12 * 64) ** 2) < 0.01 * float(coverage.sum())
     assert ((coverage > 0) & (coverage < 1)).sum() > 60  # antialiased
     centre = (np.arange(64) + 0.5 - 32) / 64 * 0.12
@@ -85,8 +85,8 @@ def test_a_diffuse_ball_has_the_radiance_of_lambert_and_the_coverage_of_its_disc
     z = np.sqrt(np.clip(0.05**2 - x**2 - y**2, 0, None))
     normals = np.stack([x, y, z], -1) / 0.05
     inside = np.hypot(x, y) < 0.045
-    for lamp, image in zip(lamps, images, strict=True):
-        expected = 0.5 * np.clip(normals @ lamp, 0, None)
+    for light, image in zip(lights, images, strict=True):
+        expected = 0.5 * np.clip(normals @ light, 0, None)
         assert np.abs(image[0].numpy() - expected)[inside].max() < 0.02
         assert np.abs(image[0].numpy() - expected)[inside].mean() < 0.002
     assert (images[:, :, coverage == 0] == 0).all()
@@ -100,8 +100,8 @@ def test_each_channel_has_its_own_albedo() -> None:
 
 
 def test_pictures_do_not_depend_on_the_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    head, lamps = joined(ball(), board("hair", z=-0.01)), rig_directions(9).numpy()
-    transport, person = bake(head, lamps, BakeSettings()), appearance(material(), (2.0, 1.0, 0.5))
+    head, lights = joined(ball(), board("hair", z=-0.01)), rig_directions(9).numpy()
+    transport, person = bake(head, lights, BakeSettings()), appearance(material(), (2.0, 1.0, 0.5))
     whole, _ = photograph(head, person, transport, camera(32))
     monkeypatch.setattr(bake_renderer, "_CHUNK", 1)
     irradiance = scattered_irradiance(head, person, transport)
@@ -129,7 +129,7 @@ def test_scattering_keeps_even_light_and_softens_an_edge_by_channel() -> None:
 
 def test_scattering_stays_within_the_skin() -> None:
     head = joined(board("cloth", z=1e-4), board("skin"))
-    transport = bake(head, AHEAD, POINT_LAMP)
+    transport = bake(head, AHEAD, POINT_LIGHT)
     person = appearance(material(), (6.0, 6.0, 6.0))
     spread = scattered_irradiance(head, person, transport, replace(DIFFUSE, scattering=True))
     skin = head.part == PARTS.index("skin")
@@ -157,10 +157,10 @@ def test_bounces_add_up() -> None:
     assert (levels[2][on_floor] - levels[1][on_floor]).mean() > 0.005
 
 
-def test_a_highlight_lies_at_the_mirrored_lamp_and_dark_skin_has_it_too() -> None:
+def test_a_highlight_lies_at_the_mirrored_light_and_dark_skin_has_it_too() -> None:
     head = ball()
-    lamp = np.array([[0.6, 0.0, 0.8]], np.float32)
-    transport = bake(head, lamp)
+    light = np.array([[0.6, 0.0, 0.8]], np.float32)
+    transport = bake(head, light)
     shine = []
     for albedo in (0.6, 0.05):
         person = appearance(material(albedo))
@@ -177,8 +177,8 @@ def test_a_highlight_lies_at_the_mirrored_lamp_and_dark_skin_has_it_too() -> Non
 
 def test_relief_turns_the_surface_as_its_slopes_say() -> None:
     head = board()
-    lamps = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.6, 0.8], [0, -0.6, 0.8]], np.float32)
-    transport, settings = bake(head, lamps), replace(DIFFUSE, relief=True)
+    lights = np.array([[0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 0.6, 0.8], [0, -0.6, 0.8]], np.float32)
+    transport, settings = bake(head, lights), replace(DIFFUSE, relief=True)
 
     def at_centre(relief: tuple[float, float]) -> list[float]:
         images, _ = photograph(head, appearance(material(relief=relief)), transport, camera(), settings)
@@ -192,8 +192,8 @@ def test_relief_turns_the_surface_as_its_slopes_say() -> None:
 
 def test_hair_shines_across_its_strands_and_is_lit_from_behind() -> None:
     head = board("hair")
-    lamps = np.array([[0, 0, 1], [0.8, 0, 0.6], [0, 0.8, 0.6], [0.6, 0, -0.8]], np.float32)
-    transport = bake(head, lamps)
+    lights = np.array([[0, 0, 1], [0.8, 0, 0.6], [0, 0.8, 0.6], [0.6, 0, -0.8]], np.float32)
+    transport = bake(head, lights)
     images, _ = photograph(head, appearance(material(0.2)), transport, camera())
     matte, _ = photograph(head, appearance(material(0.2)), transport, camera(), DIFFUSE)
     shine = (images - matte)[:, 0, 32, 32]
@@ -212,10 +212,10 @@ def test_an_eye_keeps_its_highlight_in_a_coarse_image() -> None:
     """Where a pixel holds a wide range of normals the lobe widens, and the light of all pixels stays."""
     head = ball(0.012)
     head = replace(head, part=np.full(len(head.part), PARTS.index("eye"), np.uint8))
-    lamp = np.array([[0.3, 0.3, 0.9]], np.float32)
-    lamp /= np.linalg.norm(lamp)
+    light = np.array([[0.3, 0.3, 0.9]], np.float32)
+    light /= np.linalg.norm(light)
     wet = replace(material(0.0), roughness=torch.full((1, 8, 8), 0.15))
-    transport = bake(head, lamp)
+    transport = bake(head, light)
     means = []
     for side in (12, 256):
         images, coverage = photograph(head, appearance(wet), transport, camera(side, 0.03))

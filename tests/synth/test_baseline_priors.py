@@ -1,4 +1,4 @@
-"""The priors as they are shipped."""
+"""The priors in the package."""
 
 import torch
 

@@ -1,8 +1,8 @@
 import torch
 
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.occluders import with_occluders
 from facerf_cli.synth.random_fields import Window
-from facerf_cli.synth.texture_samples import with_occluders
 
 SIDE, FACES = 64, 40
 

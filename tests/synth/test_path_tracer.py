@@ -15,9 +15,9 @@ from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
-from facerf_cli.synth.views import StageCamera
+from facerf_cli.synth.stage_cameras import StageCamera
 
-LAMPS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
+LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
 CAMERA = StageCamera(Camera(400, 60, 40, 24.0, 25.0), torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
 
 
@@ -34,7 +34,7 @@ def test_without_mitsuba_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 
 
 def _corner() -> HeadMesh:
-    """A floor that faces +z and, 1 mm beside it, a wall on the right that faces -x; each 8 x 8 cm."""
+    """A floor that faces +z and, 1 mm away, a wall on the right that faces -x; each 8 x 8 cm."""
     side, count = 0.08, 17
     v, u = np.meshgrid(*2 * [np.linspace(0, 1, count)], indexing="ij")
     cells = np.arange(count * count).reshape(count, count)[:-1, :-1].ravel()
@@ -69,43 +69,43 @@ def _appearance() -> Appearance:
 
 
 def _both(settings: PathSettings) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Our pictures and coverage, and Mitsuba's."""
+    """Images and coverage of both renderers."""
     head, person = _corner(), _appearance()
-    bake = BakeSettings(lamp_radius_deg=0, bounce_samples=256 if settings.bounces else 0)
-    transport = bake_mesh(head.vertices, head.normals, head.triangles, LAMPS, bake)
+    bake = BakeSettings(light_radius_deg=0, bounce_samples=256 if settings.bounces else 0)
+    transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
     ours = RenderSettings(settings.bounces, False, settings.gloss, settings.relief)
     return (
         *bake_renderer.photograph(head, person, transport, CAMERA, ours),
-        *path_tracer.photograph(head, person, LAMPS, CAMERA, settings),
+        *path_tracer.photograph(head, person, LIGHTS, CAMERA, settings),
     )
 
 
-def _apart(ours: torch.Tensor, theirs: torch.Tensor, coverage: torch.Tensor) -> float:
+def _relative_rms(ours: torch.Tensor, theirs: torch.Tensor, coverage: torch.Tensor) -> float:
     """RMS inside the head's outline, relative to the mean there."""
     inside = coverage > 0.99
     difference = (ours - theirs)[..., inside]
     return float(difference.square().mean().sqrt() / theirs[..., inside].mean())
 
 
-def test_both_cameras_see_the_same_place_in_a_image_that_is_no_square() -> None:
+def test_both_cameras_see_the_same_place_in_an_image_that_is_not_square() -> None:
     plain = PathSettings(samples=64, bounces=0, gloss=False, relief=False)
     ours, coverage, theirs, their_coverage = _both(plain)
     assert ours.shape == theirs.shape == (2, 3, 40, 60) and coverage.shape == their_coverage.shape
     assert (coverage - their_coverage).abs().max() < 0.3 and 0.3 < coverage.mean() < 0.7
     assert (coverage - their_coverage).abs().mean() < 0.005
-    assert _apart(ours, theirs, coverage) < 0.05
+    assert _relative_rms(ours, theirs, coverage) < 0.05
 
 
 def test_relief_and_one_bounce_are_the_same_in_both() -> None:
     settings = PathSettings(samples=256, bounces=1, gloss=False, relief=False)
     ours, coverage, theirs, _ = _both(settings)
-    assert _apart(ours, theirs, coverage) < 0.05
+    assert _relative_rms(ours, theirs, coverage) < 0.05
     dark, _, _, _ = _both(replace(settings, bounces=0))
-    assert _apart(dark, theirs, coverage) > 0.06  # the bounce is worth being measured
+    assert _relative_rms(dark, theirs, coverage) > 0.06  # the bounce is worth being measured
     bumpy, _, their_bumpy, _ = _both(PathSettings(samples=64, bounces=0, gloss=False, relief=True))
     plain, _, _, _ = _both(PathSettings(samples=1, bounces=0, gloss=False, relief=False))
     # Bumps are there to first order only, and softened on purpose.
-    assert _apart(bumpy, their_bumpy, coverage) < 0.6 * _apart(plain, their_bumpy, coverage)
+    assert _relative_rms(bumpy, their_bumpy, coverage) < 0.6 * _relative_rms(plain, their_bumpy, coverage)
 
 
 def test_highlights_are_the_same_in_both() -> None:
@@ -116,19 +116,19 @@ def test_highlights_are_the_same_in_both() -> None:
         person.scattering_mm,
         {},
     )
-    bake = BakeSettings(lamp_radius_deg=0, bounce_samples=0)
-    transport = bake_mesh(head.vertices, head.normals, head.triangles, LAMPS, bake)
+    bake = BakeSettings(light_radius_deg=0, bounce_samples=0)
+    transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
     plain = RenderSettings(0, False, True, False)
     ours, coverage = bake_renderer.photograph(head, black, transport, CAMERA, plain)
-    theirs, _ = path_tracer.photograph(head, black, LAMPS, CAMERA, glossy)
+    theirs, _ = path_tracer.photograph(head, black, LIGHTS, CAMERA, glossy)
     assert theirs[0].max() > 0.02
-    assert _apart(ours[:1], theirs[:1], coverage) < 0.15
+    assert _relative_rms(ours[:1], theirs[:1], coverage) < 0.15
 
 
-def test_a_seed_repeats_a_image() -> None:
+def test_a_seed_repeats_an_image() -> None:
     settings = PathSettings(samples=2, gloss_samples=1)
     first, second, other = (
-        path_tracer.photograph(_corner(), _appearance(), LAMPS[:1], CAMERA, settings, seed)[0]
+        path_tracer.photograph(_corner(), _appearance(), LIGHTS[:1], CAMERA, settings, seed)[0]
         for seed in (1, 1, 2)
     )
     assert torch.equal(first, second) and not torch.equal(first, other)
@@ -144,13 +144,13 @@ def test_the_benchmark_holds_on_a_small_image_of_the_builtin_head() -> None:
     generator = torch.Generator().manual_seed(1)
     alpha = 0.7 * torch.randn(len(model.identity), generator=generator)
     appearance = draw_appearance(128, generator)
-    lamps = np.stack([azel_to_direction(*angle).numpy() for angle in ((-30.0, 10.0), (60.0, 50.0))])
+    lights = np.stack([azel_to_direction(*angle).numpy() for angle in ((-30.0, 10.0), (60.0, 50.0))])
     cameras = [benchmark.stage_camera(128, 0.0)]
     times: dict[str, list[float]] = {"bake": [], "irradiance": [], "photograph": [], "mitsuba": []}
 
     def render(bounces: int) -> tuple:
         settings = PathSettings(samples=12, bounces=bounces, gloss=False, relief=False)
-        return benchmark.render_both(model, alpha, appearance, lamps, cameras, settings, 0, times)
+        return benchmark.render_both(model, alpha, appearance, lights, cameras, settings, 0, times)
 
     direct, truth = render(0)
     total, their_total = render(1)

@@ -3,7 +3,7 @@ import math
 import torch
 
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.shading import bend, diffuse_irradiance, highlights, scatter, unit
+from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit
 
 
 def _skin(side: int = 4, specular: float = 0.04, roughness: float = 0.5) -> Skin:
@@ -50,10 +50,10 @@ def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
     mirror = _skin(1, specular=1.0, roughness=0.4)
     reflected = highlights(normals, view, lights, mirror).sum() * (2 * math.pi / count) / math.pi
     assert 0.6 < reflected < 1.01
-    lamp = unit(torch.tensor([0.0, 0.6, 0.8]), 0)
-    there = highlights(normals, view, lamp.view(1, 1, 3), _skin(1))[0, 0, 0, 0] / 0.8
+    light = unit(torch.tensor([0.0, 0.6, 0.8]), 0)
+    there = highlights(normals, view, light.view(1, 1, 3), _skin(1))[0, 0, 0, 0] / 0.8
     back = (
-        highlights(normals, lamp.view(1, 3, 1, 1), view.view(1, 1, 3), _skin(1))[0, 0, 0, 0]
+        highlights(normals, light.view(1, 3, 1, 1), view.view(1, 1, 3), _skin(1))[0, 0, 0, 0]
         / view[0, 2, 0, 0]
     )
     assert torch.allclose(there, back, rtol=1e-4)
@@ -61,7 +61,9 @@ def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
 
 def test_flat_relief_leaves_normals_alone() -> None:
     normals = unit(torch.randn(1, 3, 4, 4), 1)
-    assert torch.allclose(bend(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6)
+    assert torch.allclose(
+        tilt_normals(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6
+    )
 
 
 def test_skins_span_light_to_dark_and_repeat_with_their_seed() -> None:

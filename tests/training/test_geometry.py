@@ -11,7 +11,8 @@ from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.synth.image_samples import RenderedFaces, add_pictures
+from facerf_cli.synth.face_crops import RenderedFaces
+from facerf_cli.synth.head_images import add_head_images
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.objective import seeded
 
@@ -25,7 +26,7 @@ def images(bank_folder: Path) -> Path:
     heads.mkdir()
     for path in sorted((bank_folder / "heads").glob("*.safetensors"))[:3]:
         (heads / path.name).symlink_to(path)
-    add_pictures(heads, bank_folder / "pictures", 2, jobs=1, seed=3)
+    add_head_images(heads, bank_folder / "pictures", 2, jobs=1, seed=3)
     return bank_folder / "pictures"
 
 
@@ -121,7 +122,7 @@ def test_the_paper_form_learns_from_the_same_crops(faces):
 
 
 def test_no_images_is_said(tmp_path):
-    with pytest.raises(InputError, match="no pictures"):
+    with pytest.raises(InputError, match="no images of heads"):
         RenderedFaces(tmp_path, {})
     with pytest.raises(InputError, match="no baked heads"):
-        add_pictures(tmp_path, tmp_path / "out", 1, 1, 0)
+        add_head_images(tmp_path, tmp_path / "out", 1, 1, 0)

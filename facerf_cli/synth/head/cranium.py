@@ -7,7 +7,7 @@ outward, so that position and slope are continuous across the border and the dif
 
 A point of the head is given by (u, level). u is that of the face's UV map, continued around the head. level
 is v from the upper edge of the UV map (v = 0) down; above that edge it is minus the arc length over the
-crown, in heights of the UV map.
+crown, in units of the height of the UV map.
 """
 
 from functools import cache
@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
-from facerf_cli.synth.heads_bank import one_thread
+from facerf_cli.synth.threads import one_thread
 
 BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; its other side is 1 - BACK_U
 _CROWN_MM_PER_DEG = 1.4  # arc length over the crown
@@ -59,7 +59,7 @@ _SECTIONS_MM = """
 _ROUNDING_MM = 0.3  # standard deviation of the table's rounding, which the spline smooths away
 _REACHES_MM = ((55.0, 1.0), (14.0, 0.03))  # (reach, variance) of broad and of small differences at the border
 _RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells further in
-_SCALE_LIMITS = (0.85, 1.2)  # of a head to the average head
+_SCALE_LIMITS = (0.85, 1.2)  # of the size of a head, relative to the average head
 _PAD = 6  # cells by which the grid is extended, so that the spline is good up to the border
 
 

@@ -1,9 +1,9 @@
 import pytest
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.synth.bake_heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
-from facerf_cli.synth.heads_bank import mean_coefficients
 
 
 @pytest.fixture(scope="session")

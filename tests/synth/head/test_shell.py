@@ -17,10 +17,10 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import TOP_M, UV_SIZE_MM, grid_triangles, grid_uv, inside_mm
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
+from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.eyes import RADIUS_MM
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.head.shell import shell_head
-from facerf_cli.synth.heads_bank import GeometrySettings, draw_coefficients
 
 FACES = ("mean", "jaw_open", "blink", "half_blink", *range(4))
 AWAY_FROM_CUTS_MM = 2.5
@@ -36,7 +36,7 @@ def face(which: str | int) -> torch.Tensor:
     """Canonical vertices of the mean with an expression, or of a random person."""
     alpha, beta = torch.zeros(len(model().identity)), torch.zeros(len(model().expression))
     if isinstance(which, int):
-        alpha, beta = draw_coefficients(model(), np.random.default_rng([7, which]), GeometrySettings())
+        alpha, beta = draw_coefficients(model(), np.random.default_rng([7, which]), HeadBakeSettings())
     strength = {"jaw_open": 2.0, "blink": 2.0, "half_blink": 1.0}.get(str(which), 0.0)
     stem = "eye_close" if "blink" in str(which) else str(which)
     for index, name in enumerate(model().expression_names):

@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.synth.bake_heads import mean_coefficients
 from facerf_cli.synth.head import clothes, glasses
 from facerf_cli.synth.head.clothes import GARMENTS, draw_clothes
 from facerf_cli.synth.head.glasses import GLASSES, draw_glasses
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.heads_bank import mean_coefficients
 
 
 @pytest.fixture(scope="module")

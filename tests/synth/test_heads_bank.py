@@ -8,8 +8,10 @@ from safetensors.torch import load_file
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model, save_face_model
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.heads_bank import Bank, bake_head, build_geometries, draw_coefficients, load_bank
+from facerf_cli.synth.bake_heads import bake_head, bake_heads, draw_coefficients
+from facerf_cli.synth.heads_bank import Bank, load_bank
 from facerf_cli.synth.texture_samples import draw_light
 from facerf_cli.synth.views import ViewSettings, build_views
 from tests.synth.conftest import TINY
@@ -17,20 +19,20 @@ from tests.synth.conftest import TINY
 EXACT = ViewSettings(point_noise=0, group_noise=0, contour_noise=0, yaw_deg=0, pitch_deg=0, roll_deg=0)
 
 
-def test_finished_heads_are_kept_and_a_lost_one_comes_back_the_same(bank_folder: Path) -> None:
+def test_finished_heads_are_kept_and_a_lost_one_is_rebuilt_the_same(bank_folder: Path) -> None:
     paths = sorted((bank_folder / "heads").iterdir())
     before = [path.read_bytes() for path in paths]
     kept = paths[0].stat().st_mtime_ns
     paths[3].unlink()
-    build_geometries(bank_folder / "heads", "builtin", 6, jobs=1, seed=1, settings=TINY)
+    bake_heads(bank_folder / "heads", "builtin", 6, jobs=1, seed=1, settings=TINY)
     assert [path.read_bytes() for path in sorted((bank_folder / "heads").iterdir())] == before
     assert paths[0].stat().st_mtime_ns == kept
 
 
-def test_heads_of_another_model_are_not_taken_for_this_ones(bank_folder: Path, tmp_path: Path) -> None:
+def test_heads_of_another_model_are_an_error(bank_folder: Path, tmp_path: Path) -> None:
     save_face_model(tmp_path / "other.npz", replace(load_face_model(), name="other"))
-    with pytest.raises(InputError, match="a head of the face model builtin, not of other"):
-        build_geometries(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
+    with pytest.raises(InputError, match="the head is of face model builtin, not of other"):
+        bake_heads(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
 
 
 def test_head_zero_is_the_mean_face_under_the_unturned_rig() -> None:
@@ -92,8 +94,6 @@ def test_target_brightens_where_it_faces_its_light(bank: Bank) -> None:
 
 
 def test_light_weights_are_positive_and_range_from_a_flash_to_a_dome() -> None:
-    from facerf_cli.light.sphere import rig_directions
-
     directions = rig_directions(150)
     drawn = [draw_light(directions, torch.Generator().manual_seed(seed)).mean(-1) for seed in range(60)]
     shares = torch.stack([weights.max() / weights.sum() for weights in drawn])

@@ -1,11 +1,11 @@
-"""Even draws: between their bounds, of their own shape or another."""
+"""Uniform draws lie between their bounds and have the requested shape."""
 
 import torch
 
 from facerf_cli.synth.random_fields import Uniform
 
 
-def test_numbers_lie_evenly_between_their_bounds() -> None:
+def test_uniform_numbers_fill_their_bounds() -> None:
     uniform = Uniform(torch.Generator().manual_seed(0), (2, 1000))
     numbers = uniform(-3, 5)
     assert numbers.shape == (2, 1000) and uniform(0, 1, 4, 1).shape == (4, 1)

@@ -1,8 +1,8 @@
 import torch
 import torch.nn.functional as F
 
+from facerf_cli.synth.head_fields import lid_shadows
 from facerf_cli.synth.random_fields import Window, mask
-from facerf_cli.synth.shading import lid_shadows
 
 SIDE = 128
 

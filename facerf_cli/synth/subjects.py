@@ -1,0 +1,99 @@
+"""Random subjects of the synthetic light stage: head, expression, skin, hair, clothes and glasses."""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.face.importers.source import EXPRESSION_STD
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
+from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
+from facerf_cli.synth.head.clothes import draw_clothes
+from facerf_cli.synth.head.glasses import draw_glasses
+from facerf_cli.synth.head.hair import draw_hair
+from facerf_cli.synth.head.hair_styles import scalp_cover
+from facerf_cli.synth.head.heads import build_head
+from facerf_cli.synth.head.mesh import HeadMesh, joined
+
+_POSE_STD_DEG = (6.0, 4.0, 2.0)  # yaw, pitch and roll of subjects who look ahead
+_GAZE_STD_DEG = 6.0
+_CLOSED_SHARE, _GLASSES_SHARE = 0.08, 0.15  # of subjects with closed eyes, with glasses
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A person in the stage: mesh in world space (m) and materials."""
+
+    mesh: HeadMesh
+    appearance: Appearance
+    head_to_world: Tensor  # [3, 3]
+    face_vertices: Tensor  # [GRID * GRID, 3] of the canonical mesh, head frame
+    landmarks_world: np.ndarray  # [68, 3], m
+    traits: dict[str, Any]
+
+
+@lru_cache(maxsize=1)
+def subject_model(name_or_path: str) -> MorphableModel:
+    """Load the face model once per process, since values derived from it are cached by identity."""
+    return load_face_model(name_or_path)
+
+
+def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> Subject:
+    """Draw subject number `index`, a function of (model, seed, index); `size_px` sets only its resolution."""
+    random = np.random.default_rng([seed, index])
+    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    alpha, beta = draw_coefficients(model, random, HeadBakeSettings())
+    closed = random.random() < _CLOSED_SHARE
+    if closed:
+        beta = _eyes_closed(model, beta)
+    gaze = random.normal(0, _GAZE_STD_DEG, 2)
+    pose_deg = random.normal(0, _POSE_STD_DEG)
+    side = _canvas_side(size_px)
+    appearance = draw_appearance(side, generator)
+    bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
+    face_vertices = model.vertices(alpha[None], beta[None])[0]
+    landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
+    dressed = joined(bare, draw_clothes(bare, random))
+    hair, style = draw_hair(dressed, random)
+    cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
+    appearance = with_scalp(appearance, cover, generator)
+    glasses = random.random() < _GLASSES_SHARE
+    worn = [draw_glasses(bare, landmarks_m, random)] if glasses else []
+    head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
+    mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), head_to_world.numpy())
+    landmarks_world = landmarks_m @ head_to_world.numpy().T
+    traits = appearance.traits | {
+        "hair": style.name,
+        "glasses": glasses,
+        "eyes_closed": closed,
+        "pose_deg": pose_deg.round(3).tolist(),
+        "gaze_deg": gaze.round(3).tolist(),
+    }
+    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_world, traits)
+
+
+def _canvas_side(size_px: int) -> int:
+    """Texels of the skin texture."""
+    return 512 if size_px <= 256 else 1024
+
+
+def _subdivisions(size_px: int) -> int:
+    """Number of subdivisions of the head mesh that make its edges about a pixel long."""
+    return 0 if size_px <= 96 else 1 if size_px <= 384 else 2
+
+
+def _eyes_closed(model: MorphableModel, beta: Tensor) -> Tensor:
+    """Close the eyes of an expression [Ke], and drop its other eye shapes."""
+    lids = torch.tensor([name.startswith(("eyeBlink", "eye_close")) for name in model.expression_names])
+    others = torch.tensor([name.startswith(("eye", "cheekSquint")) for name in model.expression_names])
+    return torch.where(lids, 1 / EXPRESSION_STD, beta * ~others)
+
+
+def _rotated(mesh: HeadMesh, rotation: np.ndarray) -> HeadMesh:
+    fields = {name: getattr(mesh, name) @ rotation.T for name in ("vertices", "normals", "tangents")}
+    return replace(mesh, **fields)
