@@ -20,18 +20,10 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.transform import resize
 
-from facerf_cli.capture.colour_chart import outlined
-from facerf_cli.capture.find_colour_chart import (
-    PATCH_SIDE,
-    area_corners,
-    delta_e_2000,
-    find_chart,
-    fit_colours,
-    neutral_matrix,
-    published_colours,
-    sample,
-    squares_px,
-)
+from facerf_cli.capture.chart_colours import delta_e_2000, fit_colours, neutral_matrix, published_colours
+from facerf_cli.capture.chart_patches import PATCH_SIDE, area_corners, sample, squares_px
+from facerf_cli.capture.colour_chart import outline_patches
+from facerf_cli.capture.find_chart import find_chart
 from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import read_image, write_display
 
@@ -67,7 +59,7 @@ def told(path: Path) -> np.ndarray:
     fit = fit_colours(sample(image, found).colours)
     before, after = fit.delta_e_before.mean(), fit.delta_e_after.mean()
     print(f"{path.name}: found; mean delta E 2000 {before:.1f} before, {after:.1f} after the fit")
-    return outlined(image, found)
+    return outline_patches(image, found)
 
 
 def counted(images: int) -> list[np.ndarray]:
@@ -79,7 +71,7 @@ def counted(images: int) -> list[np.ndarray]:
         found = find_chart(image)
         seconds += time.perf_counter() - begun_s
         rows.append(figures(image, corners_px, camera, found))
-        tiles += [image if found is None else outlined(image, found)]
+        tiles += [image if found is None else outline_patches(image, found)]
     print(summary(np.array(rows)), f"{seconds / images:.2f} s a picture", sep="\n")
     false = sum(find_chart(surroundings(seed)) is not None for seed in range(images))
     print(f"without a chart: {false} of {images} pictures taken for one")

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from skimage.transform import resize
 
-from facerf_cli.capture.find_colour_chart import (
+from facerf_cli.capture.chart_colours import published_colours
+from facerf_cli.capture.chart_patches import (
     COLUMNS,
     PATCH_SIDE,
     PATCHES,
@@ -13,7 +14,6 @@ from facerf_cli.capture.find_colour_chart import (
     area_corners,
     homography,
     project,
-    published_colours,
 )
 
 SHAPE = (240, 330)

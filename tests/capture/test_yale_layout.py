@@ -83,7 +83,7 @@ def test_real_people_are_prepared(tmp_path: Path, capsys: pytest.CaptureFixture[
     line = ["prepare-dataset", str(capture), "-o", str(output), "--layout", "extended-yale-b"]
     assert main([*line, "--crop", "96", "--split", "1/0/0", "--subtract-ambient", "--checks", "off"]) == 0
     said = capsys.readouterr().err
-    assert "2 pictures that are marked as damaged" in said and "yaleB16/P00: no ambient picture" in said
+    assert "2 images that are marked as damaged" in said and "yaleB16/P00: no ambient image" in said
     dataset = read_dataset(output)
     assert len(dataset.light_ids) == 64 and len(dataset.lights_of("yaleB16")) == 62
     entry = json.loads((output / "dataset.json").read_text())["subjects"]["yaleB16"]

@@ -7,14 +7,9 @@ import warnings
 import numpy as np
 import pytest
 
-from facerf_cli.capture import find_colour_chart as colours
-from facerf_cli.capture.find_colour_chart import (
-    GREYS,
-    centres,
-    fit_colours,
-    neutral_matrix,
-    published_colours,
-)
+from facerf_cli.capture import chart_colours as colours
+from facerf_cli.capture.chart_colours import fit_colours, neutral_matrix, published_colours
+from facerf_cli.capture.chart_patches import GREYS, centres
 from facerf_cli.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
 from facerf_cli.errors import FacerfError
 from tests.capture.chart_image import CAMERA
@@ -83,7 +78,7 @@ def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_
     program = (
         "import numpy as np, warnings\n"
         "import OpenImageIO as oiio\n"
-        "from facerf_cli.capture.colour_chart import published_colours\n"
+        "from facerf_cli.capture.chart_colours import published_colours\n"
         "before, filters = np.get_printoptions(), list(warnings.filters)\n"
         "published_colours()\n"
         "import OpenImageIO\n"

@@ -10,15 +10,16 @@ import pytest
 from skimage import data
 
 from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.chart_colours import published_colours
+from facerf_cli.capture.chart_correction import ChartCorrection, correct_colours
+from facerf_cli.capture.chart_patches import four_turns, squares_px
 from facerf_cli.capture.colour_chart import read_charts, write_chart_overlays
-from facerf_cli.capture.colour_correction import ChartCorrection, corrected
-from facerf_cli.capture.find_colour_chart import four_turns, published_colours, squares_px
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import read_image, write_display, write_exr
 from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image
-from tests.capture.test_colours import kept_luminance
+from tests.capture.test_chart_colours import kept_luminance
 from tests.capture.test_layouts import GOOD, capture_at
 
 WHITE = [{**light, "intensity": [2, 2, 2]} for light in GOOD["lights"]]
@@ -72,10 +73,10 @@ def test_a_chart_for_each_camera(tmp_path: Path) -> None:
     assert [chart.cameras for chart in charts] == [("C0",), ("C1",)]
     np.testing.assert_allclose(charts[1].matrix, np.eye(3), atol=0.01)
     seen = (np.array([[[0.3, 0.5, 0.2]]]) @ CAMERA.T).astype(np.float32)
-    assert np.abs(corrected(charts, "C1", seen) - seen).max() < 0.01
-    assert np.abs(corrected(charts, "C0", seen) - seen @ np.array(charts[0].matrix).T).max() < 1e-6
-    assert corrected((), "C0", seen) is seen
-    with pytest.raises(UsageError, match="names one a camera"):
+    assert np.abs(correct_colours(charts, "C1", seen) - seen).max() < 0.01
+    assert np.abs(correct_colours(charts, "C0", seen) - seen @ np.array(charts[0].matrix).T).max() < 1e-6
+    assert correct_colours((), "C0", seen) is seen
+    with pytest.raises(UsageError, match="names an image per camera"):
         next(read_charts(stage, name, CORNERS))
     write_chart_overlays(replace(stage, charts=charts), tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
@@ -103,7 +104,7 @@ REFUSED: dict[str, tuple[np.ndarray, np.ndarray | None, str]] = {
     "a channel clipped": (chart_image().clip(max=[9, 9, 0.57]), CORNERS, "white patch is clipped"),
     "grey": (chart_image().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
     "a face": (FACE, CORNERS, "delta E"),
-    "a face, no corners": (FACE, None, "give its corners|say where its 24 patches are"),
+    "a face, no corners": (FACE, None, "no ColorChecker Classic found; give the corners"),
     "too dark": (chart_image(exposure=DIM), CORNERS, "too dark"),
     "black": (np.zeros((*SHAPE, 3), np.float32), CORNERS, "too dark"),
     "encoded": (linear_to_srgb(chart_image().clip(0, 1)), CORNERS, "lin_rec709"),

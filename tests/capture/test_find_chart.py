@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 from skimage import data
 
-from facerf_cli.capture.find_colour_chart import (
-    area_corners,
-    centres,
-    find_chart,
-    find_lattices,
-    four_turns,
-    homography,
-    project,
-)
+from facerf_cli.capture.chart_patches import area_corners, centres, four_turns, homography, project
+from facerf_cli.capture.find_chart import find_chart, find_lattices
 from tests.capture.chart_image import CAMERA, CORNERS, background, chart_image
 
 

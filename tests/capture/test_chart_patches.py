@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from facerf_cli.capture.find_colour_chart import (
+from facerf_cli.capture.chart_colours import published_colours
+from facerf_cli.capture.chart_patches import (
     area_corners,
     centres,
     four_turns,
     homography,
     is_convex,
     project,
-    published_colours,
     sample,
     shrunk,
 )

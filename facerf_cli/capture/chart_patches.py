@@ -1,0 +1,113 @@
+"""Geometry of a ColorChecker Classic: where its 24 patches lie between four corners, and their pixels.
+
+Patches are numbered in reading order: six per row, from dark skin to black. Pixel centres lie at index + 0.5.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from skimage.draw import polygon
+
+ROWS, COLUMNS = 4, 6
+PATCHES = ROWS * COLUMNS
+GREYS = slice(18, 24)  # white to black, the last row
+PATCH_SIDE = 0.87  # of the grid's pitch; the rest is the chart's black frame
+MIDDLE_SIDE = 0.45  # of the pitch: the sampled square, away from edges and from inaccurate corners
+_SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
+_AT_WHITE = 1e-4  # from 1, within which a value counts as the largest of an integer format
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Measured middles of the 24 patches."""
+
+    colours: np.ndarray  # [24, 3] medians, float64; black for a patch without pixels
+    counts: np.ndarray  # [24] pixels of each
+    noise: np.ndarray  # [24] robust standard deviation of a pixel's green
+    at_white: np.ndarray  # [24] share of pixels with a channel at 1, the largest value of integer formats
+
+
+def centres() -> np.ndarray:
+    """Patch centres [24, 2] (column, row) on a grid of pitch 1."""
+    row, column = np.divmod(np.arange(PATCHES), COLUMNS)
+    return np.stack([column, row], -1).astype(float)
+
+
+def area_corners() -> np.ndarray:
+    """Corners [4, 2] of the patches' area on that grid, clockwise from the dark skin patch."""
+    half, right, bottom = PATCH_SIDE / 2, COLUMNS - 1, ROWS - 1
+    return np.array(
+        [[-half, -half], [right + half, -half], [right + half, bottom + half], [-half, bottom + half]]
+    )
+
+
+def homography(points: np.ndarray, images: np.ndarray) -> np.ndarray:
+    """Fit the matrix [3, 3] that maps points [N, 2] to images [N, 2] by least squares; N is 4 or more.
+
+    Hartley and Zisserman, 'Multiple View Geometry', algorithm 4.2: images are centred and scaled first.
+    """
+    middle, scale = images.mean(0), max(float(images.std()), 1e-9)
+    x, y = points.T
+    u, v = ((images - middle) / scale).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    rows = [
+        np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], -1),
+        np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], -1),
+    ]
+    matrix = np.linalg.svd(np.concatenate(rows))[2][-1].reshape(3, 3)
+    back = np.array([[scale, 0, middle[0]], [0, scale, middle[1]], [0, 0, 1]])
+    return back @ matrix
+
+
+def project(grid_to_px: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Map points [..., 2] by a homography [3, 3]."""
+    mapped = points @ grid_to_px[:, :2].T + grid_to_px[:, 2]
+    return mapped[..., :2] / mapped[..., 2:]
+
+
+def squares_px(corners_px: np.ndarray, side: float = MIDDLE_SIDE) -> np.ndarray:
+    """Middle of each patch as a quadrilateral [24, 4, 2], from the corners [4, 2] of the patches' area."""
+    square = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return project(homography(area_corners(), corners_px), centres()[:, None] + square)
+
+
+def sample(pixels: np.ndarray, corners_px: np.ndarray) -> Patches:
+    """Measure the patches of an image [H, W, 3] between corners [4, 2] of the patches' area."""
+    colours, counts = np.zeros((PATCHES, 3)), np.zeros(PATCHES, int)
+    noise, at_white = np.zeros(PATCHES), np.zeros(PATCHES)
+    for place, square in enumerate(squares_px(corners_px) - 0.5):
+        inside = pixels[polygon(square[:, 1], square[:, 0], pixels.shape[:2])]
+        if not len(inside):
+            continue
+        colours[place], counts[place] = np.median(inside, 0), len(inside)
+        noise[place] = _SIGMA_OF_MAD * np.median(np.abs(inside[:, 1] - colours[place, 1]))
+        at_white[place] = (np.abs(inside - 1) < _AT_WHITE).any(-1).mean()
+    return Patches(colours, counts, noise, at_white)
+
+
+def shrunk(pixels: np.ndarray, side_px: int) -> tuple[np.ndarray, int]:
+    """Shrink an image [H, W, 3] to `side_px` or less by averaging square blocks; return it and their side.
+
+    A block is never larger than the image's shorter side, so a thin image may stay longer than `side_px`.
+    """
+    scale = min(math.ceil(max(pixels.shape[:2]) / side_px), *pixels.shape[:2])
+    height, width = (side // scale for side in pixels.shape[:2])
+    blocks = pixels[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
+    return blocks.mean((1, 3), dtype=np.float32), scale
+
+
+def four_turns(corners_px: np.ndarray) -> list[np.ndarray]:
+    """Corners [4, 2] clockwise on the screen, once from each corner: the four orientations of a chart."""
+    rolled = np.roll(corners_px, -1, 0)
+    area = (corners_px[:, 0] * rolled[:, 1] - rolled[:, 0] * corners_px[:, 1]).sum()
+    clockwise = corners_px if area > 0 else corners_px[::-1]
+    return [np.roll(clockwise, -turn, 0) for turn in range(4)]
+
+
+def is_convex(corners_px: np.ndarray) -> bool:
+    """Tell whether corners [4, 2] are those of a convex quadrilateral, in order around it."""
+    edges = np.roll(corners_px, -1, 0) - corners_px
+    ahead = np.roll(edges, -1, 0)
+    bends = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
+    return bool((bends > 0).all() or (bends < 0).all())
