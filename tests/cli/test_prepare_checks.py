@@ -33,7 +33,7 @@ def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
         def check_subject(capture: Capture, subject: str) -> list[Finding]:
             return [found for found in findings if found.subject == subject]
 
-        monkeypatch.setattr("facerf_cli.capture.checks.subject.check_subject", check_subject)
+        monkeypatch.setattr("facerf_cli.cli.items.capture_findings.check_subject", check_subject)
 
     return planted
 
@@ -151,7 +151,7 @@ def test_heads_that_moved_are_moved_back(
         asked[camera] = broken
         return {"L002": (1.0, -2.0)} if camera == "C0" else {}
 
-    monkeypatch.setattr("facerf_cli.capture.checks.motion.align_shifts", align_shifts)
+    monkeypatch.setattr("facerf_cli.capture.checks.align.align_shifts", align_shifts)
     assert prepare(capture, tmp_path, "--align", "--split", "1/1/0") == 0
     assert set(asked) == {"C0", "C1", "C2"}
     record = json.loads((tmp_path / "fits/0000.json").read_text())

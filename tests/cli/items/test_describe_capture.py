@@ -22,7 +22,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def bare(given: Path, tmp_path: Path) -> Path:
-    """Its pictures without stage.json."""
+    """Its images without stage.json."""
     shutil.copytree(given, tmp_path / "capture", ignore=shutil.ignore_patterns("stage.json"))
     return tmp_path / "capture"
 
@@ -46,6 +46,20 @@ def test_a_draft_filled_in_is_the_true_description(given: Path, bare: Path, caps
     (bare / "stage.json").write_text(json.dumps(draft | {key: true[key] for key in ("lights", "cameras")}))
     assert main(line) == 0
     assert "olat/0001/C2.exr" in capsys.readouterr().out
+
+
+def test_a_pattern_says_which_part_of_a_path_is_what(bare: Path, capsys: Said) -> None:
+    (bare / "raw").mkdir()
+    for subject in ("0000", "0001"):
+        (bare / subject).rename(bare / "raw" / subject)
+    assert main(["prepare-dataset", str(bare), "--describe"]) == 2
+    assert "images lie in 3 folders); give --pattern, such as '{subject}/" in capsys.readouterr().err
+    pattern = "raw/{subject}/{camera}/{light}.exr"
+    assert main(["prepare-dataset", str(bare), "--describe", "--pattern", pattern]) == 0
+    assert f"{pattern}: 2 subjects, 3 cameras, 4 lights" in capsys.readouterr().err
+    assert json.loads((bare / "stage.json").read_text())["pattern"] == pattern
+    assert main(["prepare-dataset", str(bare), "-o", str(bare / "out"), "--pattern", pattern]) == 2
+    assert "--pattern is for --describe" in capsys.readouterr().err
 
 
 def test_nothing_is_overwritten(bare: Path, capsys: Said) -> None:
@@ -88,6 +102,6 @@ def test_options_of_preparing_are_refused(bare: Path, capsys: Said, line: str) -
 
 def test_a_folder_that_is_no_capture_and_a_line_without_output(tmp_path: Path, capsys: Said) -> None:
     assert main(["prepare-dataset", str(tmp_path), "--describe"]) == 2
-    assert "no pictures found" in capsys.readouterr().err
+    assert "no images found" in capsys.readouterr().err
     assert main(["prepare-dataset", str(tmp_path)]) == 2
     assert "give -o DATASET" in capsys.readouterr().err
