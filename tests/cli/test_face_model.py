@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facerf_cli.cli.items import face_model
 from facerf_cli.face.importers import ict as published
-from facerf_cli.face.importers import import_model as importing
 from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
@@ -19,9 +19,9 @@ Capture = pytest.CaptureFixture[str]
 
 @pytest.fixture
 def imported(monkeypatch: pytest.MonkeyPatch) -> MorphableModel:
-    """What the importer gives here, whatever it is given: the built-in model."""
+    """The built-in model, which the importer returns here for any source."""
     model = load_face_model("builtin")
-    monkeypatch.setattr(importing, "import_face_model", lambda *_: model)
+    monkeypatch.setattr(face_model, "import_face_model", lambda *_: model)
     return model
 
 

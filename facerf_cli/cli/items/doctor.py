@@ -1,0 +1,90 @@
+"""The device, assets, colour configuration and cache that `facerf doctor` shows."""
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import platformdirs
+import torch
+
+from facerf_cli.cli.doctor import MISSING
+from facerf_cli.cli.options import Settings, torch_device
+from facerf_cli.errors import FacerfError
+from facerf_cli.face.landmarks import DETECTOR_LICENCE, PREDICTOR_LICENCE, predictor_path
+from facerf_cli.face.morphable import BUILTIN_PATH
+from facerf_cli.face.recognition import RECOGNITION_LICENCE
+from facerf_cli.models import DEFAULT_CHECKPOINT
+from facerf_cli.network.checkpoint import load_checkpoint
+
+
+def examine(settings: Settings) -> dict[str, dict[str, Any]]:
+    """The facts of this machine by section."""
+    return {
+        "device": _device(settings),
+        "assets": {
+            "face model": _face_model(BUILTIN_PATH),
+            "checkpoint": _checkpoint(settings.checkpoint or DEFAULT_CHECKPOINT),
+            "landmarks": _landmark_model(),
+        },
+        "colour": _colour_configuration(),
+        "cache": {"folder": platformdirs.user_cache_dir("facerf")},
+    }
+
+
+def _device(settings: Settings) -> dict[str, Any]:
+    device = torch_device(settings)
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu"
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "torch uses": f"{device} ({name})",
+        "threads": torch.get_num_threads(),
+        "memory": f"{memory:.0f} GiB",
+        "seed": settings.seed,
+    }
+
+
+def _face_model(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {"name": MISSING, "file": str(path)}
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {"name": str(arrays["name"]), "licence": str(arrays["licence"]), "size": _size(path)}
+    except (ValueError, OSError, KeyError) as error:
+        return {"name": f"{MISSING}: damaged, {error}", "file": str(path)}
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        _, metadata = load_checkpoint(path)
+    except FacerfError as error:
+        return {"name": f"{MISSING}: {error}"}
+    provenance = metadata.get("provenance", {})
+    return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
+
+
+def _landmark_model() -> dict[str, str]:
+    try:
+        size = _size(predictor_path())
+    except FacerfError as error:
+        size = f"{MISSING}: {error}"
+    return {
+        "points": PREDICTOR_LICENCE,
+        "size": size,
+        "detector": DETECTOR_LICENCE,
+        "recognition": RECOGNITION_LICENCE,
+    }
+
+
+def _colour_configuration() -> dict[str, Any]:
+    configuration = oiio.ColorConfig()
+    trouble = configuration.geterror()
+    if trouble:
+        raise FacerfError(f"$OCIO is {os.environ.get('OCIO', '')!r}: {trouble}")
+    return {"OCIO": configuration.configname(), "spaces": configuration.getNumColorSpaces()}
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 2**20:.1f} MiB"
