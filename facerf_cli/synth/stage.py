@@ -30,7 +30,7 @@ from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, StageCamera, stage
 from facerf_cli.synth.subjects import Subject, subject_model
 
 Renderer = Literal["bake", "mitsuba"]
-_TRANSPORT_SIDE = 128  # texels of the transport that is written beside a capture
+_TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
 _LEAST_FACING = -0.2  # cosine to a camera below which a vertex is not baked
 _BAKE = BakeSettings()
 
