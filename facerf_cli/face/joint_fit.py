@@ -85,9 +85,7 @@ class JointFit:
     translation_m: Tensor  # [3]
     alpha: Tensor  # [Ki]
     beta: Tensor  # [Ke]
-    error_iod: tuple[
-        float | None, ...
-    ]  # of each camera, see `fit_views`; None without landmarks
+    error_iod: tuple[float | None, ...]  # of each camera, see `fit_views`; None without landmarks
 
     @property
     def mean_error_iod(self) -> float:
