@@ -37,9 +37,14 @@ from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import read_image
 from facerf_cli.files.light_files import read_light
 from facerf_cli.light.envmap import rotated_weights
-from facerf_cli.light.rig_latlong import brightest_direction
 from facerf_cli.light.sh import rig_coefficients
-from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel, rig_directions
+from facerf_cli.light.sphere import (
+    RigLight,
+    azel_to_direction,
+    brightest_direction,
+    direction_to_azel,
+    rig_directions,
+)
 from facerf_cli.main import main as facerf
 from facerf_cli.metrics import light_error_deg
 from facerf_cli.pipeline import (

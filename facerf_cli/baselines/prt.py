@@ -62,7 +62,7 @@ class TransferSettings:
     order: int = 4
     side: int = 128
     lights: int = 200
-    lamp_samples: int = 4
+    lamp_samples: int = 4  # this name is part of the cache's keys
     bounce_samples: int = 16
     blur_texels: float = 1.0  # removes the noise of few samples
 

@@ -1,9 +1,8 @@
-"""A lat-long map as the weights of a rig's lights.
+"""Environment maps: the weights of a rig's lights under a lat-long map, and balls that show the map.
 
-A light of weight 1 gives a white Lambertian surface that faces it radiance 1, so a light's weight is
-(1 / pi) times the integral of the map's radiance over the light's cell: the directions that it is nearest to.
-
-A mirror ball and a diffuse ball under a map, so that one can see which way the map is turned.
+A light of weight 1 gives a white Lambertian surface that faces it radiance 1. So the weight of a light is
+(1 / pi) times the integral of the map's radiance over the light's cell: the directions that are nearer to it
+than to any other light of the rig.
 """
 
 import math
@@ -19,17 +18,24 @@ from facerf_cli.errors import InputError
 from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong_solid_angles
 
 Sampling = Literal["cell", "paper"]
-_COLUMNS_AT_ONCE = 1 << 10  # of the map, when its rows are integrated in float64
+_COLUMNS_AT_ONCE = 1 << 10  # of a map, which are integrated in float64
+_LEAST_CELL_ROWS = 256  # of the grid on which cells are found
+_BALL_SAMPLES = 3  # along each side of a pixel of a ball
+_IRRADIANCE_ROWS, _SOURCE_ROWS = 32, 64  # of the diffuse ball's maps: both far finer than the cosine lobe
 
 
 def check_envmap(envmap: Tensor) -> None:
-    """Say what is wrong with a map [H, W, 3] that a user brought, if anything is."""
+    """Raise InputError for a map [H, W, 3] of another shape than lat-long or with non-finite pixels."""
     if envmap.ndim != 3 or envmap.shape[2] != 3 or envmap.shape[1] != 2 * envmap.shape[0]:
         size = " x ".join(str(side) for side in reversed(envmap.shape[:2]))
-        raise InputError(f"an environment map is twice as wide as high (lat-long), not {size} pixels")
+        raise InputError(
+            f"the environment map has {size} pixels, but must be twice as wide as high; give a lat-long map"
+        )
     broken = int((~envmap.isfinite()).any(-1).sum())
     if broken:
-        raise InputError(f"{broken} pixels of the environment map are NaN or infinite; mend it first")
+        raise InputError(
+            f"the environment map has {broken} pixels that are NaN or infinite; repair them first"
+        )
 
 
 def envmap_weights(
@@ -37,9 +43,9 @@ def envmap_weights(
 ) -> Tensor:
     """Weights [L, 3] float32 of the lights at `directions` [L, 3] under a linear map [H, W, 3].
 
-    `rotate_deg` is added to the azimuth of everything in the map. pi times the sum of the "cell" weights is
-    the map's integral, at any map size. "paper" takes the map's pixel at the light's direction (paper,
-    'Relighting'), times the light's equal share of the sphere.
+    `rotate_deg` is added to every azimuth of the map. Sampling "cell" integrates the map over cells: pi times
+    the sum of the weights is the integral of the map, at any map size. Sampling "paper" takes the map's pixel
+    at the light's direction (paper, 'Relighting'), times an equal share of the sphere.
     """
     return rotated_weights(envmap, directions, [rotate_deg], sampling)[0]
 
@@ -47,7 +53,7 @@ def envmap_weights(
 def rotated_weights(
     envmap: Tensor, directions: Tensor, rotations_deg: Sequence[float], sampling: Sampling = "cell"
 ) -> Tensor:
-    """`envmap_weights` at many rotations [R, L, 3]; what does not turn is computed once."""
+    """`envmap_weights` at many rotations [R, L, 3]; what they share is computed once."""
     if sampling == "paper":
         return torch.stack([_pixel_weights(envmap, directions, rotation) for rotation in rotations_deg])
     height = cell_rows(len(directions))
@@ -55,32 +61,33 @@ def rotated_weights(
     rows = _RowIntegrals(envmap, height)
     weights = torch.zeros(len(rotations_deg), len(directions), 3, dtype=torch.float64)
     for weight, rotation_deg in zip(weights, rotations_deg, strict=True):
-        weight.index_add_(0, cell, rows.turned(2 * height, rotation_deg).reshape(-1, 3) / math.pi)
+        weight.index_add_(0, cell, rows.rotated(2 * height, rotation_deg).reshape(-1, 3) / math.pi)
     return weights.float()
 
 
 def cell_rows(lights: int) -> int:
-    """Rows of the grid on which cells are told apart: dozens of texels a cell at the least."""
-    return max(256, 2 * math.ceil(8 * math.sqrt(lights)))
+    """Rows of the grid on which the cells of a rig are found, with dozens of texels in each cell."""
+    return max(_LEAST_CELL_ROWS, 2 * math.ceil(8 * math.sqrt(lights)))
 
 
 def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:
-    """Index of the light [L, 3] whose cell holds each texel's centre [H, W] int64."""
+    """Index of the light [L, 3] nearest to the centre of each texel of a lat-long map [H, W] int64."""
     texels = latlong_directions(height, width, torch.float64)
     _, index = cKDTree(directions.double().cpu().numpy()).query(texels.numpy())
     return torch.from_numpy(index).long()
 
 
 def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float = 0.0) -> Tensor:
-    """A map's radiance integrated over the texels of another, turned grid [height, width, 3] float64.
+    """Integrals of a map's radiance over the texels of another grid [height, width, 3] float64.
 
-    Exact for a map that is constant over each of its own pixels, whatever the two sizes and the angle.
+    `rotate_deg` is added to every azimuth of the map. The integrals are exact for a map that is constant over
+    each of its pixels, for any sizes and angle.
     """
-    return _RowIntegrals(envmap, height).turned(width, rotate_deg)
+    return _RowIntegrals(envmap, height).rotated(width, rotate_deg)
 
 
 class _RowIntegrals:
-    """A map integrated over the elevations of `height` new rows, ready to be cut at any azimuth."""
+    """Integrals of a map over the elevations of `height` rows, cumulative over azimuth."""
 
     def __init__(self, envmap: Tensor, height: int) -> None:
         envmap = torch.as_tensor(envmap)
@@ -97,10 +104,10 @@ class _RowIntegrals:
         up_to = torch.cat(parts, 1).cumsum(1) * pixel_azimuth
         self._up_to = torch.cat([zero, up_to], 1)  # [height, W + 1, 3]
 
-    def turned(self, width: int, rotate_deg: float) -> Tensor:
-        """Integrals over `width` texels a row [height, width, 3] with `rotate_deg` added to every azimuth."""
+    def rotated(self, width: int, rotate_deg: float) -> Tensor:
+        """Integrals over `width` texels per row [height, width, 3], `rotate_deg` added to every azimuth."""
         pixels = self._up_to.shape[1] - 1
-        # u falls as azimuth grows, so what now lies at u came from further right.
+        # u decreases with azimuth, so the content at u comes from further right.
         u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360
         turns = u.floor()
         position = (u - turns) * pixels
@@ -125,18 +132,15 @@ def _pixel_weights(envmap: Tensor, directions: Tensor, rotate_deg: float) -> Ten
     return (envmap[row, column].double() * (4 / len(directions))).float()
 
 
-_SAMPLES = 3  # along each side of a pixel
-_IRRADIANCE_ROWS, _SOURCE_ROWS = 32, 64  # both far finer than the cosine lobe
-
-
 def ball(
     envmap: Tensor, side_px: int, kind: Literal["mirror", "diffuse"] = "mirror", rotate_deg: float = 0.0
 ) -> Tensor:
-    """Radiance [side, side, 3] of a ball that fills the square, seen from far along +z; black beyond it.
+    """Render a ball under a linear map [H, W, 3]: radiance [side, side, 3], black around the ball.
 
-    Both balls reflect everything, so under a constant map both look like the map. `envmap` [H, W, 3] linear.
+    The ball fills the square and is seen from far along +z. Both kinds reflect all light: under a constant
+    map both have the radiance of the map.
     """
-    normals, inside = _ball_normals(side_px * _SAMPLES)
+    normals, inside = _ball_normals(side_px * _BALL_SAMPLES)
     radiance = torch.zeros(*inside.shape, 3)
     if kind == "mirror":
         toward_camera = torch.tensor([0.0, 0, 1])
@@ -144,11 +148,11 @@ def ball(
         radiance[inside] = _look_up(_mean_radiance(envmap, 2 * side_px, rotate_deg), reflected)
     else:
         radiance[inside] = _look_up(_irradiance(envmap, rotate_deg) / math.pi, normals[inside])
-    return F.avg_pool2d(radiance.permute(2, 0, 1), _SAMPLES).permute(1, 2, 0)
+    return F.avg_pool2d(radiance.permute(2, 0, 1), _BALL_SAMPLES).permute(1, 2, 0)
 
 
 def _ball_normals(side: int) -> tuple[Tensor, Tensor]:
-    """Normals [side, side, 3] of the unit ball, and where it is [side, side] bool."""
+    """Normals [side, side, 3] of the unit ball, and the pixels that it covers [side, side] bool."""
     x = (torch.arange(side) + 0.5) * (2 / side) - 1
     y, x = torch.meshgrid(-x, x, indexing="ij")
     z2 = 1 - x * x - y * y
@@ -156,7 +160,7 @@ def _ball_normals(side: int) -> tuple[Tensor, Tensor]:
 
 
 def _look_up(latlong: Tensor, directions: Tensor) -> Tensor:
-    """A map [H, W, 3] along directions [P, 3], bilinear: [P, 3]."""
+    """Sample a map [H, W, 3] in directions [P, 3], bilinearly: [P, 3]."""
     width = latlong.shape[1]
     wrapped = torch.cat([latlong[:, -1:], latlong, latlong[:, :1]], 1).permute(2, 0, 1)[None]
     uv = direction_to_uv(directions)
@@ -166,14 +170,14 @@ def _look_up(latlong: Tensor, directions: Tensor) -> Tensor:
 
 
 def _mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
-    """The turned map [h, 2 h, 3], averaged down to `most_rows` so that small pixels do not flicker."""
+    """Rotate a map and average it down to `most_rows` at most [h, 2 h, 3], against aliasing."""
     height = min(most_rows, len(envmap))
     integrals = texel_integrals(envmap, height, 2 * height, rotate_deg)
     return (integrals / latlong_solid_angles(height, 2 * height, torch.float64)[..., None]).float()
 
 
 def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:
-    """Radiance times cosine, integrated, as a small lat-long map of the normals [h, 2 h, 3]."""
+    """Irradiance as a small lat-long map [h, 2 h, 3] over the direction of the normal."""
     normals = latlong_directions(_IRRADIANCE_ROWS, 2 * _IRRADIANCE_ROWS)
     sources = latlong_directions(_SOURCE_ROWS, 2 * _SOURCE_ROWS).reshape(-1, 3)
     power = texel_integrals(envmap, _SOURCE_ROWS, 2 * _SOURCE_ROWS, rotate_deg).reshape(-1, 3).float()

@@ -1,10 +1,9 @@
-"""The light of a photo by least squares over a field's single lights (paper, 'Light Estimation').
+"""Estimate the light of a photo from a reflectance field (paper, 'Light Estimation').
 
-A photo's light refined by features of its texture (paper, 'Light Estimation').
-
-From the least-squares light on, argmin over the weights of |V_f(explained texture) - V_f(photo's texture)|^2
-by Adadelta (Zeiler, *ADADELTA: an adaptive learning rate method*, 2012), as the paper does it. What features
-are compared is handed in.
+`LightEvidence` holds the textures under each single light of a rig and the texture of the photo.
+`LightEvidence.least_squares` solves Eq. (leastsq) of the paper for the weights of the lights; `refine_light`
+then minimises |V_f(explained texture) - V_f(photo's texture)|^2 over the weights by Adadelta (Zeiler,
+*ADADELTA: an adaptive learning rate method*, 2012), as the paper does. The caller gives the features.
 """
 
 import math
@@ -19,25 +18,29 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 
-_RIDGE = 0.02  # against lights that undo each other, as a share of the picture's norm
-_OUTLIER = 3.0  # a texel further off than this many median errors weighs in inverse proportion
+Features = Callable[[Tensor], Sequence[Tensor]]  # of linear textures [B, 3, T, T], black outside the mask
+
+_WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their neighbours, lie above this
+_LEAST_TEXELS = 200  # fewer do not determine where light comes from
+_BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
+_RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
+_OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
 _ROUNDS, _ROUNDS_GREY = 3, 5  # of reweighting
-_SMOOTH, _SHORT = 0.1, 0.01  # the grey light of `estimate_smooth_light`, as shares of the picture's norm;
-_SMOOTH_OWN, _SHORT_OWN = 1.0, 0.1  # and what each channel adds to it
-_STANDS_OUT = 3.0  # a light further from its neighbours than this many mean lights may well be a lamp
-_TINY = 1e-12
-_NEIGHBOURHOOD = 1.5  # standard deviation of what is around a light, in mean distances between lights
-_WHITE = 0.95  # of a picture that ends at 1: what was brighter lies, averaged with its neighbours, above this
-_LEAST_TEXELS = 200  # fewer say nothing of where light comes from
-_BLACK = 1e-4  # the mean of a face that nothing lights: below one step of 8 bits
+# Weights of smoothness and of shortness, as shares of the photo's norm: of the grey light that all channels
+# share, and of each channel's difference from it.
+_SMOOTH, _SHORT = 0.1, 0.01
+_SMOOTH_CHANNEL, _SHORT_CHANNEL = 1.0, 0.1
+_STANDS_OUT = 3.0  # mean weights by which a light differs from its neighbours if it is a lone bright light
+_NEIGHBOURHOOD = 1.5  # standard deviation of the neighbourhood of a light, in mean spacings of the lights
+_TINY = 1e-12  # avoids divisions by 0
 
 
 @dataclass(frozen=True, eq=False)
 class LightEvidence:
-    """A face in the chart under each single light, and in its photo; all scene-linear.
+    """A face in UV space under each single light, and in its photo; all scene-linear.
 
     directions [L, 3], unit, camera space; olats [L, 3, T, T]; photo [3, T, T]; mask [T, T] bool: the texels
-    in which the two are held against each other (the paper's M_t in the chart).
+    that are compared (the paper's M_t in UV space).
     """
 
     directions: Tensor
@@ -47,62 +50,63 @@ class LightEvidence:
 
     @property
     def clipped(self) -> Tensor:
-        """Where the photo is at white, which may stand for anything brighter [3, T, T] bool.
+        """Texels [3, T, T] bool that are white in the photo, where the true radiance may be higher.
 
-        A photo that goes beyond 1 anywhere was not clipped there.
+        A photo with any value above 1 is not clipped.
         """
         ends_at_white = bool(self.photo[:, self.mask].max() <= 1) if self.mask.any() else False
         return (self.photo >= _WHITE) & self.mask & ends_at_white
 
     def require_a_face(self) -> None:
-        """InputError where there is nothing to read a light from."""
+        """Raise InputError if too little of the face is visible, or if it is black."""
         texels = int(self.mask.sum())
         if texels < _LEAST_TEXELS:
             raise InputError(
-                f"too little of the face is seen to read its light from ({texels} texels of the "
-                f"{self.mask.shape[-1]} x {self.mask.shape[-1]}, at least {_LEAST_TEXELS} are needed)"
+                f"too little of the face is visible to estimate its light: {texels} texels of "
+                f"{self.mask.shape[-1]} x {self.mask.shape[-1]}, at least {_LEAST_TEXELS} are needed; "
+                "give a photo or a matte that shows more of it"
             )
         if float(self.photo[:, self.mask].mean()) < _BLACK:
-            raise InputError("the face is black in the photo, so no light can be read from it")
+            raise InputError("the face is black in the photo: it shows no light; give a brighter photo")
 
     def relit(self, weights: Tensor) -> Tensor:
-        """The face under weights [L, 3], as it is explained: [3, T, T]."""
+        """The face under weights [L, 3]: [3, T, T]."""
         return torch.einsum("lc,lcij->cij", weights, self.olats)
 
     def residual(self, explained: Tensor) -> float:
-        """|explained [3, T, T] - photo| / |photo| in the mask; of clipped texels only what is too dark."""
+        """|explained [3, T, T] - photo| / |photo| in the mask; clipped texels count only if too dark."""
         photo, clipped = self.photo[:, self.mask], self.clipped[:, self.mask]
         error = explained[:, self.mask] - photo
         error = torch.where(clipped, error.clamp(max=0), error)
         return float(error.norm() / photo.norm().clamp_min(_TINY))
 
     def least_squares(self, non_negative: bool = True) -> Tensor:
-        """Weights [L, 3] over the mask: by `estimate_smooth_light`, or the paper's own `plain_estimate`."""
+        """Weights [L, 3] over the mask by `estimate_smooth_weights`, or by `estimate_signed_weights`."""
         olats, photo = self.olats[..., self.mask], self.photo[:, self.mask]
         if not non_negative:
-            return plain_estimate(olats, photo)
-        return estimate_smooth_light(self.directions, olats, photo, self.clipped[:, self.mask])
+            return estimate_signed_weights(olats, photo)
+        return estimate_smooth_weights(self.directions, olats, photo, self.clipped[:, self.mask])
 
 
-def estimate_light(olats: Tensor, image: Tensor) -> Tensor:
-    """Non-negative weights [L, C] with which lights' pictures [L, C, N] sum to a picture [C, N].
+def estimate_weights(olats: Tensor, image: Tensor) -> Tensor:
+    """Solve Eq. (leastsq) for non-negative weights [L, C], which sum images [L, C, N] to an image [C, N].
 
-    Eq. (leastsq) of the paper, a channel at a time, with what is clipped, covered or misfitted weighing less
-    (iteratively reweighted least squares). Everything is scene-linear.
+    Iteratively reweighted least squares, a channel at a time: clipped, covered and misfitted elements lose
+    weight. All images are scene-linear.
     """
-    channels = [_weights(a, b) for a, b in zip(olats.unbind(1), image, strict=True)]
+    channels = [_channel_weights(a, b) for a, b in zip(olats.unbind(1), image, strict=True)]
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def _weights(olats: Tensor, image: Tensor) -> np.ndarray:
+def _channel_weights(olats: Tensor, image: Tensor) -> np.ndarray:
     lights, target = olats.double().T.numpy(), image.double().numpy()  # [N, L], [N]
-    if not len(target):  # nothing is seen well enough
+    if not len(target):  # nothing is visible enough
         return np.zeros(lights.shape[1])
     ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
     trust = np.ones(len(target))
     for _ in range(_ROUNDS):
         rows = np.concatenate([lights * trust[:, None], ridge])
-        basis, square = qr(rows, mode="economic")  # as small a problem as there are lights
+        basis, square = qr(rows, mode="economic")  # reduces N rows to L
         weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
         error = np.abs(lights @ weights - target)
         limit = _OUTLIER * np.median(error) + _TINY
@@ -110,10 +114,10 @@ def _weights(olats: Tensor, image: Tensor) -> np.ndarray:
     return np.asarray(weights)
 
 
-def plain_estimate(olats: Tensor, image: Tensor) -> Tensor:
-    """Eq. (leastsq) as it stands: signed weights [L, C], every element of the picture [C, N] alike.
+def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
+    """Solve Eq. (leastsq) as the paper states it: signed weights [L, C], all elements weighted alike.
 
-    Of the many solutions where lights cannot be told apart, the shortest.
+    Where several solutions exist, it is the one of least norm.
     """
     channels = [
         np.linalg.lstsq(lights.double().T.numpy(), target.double().numpy())[0]
@@ -122,31 +126,69 @@ def plain_estimate(olats: Tensor, image: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def estimate_smooth_light(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
-    """Eq. (leastsq) for a light that is to be looked at: non-negative, smooth where the face leaves it open.
+def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
+    """Solve Eq. (leastsq) for a plausible light: non-negative, smooth where the face does not determine it.
 
-    Of lights at directions [L, 3], whose pictures [L, 3, N] are to sum to a picture [3, N]. A face fixes few
-    numbers of the hundreds sought, and a channel at a time the rest comes out as coloured specks. So first
-    all channels share one grey light in one colour, smooth but for lamps that stand out;
-    then each channel departs from that, again by what is smooth over the sphere. What is covered or
-    misfitted weighs less; where `clipped` [3, N] bool, only being too dark is an error.
+    The lights have directions [L, 3] and images [L, 3, N], which are to sum to an image [3, N]. A face
+    determines few of the hundreds of weights, and a solution for each channel alone has coloured specks. So
+    all channels first share one grey light, tinted, that is smooth except for lone bright lights; then each
+    channel differs from it by weights that are smooth over the sphere. Covered and misfitted elements lose
+    weight; where `clipped` [3, N] bool, only too dark a result is an error.
     """
     channels = [
         _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
         for lights, target, white in zip(olats.unbind(1), image, clipped, strict=True)
     ]
-    from_near = _from_near(directions.double().numpy())
+    from_near = _difference_from_neighbours(directions.double().numpy())
     grey, colour = _grey_light(channels, from_near)
     roughness = from_near.T @ from_near
     own = [channel.near(gain * grey, roughness) for channel, gain in zip(channels, colour, strict=True)]
     return torch.from_numpy(np.stack(own, -1)).float()
 
 
-def _grey_light(channels: "list[_Channel]", from_near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The light [L] that all channels share, and how much of it each has [3].
+class _Channel:
+    """One colour channel of the images under each light [N, L] and of the photo [N], with trust [N]."""
 
-    What stands out from its neighbours is held to them the less the more it does (Cauchy's weights), or a
-    lone lamp would be smeared out.
+    def __init__(self, lights: np.ndarray, target: np.ndarray, clipped: np.ndarray) -> None:
+        self._lights, self._target, self._clipped = lights, target, clipped
+        self._trust = np.ones(len(target))  # weight of each squared error
+        self.power = float(target @ target)
+
+    def gram(self) -> np.ndarray:
+        return (self._lights.T * self._trust) @ self._lights
+
+    def moment(self) -> np.ndarray:
+        return self._lights.T @ (self._trust * self._target)
+
+    def gain_of(self, weights: np.ndarray) -> float:
+        """The factor by which `weights` explain this channel best."""
+        explained = self._lights @ weights
+        return float(
+            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, _TINY)
+        )
+
+    def reweight(self, weights: np.ndarray) -> None:
+        """Set trust by the errors under the weights (Huber), 0 for clipped texels that are bright enough."""
+        beyond = self._lights @ weights - self._target
+        error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
+        typical = error if self._clipped.all() else error[~self._clipped]
+        limit = _OUTLIER * np.median(typical) + _TINY
+        self._trust = np.minimum(1, limit / np.maximum(error, limit)) * ~(self._clipped & (beyond > 0))
+
+    def near(self, wanted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        """Weights [L] that explain this channel and differ smoothly from the `wanted` ones."""
+        hold = self.power * (_SMOOTH_CHANNEL**2 * roughness + _SHORT_CHANNEL**2 * np.eye(len(wanted)))
+        for _ in range(_ROUNDS):
+            weights = _non_negative(self.gram() + hold, self.moment() + hold @ wanted)
+            self.reweight(weights)
+        return weights
+
+
+def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Estimate the light [L] that all channels share, and its gain in each [3].
+
+    The more a light stands out from its neighbours, the less smoothness is demanded of it (Cauchy weights);
+    otherwise a lone bright light would be spread over its neighbours.
     """
     lights = len(from_near)
     power = sum(channel.power for channel in channels)
@@ -162,47 +204,9 @@ def _grey_light(channels: "list[_Channel]", from_near: np.ndarray) -> tuple[np.n
         grey = _non_negative(gram, moment)
         hold = 1 / (1 + (from_near @ grey / max(_STANDS_OUT * grey.mean(), _TINY)) ** 2)
         for channel, gain in zip(channels, colour, strict=True):
-            channel.weigh_anew(gain * grey)
+            channel.reweight(gain * grey)
         colour = np.array([channel.gain_of(grey) for channel in channels])
     return grey, colour
-
-
-class _Channel:
-    """One colour of the pictures under each light [N, L] and of the photo [N], and each texel's trust."""
-
-    def __init__(self, lights: np.ndarray, target: np.ndarray, clipped: np.ndarray) -> None:
-        self._lights, self._target, self._clipped = lights, target, clipped
-        self._trust = np.ones(len(target))  # of its squared error
-        self.power = float(target @ target)
-
-    def gram(self) -> np.ndarray:
-        return (self._lights.T * self._trust) @ self._lights
-
-    def moment(self) -> np.ndarray:
-        return self._lights.T @ (self._trust * self._target)
-
-    def gain_of(self, weights: np.ndarray) -> float:
-        """What `weights` are best multiplied by."""
-        explained = self._lights @ weights
-        return float(
-            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, _TINY)
-        )
-
-    def weigh_anew(self, weights: np.ndarray) -> None:
-        """Trust each texel by its error under the weights (Huber); none that is clipped and bright enough."""
-        beyond = self._lights @ weights - self._target
-        error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
-        told = error if self._clipped.all() else error[~self._clipped]
-        limit = _OUTLIER * np.median(told) + _TINY
-        self._trust = np.minimum(1, limit / np.maximum(error, limit)) * ~(self._clipped & (beyond > 0))
-
-    def near(self, wanted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """The weights [L] that explain this channel and differ smoothly from the `wanted` ones."""
-        hold = self.power * (_SMOOTH_OWN**2 * roughness + _SHORT_OWN**2 * np.eye(len(wanted)))
-        for _ in range(_ROUNDS):
-            weights = _non_negative(self.gram() + hold, self.moment() + hold @ wanted)
-            self.weigh_anew(weights)
-        return weights
 
 
 def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
@@ -212,20 +216,20 @@ def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
     return np.asarray(nnls(factor.T, solve_triangular(factor, moment, lower=True))[0])
 
 
-def _from_near(directions: np.ndarray) -> np.ndarray:
-    """The matrix [L, L] that takes lights' weights to how far each is from the mean of those around it."""
+def _difference_from_neighbours(directions: np.ndarray) -> np.ndarray:
+    """The matrix [L, L] from lights' weights to the difference of each from the mean of its neighbours."""
     spacing = math.sqrt(4 * math.pi / len(directions))
     near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
     np.fill_diagonal(near, 0)
     return np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)
 
 
-Features = Callable[[Tensor], Sequence[Tensor]]  # of textures [B, 3, T, T], linear, black beyond the mask
-
-
 @dataclass(frozen=True)
 class RefineSettings:
-    """Adadelta's own rate is 1; it ends once `patience` steps gained less than the share `settled`."""
+    """Steps and learning rate of Adadelta (its own rate is 1).
+
+    The search ends once `patience` steps have lowered the loss by less than the share `settled`.
+    """
 
     steps: int = 150
     learning_rate: float = 1.0
@@ -235,7 +239,7 @@ class RefineSettings:
 
 @dataclass(frozen=True, eq=False)
 class RefinedLight:
-    """Weights [L, 3], the loss of the start and theirs, and after how many steps it ended."""
+    """Weights [L, 3], the losses of the start and of the result, and the number of steps."""
 
     weights: Tensor
     loss_before: float
@@ -250,12 +254,12 @@ def refine_light(
     non_negative: bool = True,
     settings: RefineSettings = RefineSettings(),
 ) -> RefinedLight:
-    """The light of least feature loss on the way from `start` [L, 3]; never worse than the start.
+    """Minimise the feature loss from weights `start` [L, 3] on; the result is never worse than the start.
 
-    Non-negativity is kept by projection. Beyond white nothing is asked of clipped texels.
+    Projection keeps weights non-negative. Clipped texels have no error where they are bright enough.
     """
     loss_of = _FeatureLoss(evidence, features)
-    unit = float(start.square().mean().sqrt()) or 1.0  # so that a step is of the same size for every photo
+    unit = float(start.square().mean().sqrt()) or 1.0  # makes the size of a step the same for all photos
     scaled = (start / unit).requires_grad_()
     optimizer = torch.optim.Adadelta([scaled], lr=settings.learning_rate)
     best, first, least, losses = start, 0.0, float("inf"), []
@@ -276,7 +280,7 @@ def refine_light(
 
 
 class _FeatureLoss:
-    """Mean squared difference of features, summed over layers, of the masked textures of one face."""
+    """Mean squared difference of features, summed over layers, between masked textures of one face."""
 
     def __init__(self, evidence: LightEvidence, features: Features) -> None:
         self._evidence, self._features = evidence, features

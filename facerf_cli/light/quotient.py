@@ -1,8 +1,8 @@
-"""A reflectance field held to its photo: relit by the photo's own light, the photo comes back.
+"""The photo quotient: it corrects a reflectance field so that the photo's own light gives the photo back.
 
-Where the network is wrong about a face (a white of the eye too bright, a crease too shallow) it is as wrong
-under the photo's own light as under one like it, and there the error is known: the photo over what the field
-makes of it, a quotient image (Riklin-Raviv and Shashua, *The quotient image*, 2001) of the network's own.
+Errors of the network in a face (the white of an eye too bright, a crease too shallow) are about the same
+under the photo's light and under similar lights. Under the photo's light they are known: the photo divided by
+its reconstruction from the field is a quotient image (Riklin-Raviv and Shashua, *The quotient image*, 2001).
 """
 
 from dataclasses import dataclass
@@ -11,30 +11,30 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-_FLOOR = 0.2  # of the photo's mean radiance: keeps quotients of shadows near 1
-_RANGE = (0.3, 3.0)
-_SHARPNESS = 8.0  # of how fast a light is left alone as it shades the face less like the photo's
+_FLOOR = 0.2  # as a share of the photo's mean radiance: keeps quotients in shadows near 1
+_RANGE = (0.3, 3.0)  # of the quotients
+_SHARPNESS = 8.0  # exponent of the likeness: the higher, the more alike a light must shade the face
 
 
 @dataclass(frozen=True)
 class Quotient:
-    """Photo over explained photo [3, t, t]; the explained photo's luminance where it is seen [t, t]."""
+    """Photo over its reconstruction [3, t, t], and the visible reconstruction, grey [t, t]."""
 
     ratio: Tensor
     explained: Tensor
 
     @staticmethod
     def of(photo: Tensor, explained: Tensor, visible: Tensor) -> "Quotient":
-        """Of textures [3, t, t], scene-linear; visible [t, t] in 0..1."""
+        """Divide a photo by its reconstruction, scene-linear textures [3, t, t]; visible [t, t] in 0..1."""
         floor = _FLOOR * (photo.mean(0) * visible).sum() / visible.sum().clamp_min(1e-6)
         ratio = ((photo + floor) / (explained + floor).clamp_min(1e-12)).clamp(*_RANGE)
         return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible)
 
     def corrected(self, olats: Tensor) -> Tensor:
-        """OLAT textures [l, 3, T, T] times the quotient, each as far as its light is like the photo's.
+        """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
 
-        Likeness is the cosine between the two pictures, so it is the shading that counts, not where a lamp
-        is: a photo's dome of light lends nothing to a lamp from the side.
+        Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
+        not light directions: a photo under a dome of light hardly corrects a light from the side.
         """
         small = F.interpolate(olats, self.explained.shape, mode="area").mean(1)
         lengths = (small * (self.explained > 0)).flatten(1).norm(dim=1) * self.explained.norm()

@@ -1,17 +1,9 @@
-"""Real spherical harmonics of any order: light as coefficients, and back; one convention, stated here.
+"""Light as real spherical harmonics: coefficients of rigs and lat-long maps, and back, of any order.
 
-`CONVENTION` goes into every file that holds coefficients. Coefficients [K, C], K = (order + 1)^2, are
-c_lm = integral of L(d) Y_lm(d) over the sphere: radiance times steradian. A light of a rig of weight w
-(`light/envmap.py`: it gives a white surface that faces it radiance 1) is a point of radiance times solid
-angle pi w, so a rig and the map that it was weighed from have about the same coefficients.
-
-Spherical harmonics of a lat-long map, and the map of coefficients; the convention is `sh.CONVENTION`.
-
-A light that can shine, nowhere negative, with given spherical-harmonic coefficients.
-
-Coefficients cut off at an order ring below 0, and a face that is lit so goes black where it should be dim. Of
-all non-negative lights that have the coefficients, the one of least power (least integral of its square) is a
-harmonic series clipped at 0; its series is found from the coefficients by Newton's method on the convex dual.
+`CONVENTION` is written into every file that holds coefficients. Coefficients [K, C], K = (order + 1)^2, are
+c_lm = integral of L(d) Y_lm(d) over the sphere: radiance times steradian. A rig's light of weight w gives a
+white surface that faces it radiance w (`light/sphere.py`), so it is a point of radiance times solid angle
+pi w, and a rig and the map from which its weights were computed have about the same coefficients.
 """
 
 import math
@@ -29,20 +21,31 @@ CONVENTION = (
     "(y, z, x)"
 )
 MOST_ORDER = 20
+# Rotates camera axes so that the polar axis of the harmonics is that of the map, +y: the basis is then a
+# product of a function of the row and one of the column. (z, x, y).
+_MAP_POLAR = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
+_VALUES_AT_ONCE = 1 << 24  # of a large map, against memory
+# Of the series that is clipped to a non-negative light.
+_RIDGE = 1e-3  # bounds it if no non-negative light has the coefficients
+_STEPS = 60  # of Newton's method
+_SETTLED = 1e-8  # gradient at which it ends
+_FEWEST_DIRECTIONS, _DIRECTIONS_PER_COEFFICIENT = 2048, 10  # of its quadrature
 
 
 def sh_basis(directions: Tensor, order: int) -> Tensor:
-    """Y_lm [..., (order + 1)^2] along unit directions [..., 3], in their own precision; differentiable.
+    """Y_lm [..., (order + 1)^2] in unit directions [..., 3], in their precision; differentiable.
 
-    Polynomials in x, y, z, so that nothing breaks at the poles: the associated Legendre functions over
+    They are polynomials in x, y, z, which are regular at the poles: the associated Legendre functions over
     sin^m theta by their recurrence in l (Sloan, *Stupid Spherical Harmonics Tricks*, 2008, appendix A1),
     times the real and imaginary part of (x + i y)^m.
     """
     if not 0 <= order <= MOST_ORDER:
-        raise InputError(f"spherical harmonics of order {order}: orders from 0 to {MOST_ORDER} can be had")
+        raise InputError(
+            f"spherical harmonics of order {order}: not supported; give an order from 0 to {MOST_ORDER}"
+        )
     x, y, z = directions.unbind(-1)
     basis: list[Tensor] = [z] * (order + 1) ** 2
-    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # of m times the azimuth, times sin^m theta
+    cosine, sine = torch.ones_like(z), torch.zeros_like(z)  # cos and sin of m azimuth, times sin^m theta
     for m in range(order + 1):
         for degree, legendre in enumerate(_legendre(z, m, order), start=m):
             middle = degree * degree + degree
@@ -67,10 +70,12 @@ def _legendre(z: Tensor, m: int, order: int) -> list[Tensor]:
 
 
 def order_of(coefficients: Tensor) -> int:
-    """The order of coefficients [K, ...]; K must be a square."""
+    """The order of coefficients [K, ...]; raises InputError if K is not a square."""
     order = math.isqrt(len(coefficients)) - 1
     if order < 0 or (order + 1) ** 2 != len(coefficients):
-        raise InputError(f"{len(coefficients)} spherical-harmonic coefficients; there are 1, 4, 9, 16, ...")
+        raise InputError(
+            f"{len(coefficients)} spherical-harmonic coefficients: no order has so many; give 1, 4, 9, ..."
+        )
     return order
 
 
@@ -81,11 +86,11 @@ def rig_coefficients(light: RigLight, order: int) -> Tensor:
 
 
 def coefficients_to_rig(coefficients: Tensor, directions: Tensor | None = None) -> RigLight:
-    """The light of least weights, over `directions` [L, 3], that has these coefficients [K, 3].
+    """The weights of least norm of a rig with directions [L, 3] that have these coefficients [K, 3].
 
-    Over the paper's 150 lights where no directions are given. Signed, by the pseudo-inverse:
-    `rig_coefficients` gives the coefficients back exactly for a rig of enough lights that are spread over the
-    sphere (150 are enough up to order 11), else the nearest that can be had.
+    The default rig has the paper's 150 lights. Weights are signed, by the pseudo-inverse. `rig_coefficients`
+    gives the coefficients back exactly if the rig has enough lights that are spread over the sphere (150 are
+    enough up to order 11), and the nearest possible ones otherwise.
     """
     directions = rig_directions() if directions is None else directions
     basis = sh_basis(directions.double(), order_of(coefficients))
@@ -102,7 +107,7 @@ def irradiance(normals: Tensor, coefficients: Tensor) -> Tensor:
     """Irradiance [..., 3] on surfaces of unit normals [..., 3]; over pi it is a white surface's radiance.
 
     Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment Maps*, 2001, Eq. 7.
-    It may be slightly negative, as a cut series is.
+    It may be slightly negative, as a truncated series is.
     """
     order = order_of(coefficients)
     lobe = torch.cat(
@@ -124,9 +129,10 @@ def cosine_lobe(degree: int) -> float:
 
 
 def rotated(coefficients: Tensor, turn: Tensor) -> Tensor:
-    """Coefficients [K, 3] of the light after the rotation `turn` [3, 3], which takes d to turn @ d.
+    """Rotate a light of coefficients [K, 3] by `turn` [3, 3], which maps d to turn @ d.
 
-    Solved for at more directions than there are coefficients; exact, as each degree is closed under rotation.
+    The result is a least-squares solution over more directions than coefficients. It is exact, since each
+    degree is closed under rotation.
     """
     order = order_of(coefficients)
     directions = latlong_directions(order + 2, 2 * order + 4, torch.float64).reshape(-1, 3)
@@ -135,16 +141,11 @@ def rotated(coefficients: Tensor, turn: Tensor) -> Tensor:
     return torch.linalg.lstsq(sh_basis(directions, order), turned, driver="gelsd").solution.to(coefficients)
 
 
-# Takes camera axes to those whose polar axis is the map's, +y, so that rows and columns part: (z, x, y).
-_MAP_POLAR = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
-_VALUES_AT_ONCE = 1 << 24
-
-
 def latlong_coefficients(envmap: Tensor, order: int) -> Tensor:
-    """Coefficients [(order + 1)^2, 3] float32 of a map [H, W, 3], taken as constant over each pixel.
+    """Coefficients [(order + 1)^2, 3] float32 of a map [H, W, 3] that is constant over each pixel.
 
-    The integral is exact across a row and by Gauss-Legendre quadrature down it, at any map size; it is taken
-    about the map's own pole and turned to the convention's.
+    The integral is exact over azimuth and by Gauss-Legendre quadrature over elevation, at any map size. It is
+    computed with the map's pole as the polar axis, then rotated to the convention's.
     """
     height, width = envmap.shape[:2]
     across = _across(width, order)  # [W, 2 order + 1]
@@ -155,7 +156,7 @@ def latlong_coefficients(envmap: Tensor, order: int) -> Tensor:
 
 
 def sh_to_latlong(coefficients: Tensor, height: int) -> Tensor:
-    """Radiance [height, 2 height, 3] float32 at the pixels' centres; negative where a cut series is."""
+    """Radiance [height, 2 height, 3] float32 at the pixels' centres; it may be negative."""
     directions = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
     parts = torch.split(directions, max(1, _VALUES_AT_ONCE // len(coefficients)))
     order_of(coefficients)
@@ -169,7 +170,7 @@ def _column_of(order: int) -> Tensor:
 
 
 def _across(width: int, order: int) -> Tensor:
-    """Integrals over a pixel's azimuths [W, 2 order + 1] of cos(m azimuth), for m < 0 of sin(|m| azimuth)."""
+    """Integrals over each pixel's azimuths [W, 2 order + 1] of cos(m azimuth), or of sin if m < 0."""
     edges = math.pi * (1 - 2 * torch.arange(width + 1, dtype=torch.float64)[:, None] / width)
     m = torch.arange(1, order + 1, dtype=torch.float64)
     cosines = (m * edges).sin() / m
@@ -179,7 +180,7 @@ def _across(width: int, order: int) -> Tensor:
 
 
 def _down(height: int, order: int) -> Tensor:
-    """Integrals over a row's elevations [H, K] of each harmonic's factor of elevation."""
+    """Integrals over each row's elevations [H, K] of the harmonics' factors of elevation."""
     points = 8 + math.ceil(order * math.pi / height)
     nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
     step = math.pi / height
@@ -194,25 +195,25 @@ def _down(height: int, order: int) -> Tensor:
     return factors[:, index]
 
 
-_RIDGE = 1e-3  # bounds the series where no non-negative light has the coefficients
-_STEPS = 60
-_SETTLED = 1e-8
-_FEWEST_DIRECTIONS, _DIRECTIONS_A_COEFFICIENT = 2048, 10
-
-
 def positive_latlong(coefficients: Tensor, height: int) -> Tensor:
-    """The map [height, 2 height, 3] float32, not negative, whose coefficients are these [K, 3].
+    """A non-negative map [height, 2 height, 3] float32 with these coefficients [K, 3].
 
-    To two or three hundredths where they are those of some light, mostly to a thousandth; else about the
-    nearest that can be had.
+    A truncated series is negative in places, and a face that it lights has black parts. Of all non-negative
+    lights with these coefficients, this is the one of least power (least integral of its square). If such
+    lights exist, the coefficients of the map are within two or three hundredths, mostly within a thousandth;
+    otherwise they are about the nearest possible.
     """
     return sh_to_latlong(clipped_series(coefficients), height).clamp(min=0)
 
 
 def clipped_series(coefficients: Tensor) -> Tensor:
-    """The series [K, 3] which, clipped at 0, has these coefficients [K, 3]."""
+    """The series [K, 3] which, clipped at 0, has these coefficients [K, 3].
+
+    The light of least power with given coefficients is a clipped series; Newton's method on the convex dual
+    finds it.
+    """
     order = order_of(coefficients)
-    count = max(_FEWEST_DIRECTIONS, _DIRECTIONS_A_COEFFICIENT * len(coefficients))
+    count = max(_FEWEST_DIRECTIONS, _DIRECTIONS_PER_COEFFICIENT * len(coefficients))
     basis = sh_basis(torch.from_numpy(golden_spiral(count)), order).numpy()
     wanted = coefficients.double().cpu().numpy()
     scale = max(float(np.abs(wanted).max()), 1e-30)
@@ -220,14 +221,14 @@ def clipped_series(coefficients: Tensor) -> Tensor:
 
 
 def _solve(basis: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Least of half the integral of max(0, basis @ series)^2, less wanted @ series, and a small ridge."""
+    """Minimise half the integral of max(0, basis @ series)^2, minus wanted @ series, plus a small ridge."""
     area = 4 * np.pi / len(basis)
     series, lowest = wanted.copy(), np.inf
     step = np.zeros_like(series)
     for _ in range(_STEPS):
         light = (basis @ series).clip(min=0)
         value = 0.5 * area * light @ light + 0.5 * _RIDGE * series @ series - wanted @ series
-        if value > lowest:  # too far: half way back
+        if value > lowest:  # too far: go half way back
             step = step / 2
             series = series + step
             continue

@@ -1,11 +1,8 @@
-"""A light as the single lights that add up to it: what is estimated, weighed and handed on.
+"""Directions of light, lat-long maps and rigs; each convention is defined here and nowhere else.
 
-Directions of light: rigs, azimuth and elevation, and the lat-long map; defined here and nowhere else.
-
-A light direction is the unit vector from the face toward the light, in camera space (x to the picture's
-right, y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the
-camera), u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres at
-(index + 0.5) / size.
+A light direction is the unit vector from the face toward the light, in camera space (x to the image's right,
+y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the camera),
+u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres at (index + 0.5) / size.
 """
 
 import math
@@ -16,30 +13,72 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+RIG_LIGHTS = 150  # of the paper's light stage
+_RELAX_STEPS = 200  # in which a rig's lights repel each other
+_RELAX_NEIGHBOURS = 18  # that repel a light
+_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec.709
+_BLUR_DEG = 12.0  # of the light whose brightest direction is sought; less than the rig's spacing, 18 degrees
+_BLUR_ROWS = 90  # of the grid of directions on which it is sought
+
 
 @dataclass(frozen=True, eq=False)
 class RigLight:
-    """Unit camera-space directions [L, 3] toward the lights, and their rgb weights [L, 3].
+    """A light as a weighted sum of single lights: unit directions [L, 3] in camera space, rgb weights [L, 3].
 
-    The units are those of `light/envmap.py`.
-
-    Weights are not negative where a light is to be physical; the light of a spherical-harmonic model may need
-    negative ones.
+    A light of weight 1 gives a white Lambertian surface that faces it radiance 1. Weights are non-negative,
+    except those of a spherical-harmonic model's light.
     """
 
     directions: Tensor
     weights: Tensor
 
 
-RIG_LIGHTS = 150  # the paper's light stage
-_RELAX_STEPS = 200
-_RELAX_NEIGHBOURS = 18
+def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
+    """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the image's right side."""
+    azimuth = torch.deg2rad(torch.as_tensor(azimuth_deg))
+    elevation = torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth)
+    ring = elevation.cos()
+    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+
+
+def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3], any length."""
+    x, y, z = directions.unbind(-1)
+    return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.atan2(y, torch.hypot(x, z)))
+
+
+def uv_to_direction(uv: Tensor) -> Tensor:
+    """Unit directions [..., 3] of lat-long positions [..., 2]: azimuth 180 - 360 u, elevation 90 - 180 v."""
+    azimuth, elevation = math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1])
+    ring = elevation.cos()
+    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+
+
+def direction_to_uv(directions: Tensor) -> Tensor:
+    """Lat-long positions [..., 2] in [0, 1] of directions [..., 3] of any length."""
+    azimuth_deg, elevation_deg = direction_to_azel(directions)
+    return torch.stack([0.5 - azimuth_deg / 360, 0.5 - elevation_deg / 180], -1)
+
+
+def latlong_directions(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Unit directions of the centres of a lat-long map's pixels [H, W, 3]."""
+    v = (torch.arange(height, dtype=torch.float64) + 0.5) / height
+    u = (torch.arange(width, dtype=torch.float64) + 0.5) / width
+    grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
+    return uv_to_direction(torch.stack([grid_u, grid_v], -1)).to(dtype)
+
+
+def latlong_solid_angles(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Exact solid angles of a lat-long map's pixels [H, W] in steradians; they sum to 4 pi at any size."""
+    elevation = math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
+    band = elevation[:-1].sin() - elevation[1:].sin()
+    return (band * (2 * math.pi / width))[:, None].expand(height, width).to(dtype)
 
 
 def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
-    """Unit directions [n, 3] float32, uniform on the sphere and the same at every call.
+    """Unit directions [n, 3] float32, uniform on the sphere and the same in every call.
 
-    A golden spiral about +y, then a fixed number of steps in which each light is pushed off its neighbours.
+    A golden spiral about +y, then a fixed number of steps in which each light is repelled by its neighbours.
     """
     if n < 1:
         raise ValueError(f"a rig needs at least one light, not {n}")
@@ -50,11 +89,11 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
     return torch.from_numpy(points).float()
 
 
-def golden_spiral(lights: int) -> np.ndarray:
-    """Unit vectors [lights, 3] in a spiral about +y, each with an equal share of the sphere."""
-    index = np.arange(lights)
+def golden_spiral(points: int) -> np.ndarray:
+    """Unit vectors [points, 3] in a spiral about +y, each with an equal share of the sphere."""
+    index = np.arange(points)
     azimuth = index * math.pi * (3 - math.sqrt(5))
-    y = 1 - (2 * index + 1) / lights
+    y = 1 - (2 * index + 1) / points
     ring = np.sqrt(1 - y * y)
     return np.stack([ring * np.sin(azimuth), y, ring * np.cos(azimuth)], -1)
 
@@ -71,43 +110,17 @@ def _repel(points: np.ndarray, step: float) -> np.ndarray:
     return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
 
 
-def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
-    """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the picture's right side."""
-    azimuth = torch.deg2rad(torch.as_tensor(azimuth_deg))
-    elevation = torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth)
-    ring = elevation.cos()
-    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+def brightest_direction(light: RigLight, front_only: bool = False) -> Tensor:
+    """The unit direction [3] in which the blurred luminance of a light is greatest; 0 for a dark light.
 
-
-def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3], any length."""
-    x, y, z = directions.unbind(-1)
-    return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.atan2(y, torch.hypot(x, z)))
-
-
-def uv_to_direction(uv: Tensor) -> Tensor:
-    """Map positions [..., 2] to unit directions [..., 3]: azimuth 180 - 360 u, elevation 90 - 180 v."""
-    azimuth, elevation = math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1])
-    ring = elevation.cos()
-    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
-
-
-def direction_to_uv(directions: Tensor) -> Tensor:
-    """Directions [..., 3] of any length to map positions [..., 2] in [0, 1]."""
-    azimuth_deg, elevation_deg = direction_to_azel(directions)
-    return torch.stack([0.5 - azimuth_deg / 360, 0.5 - elevation_deg / 180], -1)
-
-
-def latlong_directions(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Unit direction of every pixel's centre [H, W, 3]."""
-    v = (torch.arange(height, dtype=torch.float64) + 0.5) / height
-    u = (torch.arange(width, dtype=torch.float64) + 0.5) / width
-    grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
-    return uv_to_direction(torch.stack([grid_u, grid_v], -1)).to(dtype)
-
-
-def latlong_solid_angles(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Exact solid angle of every pixel [H, W] in steradians; they sum to 4 pi at any size."""
-    elevation = math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
-    band = elevation[:-1].sin() - elevation[1:].sin()
-    return (band * (2 * math.pi / width))[:, None].expand(height, width).to(dtype)
+    The blur, a von Mises-Fisher lobe, adds up the weights of neighbouring lights that share one light
+    source. `front_only` leaves out the lights behind the face (z < 0), which shading hardly determines.
+    """
+    luminance = light.weights.double() @ torch.tensor(_LUMINANCE, dtype=torch.float64)
+    if front_only:
+        luminance = luminance * (light.directions[:, 2] > 0)
+    where = latlong_directions(_BLUR_ROWS, 2 * _BLUR_ROWS, torch.float64).reshape(-1, 3)
+    sharpness = 1 / math.radians(_BLUR_DEG) ** 2
+    blurred = torch.exp(sharpness * (where @ light.directions.double().T - 1)) @ luminance
+    best = int(blurred.argmax())
+    return (where[best] if blurred[best] > 0 else torch.zeros(3, dtype=torch.float64)).float()

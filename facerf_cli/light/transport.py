@@ -1,8 +1,7 @@
-"""Rays for baking light: an embree scene, and directions over a lamp's disc or a hemisphere.
+"""Light transport of a face, baked in UV space: the visibility and the bounced light of each light and texel.
 
-Light transport baked in the chart: what each light brings to each texel, kept apart from skin.
-
-Ray-cast with embree. Everything is in one frame (the head's, for a bake that any pose can use).
+It is independent of the skin. Rays are cast with embree. All positions are in one frame: for a bake that
+serves every pose, the head's.
 """
 
 from dataclasses import dataclass
@@ -13,55 +12,14 @@ from embreex.mesh_construction import TriangleMesh
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
-
-def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.EmbreeScene:
-    """An embree scene of one triangle mesh."""
-    scene = rtcore_scene.EmbreeScene()
-    TriangleMesh(scene, vertices[triangles].astype(np.float32))
-    return scene
-
-
-def occluded(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Whether anything lies along each ray [N, 3]; bool [N]."""
-    hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="OCCLUDED")
-    return np.asarray(hits) != -1
-
-
-def on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Unit directions [N, 3] to points on a lamp's disc, by two numbers [N, 1] in 0..1."""
-    axis = axis.astype(np.float32)
-    tangent, bitangent = (side.astype(np.float32) for side in _tangents(axis[None]))
-    radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
-    turn = 2 * np.pi * around
-    rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
-    return (rays / np.sqrt((rays * rays).sum(-1, keepdims=True))).astype(np.float32)
-
-
-def over_hemisphere(normals: np.ndarray, share: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """A direction [N, 3] about each normal by two numbers [N, 1] in 0..1; even ones give a cosine lobe."""
-    tangent, bitangent = _tangents(normals)
-    radius = np.sqrt(share)
-    turn = 2 * np.pi * around
-    rays = np.sqrt(1 - radius**2) * normals + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
-    return rays.astype(np.float32)
-
-
-def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors [N, 3] each, orthogonal to unit normals [N, 3]."""
-    helper = np.where(np.abs(normals[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    tangent = np.cross(helper, normals)
-    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
-    return tangent, np.cross(normals, tangent)
-
-
-OFFSET_M = 2e-4  # rays start this far off the surface, above float32's step at head scale
+OFFSET_M = 2e-4  # by which rays start off the surface: more than a step of float32 at the size of a head
 
 
 @dataclass(frozen=True)
 class Transport:
-    """Per light and texel, for lights of rgb 1 in `directions` [L, 3].
+    """Transport of each light and texel, for lights of rgb 1 from `directions` [L, 3].
 
-    visibility [L, T, T]: the share of the lamp's disc that the texel sees, 0 where it faces away.
+    visibility [L, T, T]: the share of the area light that is visible, 0 where the texel faces away.
     bounce [L, T, T]: irradiance after one diffuse bounce off surroundings of albedo 1, in units where a
     surface that faces an unoccluded light receives 1.
     """
@@ -73,14 +31,15 @@ class Transport:
 
 @dataclass(frozen=True)
 class BakeSettings:
-    """Rays per texel: `lamp_samples` over a lamp of `lamp_radius_deg`, `bounce_samples` over the hemisphere.
+    """Rays per texel: `light_samples` over an area light, a disc of `light_radius_deg`; `bounce_samples`.
 
-    A bounce varies slowly over the face, so its noise is smoothed by a Gaussian of `bounce_blur_texels`, or
-    on a mesh of `bounce_blur_m` over the nearest vertices of the same surface.
+    Rays of the bounce cover the hemisphere. A bounce varies slowly over the face, so its noise is smoothed by
+    a Gaussian of `bounce_blur_texels`, or, on a mesh, of `bounce_blur_m` over near vertices of the same
+    surface.
     """
 
-    lamp_samples: int = 4
-    lamp_radius_deg: float = 1.5
+    light_samples: int = 4
+    light_radius_deg: float = 1.5
     bounce_samples: int = 16
     bounce_blur_texels: float = 1.5
     bounce_blur_m: float = 0.002
@@ -97,14 +56,14 @@ def bake_transport(
 ) -> Transport:
     """Bake texels at positions [T, T, 3] (m) with unit normals [T, T, 3], lit from unit directions [L, 3].
 
-    The occluder is the mesh of vertices [V, 3] and triangles [F, 3], with its texture coordinates implied:
-    texel centres are where `positions` were taken, so a bounce looks its hit up by nearest position.
+    The occluder is a mesh of vertices [V, 3] and triangles [F, 3]. A ray of the bounce takes the light of the
+    texel whose position is nearest to its hit.
     """
     scene = build_scene(vertices, triangles)
     random = np.random.default_rng(seed)
     flat_positions = positions.reshape(-1, 3).astype(np.float32)
     flat_normals = normals.reshape(-1, 3).astype(np.float32)
-    visibility = _lamp_visibility(scene, flat_positions, flat_normals, directions, settings, random)
+    visibility = _light_visibility(scene, flat_positions, flat_normals, directions, settings, random)
     direct = visibility * np.clip(directions.astype(np.float32) @ flat_normals.T, 0, None)  # [L, N]
     bounce = _one_bounce(scene, flat_positions, flat_normals, vertices[triangles], direct, settings, random)
     shape = (len(directions), *positions.shape[:2])
@@ -113,7 +72,7 @@ def bake_transport(
     return Transport(directions, visibility.reshape(shape), smooth_bounce)
 
 
-def _lamp_visibility(
+def _light_visibility(
     scene: rtcore_scene.EmbreeScene,
     positions: np.ndarray,
     normals: np.ndarray,
@@ -121,19 +80,19 @@ def _lamp_visibility(
     settings: BakeSettings,
     random: np.random.Generator,
 ) -> np.ndarray:
-    """Share of unoccluded lamp samples [L, N]."""
+    """Share of unoccluded samples of each area light [L, N]."""
     visibility = np.zeros((len(directions), len(positions)), np.float32)
     origins = positions + normals * OFFSET_M
     for light, direction in enumerate(directions):
         facing = np.flatnonzero(normals @ direction.astype(np.float32) > 0)
-        for _ in range(settings.lamp_samples):
-            rays = _within_cone(direction, settings.lamp_radius_deg, len(facing), random)
+        for _ in range(settings.light_samples):
+            rays = _within_cone(direction, settings.light_radius_deg, len(facing), random)
             visibility[light, facing] += ~occluded(scene, origins[facing], rays)
-    return visibility / settings.lamp_samples
+    return visibility / settings.light_samples
 
 
 def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.random.Generator) -> np.ndarray:
-    """Unit directions [count, 3] spread evenly over the disc of a lamp; a lamp of radius 0 is a point."""
+    """Random unit directions [count, 3], uniform over the disc of an area light; radius 0 is a point."""
     return on_disc(axis, radius_deg, random.random((count, 1)), random.random((count, 1)))
 
 
@@ -146,7 +105,7 @@ def _one_bounce(
     settings: BakeSettings,
     random: np.random.Generator,
 ) -> np.ndarray:
-    """Mean of the direct irradiance [L, N] over what a cosine-weighted hemisphere sees; [L, N]."""
+    """Mean [L, N] of the direct irradiance [L, N] over the hits of a cosine-weighted hemisphere."""
     nearest_texel = cKDTree(positions)
     origins = positions + normals * OFFSET_M
     bounce = np.zeros_like(direct)
@@ -158,7 +117,7 @@ def _one_bounce(
         u, v = hits["u"][found, None], hits["v"][found, None]
         points = triangles[:, 0] * (1 - u - v) + triangles[:, 1] * u + triangles[:, 2] * v
         _, texels = nearest_texel.query(points)
-        # A ray that reaches the shell's inner side has left through its open rim: no light comes back.
+        # A ray that hits the inner side of the open surface has left through its rim: no light comes back.
         front = np.einsum("nc,nc->n", rays[found], normals[texels]) < 0
         bounce[:, found[front]] += direct[:, texels[front]]
     return bounce / max(1, settings.bounce_samples)
@@ -167,3 +126,43 @@ def _one_bounce(
 def _cosine_hemisphere(normals: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """One cosine-distributed unit direction about each normal [N, 3]."""
     return over_hemisphere(normals, random.random((len(normals), 1)), random.random((len(normals), 1)))
+
+
+def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.EmbreeScene:
+    """An embree scene of one triangle mesh."""
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, vertices[triangles].astype(np.float32))
+    return scene
+
+
+def occluded(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Test rays [N, 3] for any hit; bool [N]."""
+    hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="OCCLUDED")
+    return np.asarray(hits) != -1
+
+
+def on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """Unit directions [N, 3] to points on the disc of an area light, from two numbers [N, 1] in 0..1."""
+    axis = axis.astype(np.float32)
+    tangent, bitangent = (side.astype(np.float32) for side in _tangents(axis[None]))
+    radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
+    turn = 2 * np.pi * around
+    rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
+    return (rays / np.sqrt((rays * rays).sum(-1, keepdims=True))).astype(np.float32)
+
+
+def over_hemisphere(normals: np.ndarray, share: np.ndarray, around: np.ndarray) -> np.ndarray:
+    """A direction [N, 3] about each normal from two numbers [N, 1]; uniform in 0..1: a cosine lobe."""
+    tangent, bitangent = _tangents(normals)
+    radius = np.sqrt(share)
+    turn = 2 * np.pi * around
+    rays = np.sqrt(1 - radius**2) * normals + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
+    return rays.astype(np.float32)
+
+
+def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors [N, 3] each, orthogonal to unit normals [N, 3]."""
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
+    tangent = np.cross(helper, normals)
+    tangent /= np.linalg.norm(tangent, axis=-1, keepdims=True)
+    return tangent, np.cross(normals, tangent)

@@ -37,8 +37,8 @@ def white(transfer: Tensor, rotation: Tensor | None = None) -> Prt:
 
 
 def lit(face: Prt, azimuth_deg: float, elevation_deg: float, turn: Tensor | None = None) -> Tensor:
-    lamp = azel_to_direction(azimuth_deg, elevation_deg)[None]
-    return face.relit(lamp, torch.ones(1, 1, 3), turn)[0, 0]
+    light = azel_to_direction(azimuth_deg, elevation_deg)[None]
+    return face.relit(light, torch.ones(1, 1, 3), turn)[0, 0]
 
 
 def test_where_nothing_shadows_it_is_lamberts(vertices: Tensor, transfer: Tensor) -> None:
@@ -77,7 +77,7 @@ def test_lights_that_turn_with_the_head_change_nothing(transfer: Tensor) -> None
     assert not torch.allclose(face.relit(rig, weights, turn), wanted, atol=0.01)
 
 
-def test_a_lamp_from_the_right_lights_the_right(transfer: Tensor) -> None:
+def test_a_light_from_the_right_lights_the_right(transfer: Tensor) -> None:
     image = lit(white(transfer), 60, 0)
     assert float(image[:, 40:].mean()) > 2 * float(image[:, :24].mean())
 

@@ -49,11 +49,11 @@ def test_light_from_everywhere_is_mirrored_whole() -> None:
 
 
 @pytest.mark.parametrize("azel_deg", [(40.0, 0.0), (-30.0, 50.0), (0.0, 0.0)])
-def test_the_highlight_is_where_a_mirror_shows_the_lamp(azel_deg: tuple[float, float]) -> None:
-    surface, lamp = ball(centre_m=-1000.0), azel_to_direction(*azel_deg)
-    relit = shiny(surface, albedo=0.0, gloss=1.0).relit(lamp[None], torch.ones(1, 1, 3))[0, 0]
+def test_the_highlight_is_where_a_mirror_shows_the_light(azel_deg: tuple[float, float]) -> None:
+    surface, light = ball(centre_m=-1000.0), azel_to_direction(*azel_deg)
+    relit = shiny(surface, albedo=0.0, gloss=1.0).relit(light[None], torch.ones(1, 1, 3))[0, 0]
     brightest = surface.normals.flatten(1)[:, int(relit.argmax())]
-    half = F.normalize(lamp + torch.tensor([0.0, 0, 1]), dim=0)
+    half = F.normalize(light + torch.tensor([0.0, 0, 1]), dim=0)
     assert float(brightest @ half) > math.cos(math.radians(4))
 
 

@@ -1,22 +1,21 @@
 import torch
 
-from facerf_cli.light.rig_latlong import brightest_direction
-from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.light.sphere import RigLight, brightest_direction, rig_directions
 
 
 def _angle_deg(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(torch.rad2deg(torch.dot(a, b).clamp(-1, 1).acos()))
 
 
-def test_one_lamp_is_where_it_is() -> None:
+def test_one_light_is_where_it_is() -> None:
     rig = rig_directions()
-    for lamp in (0, 40, 77, 149):
+    for light in (0, 40, 77, 149):
         weights = torch.full((150, 3), 0.01)
-        weights[lamp] = torch.tensor([1.0, 0.8, 0.6])
-        assert _angle_deg(brightest_direction(RigLight(rig, weights)), rig[lamp]) < 2
+        weights[light] = torch.tensor([1.0, 0.8, 0.6])
+        assert _angle_deg(brightest_direction(RigLight(rig, weights)), rig[light]) < 2
 
 
-def test_a_lamp_shared_by_two_lights_lies_between_them_and_beats_a_brighter_single_one() -> None:
+def test_a_light_shared_by_two_lights_lies_between_them_and_beats_a_brighter_single_one() -> None:
     rig = rig_directions()
     near = (rig @ rig[60]).topk(3).indices
     weights = torch.zeros(150, 3)

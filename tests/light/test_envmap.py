@@ -86,7 +86,7 @@ def test_rotation_adds_to_every_azimuth() -> None:
     ahead = one_texel(64, (0.5, 0.5))
     weights = envmap_weights(ahead, RIG, rotate_deg=90)
     brightest = RIG[weights[:, 0].argmax()]
-    assert brightest[0] > 0.95  # from the camera's side to the picture's right
+    assert brightest[0] > 0.95  # from the camera's side to the image's right
 
 
 def test_rotation_by_whole_pixels_moves_the_map() -> None:

@@ -2,7 +2,12 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.estimate import LightEvidence, estimate_light, estimate_smooth_light, plain_estimate
+from facerf_cli.light.estimate import (
+    LightEvidence,
+    estimate_signed_weights,
+    estimate_smooth_weights,
+    estimate_weights,
+)
 from facerf_cli.light.sphere import rig_directions
 
 LIGHTS = 24
@@ -17,7 +22,7 @@ def _normals(side: int = 24) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def shaded_ball(lights: int = LIGHTS) -> LightEvidence:
-    """Lambert's pictures of a ball with a coloured albedo, and no photo yet."""
+    """Lambert's images of a ball with a coloured albedo, and no photo yet."""
     normals, inside = _normals()
     albedo = 0.2 + 0.6 * torch.rand(3, *inside.shape, generator=torch.Generator().manual_seed(0))
     cosines = torch.einsum("lc,cij->lij", rig_directions(lights), normals).clamp_min(0)
@@ -44,7 +49,7 @@ def flat(evidence: LightEvidence) -> tuple[torch.Tensor, torch.Tensor]:
 def test_weights_that_made_a_image_are_found_again() -> None:
     weights = some_weights()
     olats, image = flat(lit(shaded_ball(), weights))
-    found = estimate_light(olats, image)
+    found = estimate_weights(olats, image)
     assert (found >= 0).all()
     remade = torch.einsum("lc,lcn->cn", found, olats)
     assert (remade - image).norm() < 0.03 * image.norm()
@@ -58,7 +63,7 @@ def test_the_plain_form_is_exact_where_lights_can_be_told_apart_even_if_they_are
     seen = LightEvidence(
         evidence.directions[facing], evidence.olats[facing], evidence.relit(weights), evidence.mask
     )
-    assert torch.allclose(plain_estimate(*flat(seen)), weights[facing], atol=1e-4)
+    assert torch.allclose(estimate_signed_weights(*flat(seen)), weights[facing], atol=1e-4)
     assert torch.allclose(seen.least_squares(non_negative=False), weights[facing], atol=1e-4)
     assert (seen.least_squares() >= 0).all()
 
@@ -71,9 +76,9 @@ def test_a_covered_image_gives_the_same_light() -> None:
         spoilt[:, ::10] = 0.0  # hair
         none = torch.zeros_like(image, dtype=torch.bool)
         found = (
-            estimate_light(olats, spoilt)
+            estimate_weights(olats, spoilt)
             if solve == "quotient"
-            else estimate_smooth_light(evidence.directions, olats, spoilt, none)
+            else estimate_smooth_weights(evidence.directions, olats, spoilt, none)
         )
         remade = torch.einsum("lc,lcn->cn", found, olats)
         assert (remade - image).norm() < 0.05 * image.norm(), solve
@@ -86,7 +91,7 @@ def test_of_clipped_highlights_only_darkness_is_an_error() -> None:
     clipped = LightEvidence(evidence.directions, evidence.olats, evidence.photo.clamp(max=1), evidence.mask)
     assert clipped.clipped.any() and not evidence.clipped.any()  # beyond 1 nothing was clipped at 1
     found = evidence.relit(clipped.least_squares())
-    blind = estimate_smooth_light(
+    blind = estimate_smooth_weights(
         clipped.directions, *flat(clipped), torch.zeros_like(flat(clipped)[1], dtype=torch.bool)
     )
     at_white = clipped.clipped
@@ -99,19 +104,19 @@ def test_what_the_face_leaves_open_is_smooth_and_of_one_colour() -> None:
     weights = torch.tensor([0.3, 0.2, 0.1]) * (0.2 + (rig_directions(150)[:, 1:2] + 1))
     evidence = lit(shaded_ball(150), weights)
     found = evidence.least_squares()
-    own = estimate_light(*flat(evidence))
+    own = estimate_weights(*flat(evidence))
     assert evidence.residual(evidence.relit(found)) < 0.05
     assert (found - weights).norm() < 0.5 * (own - weights).norm()
     colour = found / found.sum(1, keepdim=True)
     assert (colour - torch.tensor([0.5, 1 / 3, 1 / 6])).abs().mean() < 0.03
 
 
-def test_a_lone_lamp_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    lamp = int((rig_directions(150) @ torch.tensor([0.6, 0.0, 0.8])).argmax())
+def test_a_lone_light_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    light = int((rig_directions(150) @ torch.tensor([0.6, 0.0, 0.8])).argmax())
     weights = torch.full((150, 3), 0.004)
-    weights[lamp] += 0.8
+    weights[light] += 0.8
     evidence = lit(shaded_ball(150), weights)
-    around = rig_directions(150) @ rig_directions(150)[lamp] > 0.93  # the lamp and its six neighbours
+    around = rig_directions(150) @ rig_directions(150)[light] > 0.93  # the light and its six neighbours
     found = evidence.least_squares()[around].sum() / weights[around].sum()
     monkeypatch.setattr("facerf_cli.light.estimate._STANDS_OUT", 1e9)
     smeared = evidence.least_squares()[around].sum() / weights[around].sum()
@@ -120,7 +125,7 @@ def test_a_lone_lamp_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_black_image_has_no_light() -> None:
     olats, image = flat(shaded_ball())
-    assert estimate_light(olats, image).abs().max() == 0
+    assert estimate_weights(olats, image).abs().max() == 0
     evidence = shaded_ball()
     red = LightEvidence(
         evidence.directions,
@@ -134,7 +139,7 @@ def test_a_black_image_has_no_light() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_where_nothing_is_seen_there_is_no_light() -> None:
-    found = estimate_light(torch.zeros(24, 3, 0), torch.zeros(3, 0))
+    found = estimate_weights(torch.zeros(24, 3, 0), torch.zeros(3, 0))
     assert found.shape == (24, 3) and (found == 0).all()
 
 
@@ -144,7 +149,7 @@ def test_evidence_without_a_face_or_a_light_is_refused_in_words() -> None:
     hidden = LightEvidence(
         evidence.directions, evidence.olats, evidence.photo, torch.zeros_like(evidence.mask)
     )
-    with pytest.raises(InputError, match="too little of the face"):
+    with pytest.raises(InputError, match="too little of the face is visible"):
         hidden.require_a_face()
     with pytest.raises(InputError, match="black"):
         shaded_ball().require_a_face()

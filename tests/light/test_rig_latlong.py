@@ -57,7 +57,7 @@ def test_no_spikes() -> None:
     assert float(envmap.max()) < 3 * math.pi * float(weights.max()) / cell  # near the mean over a cell
 
 
-def test_a_lone_lamp_lies_about_its_direction() -> None:
+def test_a_lone_light_lies_about_its_direction() -> None:
     weights = torch.zeros(len(RIG), 3)
     weights[17] = 1
     envmap, _ = back_and_forth(weights, 128)

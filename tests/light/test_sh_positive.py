@@ -17,9 +17,9 @@ def relative_error(found: torch.Tensor, truth: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("order", [1, 2, 4])
 def test_the_coefficients_of_a_light_come_back_from_a_map_that_is_nowhere_negative(order: int) -> None:
-    sky, lamp = torch.full((150, 3), 0.005), torch.zeros(150, 3)
-    lamp[40] = torch.tensor([1.0, 0.8, 0.6])
-    coefficients = rig_coefficients(RigLight(rig_directions(), sky + lamp), order)
+    sky, single = torch.full((150, 3), 0.005), torch.zeros(150, 3)
+    single[40] = torch.tensor([1.0, 0.8, 0.6])
+    coefficients = rig_coefficients(RigLight(rig_directions(), sky + single), order)
     envmap = positive_latlong(coefficients, 64)
     assert envmap.shape == (64, 128, 3) and float(envmap.min()) >= 0
     assert relative_error(latlong_coefficients(envmap, order), coefficients) < 0.02

@@ -14,7 +14,7 @@ from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from tests.oracles import visibility as oracle
 
-POINT_LAMP = BakeSettings(lamp_samples=1, lamp_radius_deg=0, bounce_samples=0)
+POINT_LIGHT = BakeSettings(light_samples=1, light_radius_deg=0, bounce_samples=0)
 SIDE = 48
 
 
@@ -39,23 +39,23 @@ def test_occlusion_agrees_with_the_brute_force_oracle() -> None:
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.8, 0.0, 0.6), (-0.5, 0.7, 0.51)])
-def test_shadows_agree_with_the_rasterizer_seen_from_the_lamp(
+def test_shadows_agree_with_the_rasterizer_seen_from_the_light(
     head: tuple[np.ndarray, ...], direction: tuple
 ) -> None:
     vertices, positions, normals = head
-    lamp = np.array(direction) / np.linalg.norm(direction)
-    baked = bake_transport(positions, normals, vertices, grid_triangles().numpy(), lamp[None], POINT_LAMP)
-    facing = normals @ lamp
-    seen = _seen_from(lamp, vertices, positions)
+    light = np.array(direction) / np.linalg.norm(direction)
+    baked = bake_transport(positions, normals, vertices, grid_triangles().numpy(), light[None], POINT_LIGHT)
+    facing = normals @ light
+    seen = _seen_from(light, vertices, positions)
     clear = np.abs(facing) > 0.25  # grazing texels lie within the depth map's own error
     assert (seen[clear & (facing > 0)] == (baked.visibility[0][clear & (facing > 0)] > 0.5)).mean() > 0.97
     assert (baked.visibility[0][facing < 0] == 0).all()
 
 
-def _seen_from(lamp: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Visibility [T, T] by the z-buffer of a far camera that looks along the lamp's light."""
-    right = np.cross([0, 1, 0], lamp) / np.linalg.norm(np.cross([0, 1, 0], lamp))
-    head_to_camera = np.stack([right, np.cross(lamp, right), lamp])
+def _seen_from(light: np.ndarray, vertices: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Visibility [T, T] by the z-buffer of a far camera that looks along the light."""
+    right = np.cross([0, 1, 0], light) / np.linalg.norm(np.cross([0, 1, 0], light))
+    head_to_camera = np.stack([right, np.cross(light, right), light])
     camera, distance_m = Camera(1000 * 1500.0, 700, 700, 350, 350), 1000.0
 
     def to_camera(points: np.ndarray) -> torch.Tensor:
@@ -77,7 +77,7 @@ def test_a_sphere_gets_no_bounce_from_itself() -> None:
     triangles = np.concatenate(
         [np.stack([cells, cells + 20, cells + 21], -1), np.stack([cells, cells + 21, cells + 1], -1)]
     )
-    settings = BakeSettings(lamp_samples=1, bounce_samples=8)
+    settings = BakeSettings(light_samples=1, bounce_samples=8)
     baked = bake_transport(
         points, points, points.reshape(-1, 3), triangles, np.array([[0.0, 0, 1]]), settings
     )
@@ -101,7 +101,7 @@ def test_a_corner_returns_the_form_factor_of_its_other_wall() -> None:
     normals = np.zeros_like(positions)
     normals[:, :24, 1], normals[:, 24:, 2] = 1, 1
     light = np.array([[0.0, 0.0, 1.0]])  # lights the wall alone, head on
-    settings = BakeSettings(lamp_samples=1, lamp_radius_deg=0, bounce_samples=600, bounce_blur_texels=0)
+    settings = BakeSettings(light_samples=1, light_radius_deg=0, bounce_samples=600, bounce_blur_texels=0)
     baked = bake_transport(positions, normals, vertices, triangles, light, settings)
     expected = (1 - 1 / np.sqrt(1 + (depth / across) ** 2)) / 2
     middle = baked.bounce[0][:, 10:14].mean(1)
@@ -110,10 +110,10 @@ def test_a_corner_returns_the_form_factor_of_its_other_wall() -> None:
 
 def test_the_same_seed_gives_the_same_bake(head: tuple[np.ndarray, ...]) -> None:
     vertices, positions, normals = head
-    settings = BakeSettings(lamp_samples=1, bounce_samples=2)
-    lamps = rig_directions(3).numpy()
+    settings = BakeSettings(light_samples=1, bounce_samples=2)
+    lights = rig_directions(3).numpy()
     first, second = (
-        bake_transport(positions, normals, vertices, grid_triangles().numpy(), lamps, settings, seed=4)
+        bake_transport(positions, normals, vertices, grid_triangles().numpy(), lights, settings, seed=4)
         for _ in "ab"
     )
     assert (first.visibility == second.visibility).all() and (first.bounce == second.bounce).all()
@@ -153,22 +153,22 @@ def _cover(bake: MeshTransport) -> np.ndarray:
     return bake.gathered(np.ones(len(bake.sites)))[bake.site_of]
 
 
-def test_a_mesh_shadow_lies_where_the_lamp_throws_it() -> None:
+def test_a_mesh_shadow_lies_where_the_light_throws_it() -> None:
     vertices, normals, triangles = _table()
-    lamp = np.array([1.0, 3.0, 0.0]) / np.sqrt(10)  # moves the board's shadow by 0.1 m to -x
-    baked = bake_mesh(vertices, normals, triangles, lamp[None], POINT_LAMP)
+    light = np.array([1.0, 3.0, 0.0]) / np.sqrt(10)  # moves the board's shadow by 0.1 m to -x
+    baked = bake_mesh(vertices, normals, triangles, light[None], POINT_LIGHT)
     floor = vertices[:, 1] == 0
     shadow = (np.abs(vertices[:, 0] + 0.1) < 0.1 - 1e-3) & (np.abs(vertices[:, 2]) < 0.1 - 1e-3)
     clear = (np.abs(vertices[:, 0] + 0.1) > 0.1 + 1e-3) | (np.abs(vertices[:, 2]) > 0.1 + 1e-3)
     assert (baked.visibility[0][floor & shadow] == 0).all() and (floor & shadow).sum() > 20
     assert (baked.visibility[0][~floor | clear] == 1).all()
-    assert (bake_mesh(vertices, normals, triangles, -lamp[None], POINT_LAMP).visibility == 0).all()
+    assert (bake_mesh(vertices, normals, triangles, -light[None], POINT_LIGHT).visibility == 0).all()
 
 
-def test_a_wide_lamp_has_a_penumbra_of_its_own_width() -> None:
+def test_a_wide_light_has_a_penumbra_of_its_own_width() -> None:
     vertices, normals, triangles = _table()
-    lamp, settings = np.array([[0.0, 1.0, 0.0]]), BakeSettings(64, 10.0, 0)
-    share = bake_mesh(vertices, normals, triangles, lamp, settings).visibility[0]
+    light, settings = np.array([[0.0, 1.0, 0.0]]), BakeSettings(64, 10.0, 0)
+    share = bake_mesh(vertices, normals, triangles, light, settings).visibility[0]
     row = (vertices[:, 1] == 0) & (np.abs(vertices[:, 2]) < 1e-6)
     x, found = vertices[row, 0], share[row]
     half_m = 0.3 * np.tan(np.radians(10))  # of the penumbra about the board's edge at 0.1 m
@@ -180,13 +180,13 @@ def test_a_wide_lamp_has_a_penumbra_of_its_own_width() -> None:
 
 def test_smooth_normals_of_a_sphere_throw_no_shadow_on_it() -> None:
     sphere = trimesh.creation.icosphere(3, 0.1)
-    lamps = rig_directions(20).numpy()
-    baked = bake_mesh(sphere.vertices, sphere.vertex_normals, sphere.faces, lamps, POINT_LAMP)
-    facing = lamps @ sphere.vertex_normals.T
+    lights = rig_directions(20).numpy()
+    baked = bake_mesh(sphere.vertices, sphere.vertex_normals, sphere.faces, lights, POINT_LIGHT)
+    facing = lights @ sphere.vertex_normals.T
     assert (baked.visibility[facing > 0.02] == 1).all()
     assert (baked.visibility[facing <= 0] == 0).all()
     inside_out = -sphere.vertex_normals  # a hollow: its facets rise above every tangent plane
-    hollow = bake_mesh(sphere.vertices, inside_out, sphere.faces[:, ::-1], lamps, BakeSettings())
+    hollow = bake_mesh(sphere.vertices, inside_out, sphere.faces[:, ::-1], lights, BakeSettings())
     assert np.allclose(_cover(hollow), 1, atol=1e-5)  # nothing but the hollow to be seen from within
 
 
@@ -226,17 +226,17 @@ def test_light_bounces_off_outsides_only() -> None:
 def test_hair_is_lit_from_both_sides() -> None:
     x, y, z = np.eye(3)
     vertices, normals, triangles = _joined(_tessellated(np.zeros(3), 0.1 * z, 0.01 * x, 5))
-    lamps = np.stack([y, -y])
-    plain = bake_mesh(vertices, normals, triangles, lamps)
-    hair = bake_mesh(vertices, normals, triangles, lamps, all_round=np.ones(len(vertices), bool))
+    lights = np.stack([y, -y])
+    plain = bake_mesh(vertices, normals, triangles, lights)
+    hair = bake_mesh(vertices, normals, triangles, lights, two_sided=np.ones(len(vertices), bool))
     assert (plain.visibility[0] == 1).all() and (plain.visibility[1] == 0).all()
     assert (hair.visibility == 1).all()
 
 
 def test_the_same_seed_gives_the_same_mesh_bake() -> None:
     vertices, normals, triangles = _table()
-    lamps = rig_directions(6).numpy()
-    first, second, third = (bake_mesh(vertices, normals, triangles, lamps, seed=seed) for seed in (3, 3, 4))
+    lights = rig_directions(6).numpy()
+    first, second, third = (bake_mesh(vertices, normals, triangles, lights, seed=seed) for seed in (3, 3, 4))
     assert (first.visibility == second.visibility).all() and (first.hits != second.hits).nnz == 0
     assert (first.visibility != third.visibility).any()
 
@@ -248,7 +248,7 @@ def test_strands_share_the_light_and_surroundings_of_those_near() -> None:
     roof = _tessellated(np.array([-0.5, 0.1, 0.5]), z, x, 3)
     vertices, normals, triangles = _joined(strip, roof)
     hair = vertices[:, 1] == 0
-    bake = bake_mesh(vertices, normals, triangles, y[None], BakeSettings(lamp_radius_deg=0), all_round=hair)
+    bake = bake_mesh(vertices, normals, triangles, y[None], BakeSettings(light_radius_deg=0), two_sided=hair)
     share, along = bake.visibility[0][hair], vertices[hair, 2]
     assert (share[along < 0.49] == 1).all() and (share[along > 0.51] == 0).all()
     sites = bake.site_of[hair]

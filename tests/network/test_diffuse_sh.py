@@ -79,7 +79,7 @@ def test_what_is_finer_than_its_side_comes_from_the_texture(network: DiffuseNetw
 
 
 def test_the_light_turns_with_the_head_that_it_was_read_in(network: DiffuseNetwork) -> None:
-    """The chart sees the light in the head's frame; what leaves the network is in the camera's."""
+    """UV space has the light in the head's frame; what leaves the network is in the camera's."""
     turn = pose_to_rotation(35.0, -15.0, 10.0)
     in_head = torch.randn(1, 9, 3)
     normals = torch.einsum("dc,cij->dij", turn, bump(64))[None]

@@ -34,7 +34,7 @@ def test_the_distance_is_that_of_the_slow_twin() -> None:
     network = small().double()
     first = torch.rand(1, 3, 16, 33).double() * 0.9
     second = (first + 0.2 * torch.rand_like(first)).clamp(0, 1)
-    second[..., :4] = 0  # as masked pictures are
+    second[..., :4] = 0  # as masked images are
     tensors = {name: tensor.numpy() for name, tensor in network.trunk.state_dict().items()}
     encoded = [linear_to_srgb(image[0].numpy()).astype(np.float64) for image in (first, second)]
     expected = slow_lpips(tensors, [head.numpy() for head in network.heads], *encoded)

@@ -95,7 +95,7 @@ def test_maps_turn_and_turn_back(height: int) -> None:
 
 
 def test_blenders_map_is_read_by_its_formula() -> None:
-    direction = azel_to_direction(54, 36).double()  # to the picture's right, above, in front
+    direction = azel_to_direction(54, 36).double()  # to the image's right, above, in front
     u, v = direction_to_uv(direction).tolist()
     envmap = torch.zeros(180, 360, 3)
     envmap[int(v * 180), int(u * 360)] = 1
