@@ -21,7 +21,7 @@ def centroid_px(image: np.ndarray) -> np.ndarray:
 
 
 def frontal_landmarks(scale_px: float = 1000.0, turn_deg: float = 0.0) -> np.ndarray:
-    """The mean's landmarks seen from far in front, turned in the picture."""
+    """The mean's landmarks seen from far in front, rotated in the image."""
     flat = LANDMARKS_M[:, :2] * [scale_px, -scale_px]
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     return flat @ np.array([[c, s], [-s, c]]) + [300, 200]
@@ -87,7 +87,7 @@ def test_a_crop_wholly_outside_holds_the_edge():
 def test_chin_and_forehead_fit_however_the_head_lies(turn_deg):
     landmarks = frontal_landmarks(turn_deg=turn_deg)
     crop = from_landmarks(landmarks, 256)
-    head = np.array([[0, 0.092], [-0.07, 0.085], [0.07, 0.085], [0, -0.082]])  # chart's top and bottom
+    head = np.array([[0, 0.092], [-0.07, 0.085], [0.07, 0.085], [0, -0.082]])  # the grid's top and bottom
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     head_px = crop.to_crop((head * [1000, -1000]) @ np.array([[c, s], [-s, c]]) + [300, 200])
     inside = np.concatenate([crop.to_crop(landmarks), head_px])

@@ -1,4 +1,4 @@
-"""A start from a Geometry Network saves steps of the fit, and changes where it ends no more than rounding."""
+"""A start from a Geometry Network saves steps and hardly changes the result; poses come from landmarks."""
 
 from dataclasses import replace
 
@@ -7,13 +7,15 @@ import torch
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FitSettings, fit_batch, fit_landmarks, fit_problem
-from facerf_cli.face.fit_start import FitStart, better_start, seeded_state
+from facerf_cli.face.fit_start import FitStart, better_start, pose_from_landmarks, seeded_state
 from facerf_cli.face.gauss_newton import fit_points, minimise, total_cost
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
 CAMERA = crop_camera(256)
 SETTINGS = FitSettings(steps=60)
+INNER_POINTS = torch.from_numpy(LANDMARKS_M[17:])[None]
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +115,35 @@ def test_one_photo_takes_a_start_too(model, landmarks_px, cold):
     start = FitStart(*(x[:1] for x in (cold.rotation, cold.translation_m, cold.alpha, cold.beta)))
     fit = fit_landmarks(model, landmarks_px[0].numpy(), crop, SETTINGS, start=start)
     assert fit.error_iod == pytest.approx(float(cold.error_iod[0]), abs=2e-4)
+
+
+@pytest.mark.parametrize("pose", [(0, 0, 0), (30, -10, 5), (-40, 15, -20), (10, 20, 170)])
+@pytest.mark.parametrize("distance_m", [0.8, 1.3])
+def test_the_pose_comes_back(pose, distance_m):
+    rotation, translation = (
+        pose_to_rotation(*pose).double(),
+        torch.tensor([0.02, -0.01, -distance_m]).double(),
+    )
+    px = project(INNER_POINTS @ rotation.T + translation, CAMERA)
+    guess = pose_to_rotation(pose[0] + 12, pose[1] - 8, pose[2] + 6).double()[None]
+    at = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    found, where = pose_from_landmarks(INNER_POINTS, px, CAMERA, guess, at)
+    angle_deg = torch.rad2deg(2 * torch.asin((found[0] - rotation).norm() / 8**0.5))
+    assert angle_deg < 1.0
+    assert (where[0] - translation).abs().max() < 0.02 * distance_m
+    seen = project(INNER_POINTS @ found.mT + where[:, None], CAMERA)
+    assert (seen - px).norm(dim=-1).max() < 1.0
+
+
+def test_poses_do_not_depend_on_each_other():
+    rotation = torch.stack([pose_to_rotation(yaw, 0, 0).double() for yaw in (-30, 0, 25)])
+    translation = torch.tensor([[0.0, 0.0, -0.9], [0.03, 0.0, -1.1], [0.0, 0.02, -1.0]], dtype=torch.float64)
+    points = INNER_POINTS.expand(3, -1, -1)
+    px = project(points @ rotation.mT + translation[:, None], CAMERA)
+    guess = torch.eye(3, dtype=torch.float64).expand(3, 3, 3)
+    whole = pose_from_landmarks(points, px, CAMERA, guess, translation)
+    for i in range(3):
+        one = pose_from_landmarks(
+            *(x[i : i + 1] for x in (points, px)), CAMERA, guess[:1], translation[i : i + 1]
+        )
+        assert torch.allclose(one[0][0], whole[0][i], atol=1e-9)

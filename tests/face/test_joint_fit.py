@@ -25,7 +25,7 @@ def model() -> MorphableModel:
 
 
 def camera_at(yaw_deg: float, distance_m: float = 1.1, side_px: int = 400) -> PosedCamera:
-    """A camera that sees the head turned by a yaw, a little off its picture's centre."""
+    """A camera that sees the head turned by a yaw, slightly off the centre of its image."""
     rotation = pose_to_rotation(yaw_deg, 4.0, 2.0).double()
     centre = torch.tensor([0.01, -0.02, -distance_m], dtype=torch.float64)
     head = torch.tensor(HEAD_WORLD, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""Faces are found where they are: small, dark, turned, in tight crops and large pictures; files are read."""
+"""Faces are found in small, dark, turned and large images and in tight crops; landmark files are read."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""Descriptors tell people apart, and say nothing of where a face stands in its picture."""
+"""Descriptors distinguish people and do not depend on the face's position in the image."""
 
 from pathlib import Path
 from typing import Any

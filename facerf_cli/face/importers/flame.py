@@ -33,7 +33,7 @@ _LICENCE = (
 )
 _OPEN_LICENCE = "FLAME 2023 Open, (c) Max-Planck-Gesellschaft; CC BY 4.0 (flame.is.tue.mpg.de)"
 _OPEN_KEY = "supr_expression_metadata"  # only FLAME 2023 Open has it
-_NO_JAW = "no_jaw"  # part of a file's name; nothing in the file tells it
+_NO_JAW = "no_jaw"  # in a file's name; its content has no such mark
 _JAW, _JOINTS = 2, 5  # joints: root, neck, jaw and two eyes
 _JAW_STD_RAD = 0.1  # a coefficient of 3 opens a mouth by 17 degrees
 _JAW_SHAPES = {  # turns of the jaw as axes in units of _JAW_STD_RAD
@@ -124,9 +124,7 @@ def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarra
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(f"{key} has shape {list(array.shape)}, not {list(shape)}, or is not finite")
     joint, weight = regressor[_JAW] @ mean, weights[:, _JAW, None]
-    own = slice(
-        9 * (_JAW - 1), 9 * _JAW
-    )  # the corrections' columns are the entries of each joint's turn, without the root
+    own = slice(9 * (_JAW - 1), 9 * _JAW)  # nine columns for each joint's turn but the root's
     shapes = {}
     for name, axis in _JAW_SHAPES.items():
         turn = Rotation.from_rotvec(_JAW_STD_RAD * np.array(axis, float)).as_matrix()

@@ -1,4 +1,4 @@
-"""Resampling of a model in its own topology to the canonical grid (DESIGN, 'One topology inside').
+"""Resampling of a face model from its publisher's topology to the canonical grid.
 
 The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface. A whole
 head stays in its publisher's topology, in the head frame, with (u, v) that match the canonical grid.

@@ -12,7 +12,7 @@ from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alig
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV, grid_triangles, locate
 
-MARGIN = 0.06  # of the chart, by which the mesh goes on beyond it
+MARGIN = 0.06  # of UV space, by which the mesh extends beyond it
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ def head(rows: int, columns: int, loose: int = 0, shapes: int = 4, turn_deg: flo
 
 
 def _sampled(field: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """A field [V, 3] of the canonical vertices at (u, v) [N, 2]; beyond the chart it goes on as it ended."""
+    """A field [V, 3] of the canonical vertices at (u, v) [N, 2]; extrapolated beyond the grid."""
     inside = uv.clip(0, 1)
     values = _at(field, inside)
     beyond = np.linalg.norm(uv - inside, axis=-1) > 0

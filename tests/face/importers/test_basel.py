@@ -178,7 +178,7 @@ def test_a_surface_that_ends_early_goes_on_as_the_built_in_face(tmp_path: Path) 
         inside = (away[:, 0] / width_m) ** 2 + ((away[:, 1] + 0.005) / height_m) ** 2 < 1
         return replace(source, triangles=whole.triangles[inside[whole.triangles].all(1)])
 
-    part = oval(0.070, 0.105)  # without the chart's corners, and without the contour's ends
+    part = oval(0.070, 0.105)  # without the grid's corners and the contour's ends
     off = 1000 * np.linalg.norm(landmarks_of(part) - whole.landmarks, axis=-1)
     assert off[:17].max() < 2.5  # also of those that are cut away
     model = resample_model(part)

@@ -99,21 +99,21 @@ def test_what_is_painted_at_the_landmarks_falls_on_them(ict):
     source, model = ict
     found = cKDTree(model.head.mean.numpy()).query(aligned(source, landmarks_of(source)))
     assert found[0].max() < 1e-6
-    off_mm = np.abs(model.head.uv.numpy()[found[1]] - LANDMARK_UV) * 174  # the chart's height
+    off_mm = np.abs(model.head.uv.numpy()[found[1]] - LANDMARK_UV) * 174  # the grid's height in mm
     assert off_mm.max() < 1.0 and off_mm.mean() < 0.3
 
 
-def test_the_chart_goes_on_around_the_head_without_a_jump(ict):
+def test_uv_continues_around_the_head_without_a_jump(ict):
     head = ict[1].head
     skin = head.triangles[(head.part[head.triangles] == 0).all(-1)].numpy()
     uv, points = head.uv.numpy(), head.mean.numpy()
     assert uv[head.part == 0].min() < -0.5 and uv[head.part == 0].max() > 1.5
     sides = np.stack([skin, np.roll(skin, 1, 1)], -1)[(np.abs(uv[skin] - 0.5) > 0.49).any((1, 2))]
     (a, b), (from_uv, to_uv) = (np.moveaxis(field[sides], 2, 0) for field in (points, uv))
-    away = np.hypot(a[..., 0], a[..., 2]) > 0.05  # from the chart's axis: at the crown u turns on the spot
+    away = np.hypot(a[..., 0], a[..., 2]) > 0.05  # from the axis: at the crown u changes within a point
     front = (np.abs(from_uv[..., 0] - 0.5) < 1.3) & away  # of the seam at the back of the head
     slope = np.linalg.norm(from_uv - to_uv, axis=-1) / np.linalg.norm(a - b, axis=-1)
-    assert slope[front].max() < 2 / 0.174  # twice that of a chart of 174 mm
+    assert slope[front].max() < 2 / 0.174  # twice that of a grid of 174 mm
 
 
 def test_an_iris_has_its_place_in_the_texture_of_the_eye(ict):

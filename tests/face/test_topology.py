@@ -1,0 +1,93 @@
+"""Regions lie at their landmarks, are symmetric and cover UV space once; the interior faces the camera."""
+
+import pytest
+import torch
+
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import (
+    LANDMARK_UV,
+    REGIONS,
+    grid_triangles,
+    grid_uv,
+    interior_mask,
+    interior_texture,
+    region_mask,
+)
+from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
+from facerf_cli.raster.rasterize import interpolate, rasterize
+
+SIDE = 96
+
+
+def at(mask: torch.Tensor, uv) -> float:
+    column, row = (int(c * mask.shape[0]) for c in uv)
+    return float(mask[row, column])
+
+
+@pytest.mark.parametrize("name", REGIONS)
+def test_masks_are_symmetric_and_bounded(name):
+    mask = region_mask(name, SIDE)
+    assert mask.shape == (SIDE, SIDE) and mask.dtype == torch.float32
+    assert torch.equal(mask, mask.flip(1))
+    assert mask.min() >= 0 and 0.5 < mask.max() <= 1
+
+
+def test_parts_cover_uv_space_once():
+    total = sum(region_mask(part, 256) for part in ("skin", "eyes", "brows", "lips", "nostrils", "neck"))
+    assert torch.allclose(total, torch.ones(256, 256), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name, inside, outside",
+    [
+        ("eyes", LANDMARK_UV[36:42].mean(0), LANDMARK_UV[19]),
+        ("eyes", LANDMARK_UV[42:48].mean(0), LANDMARK_UV[27]),
+        ("brows", LANDMARK_UV[24] + [0, 0.01], LANDMARK_UV[27]),
+        ("lips", LANDMARK_UV[[51, 62]].mean(0), LANDMARK_UV[33]),
+        ("mouth", LANDMARK_UV[[62, 66]].mean(0), LANDMARK_UV[[57, 66]].mean(0)),
+        ("nostrils", LANDMARK_UV[31] + [0.0145, -0.022], LANDMARK_UV[30]),
+        ("neck", LANDMARK_UV[4] + [0, 0.1], LANDMARK_UV[8] - [0, 0.08]),
+        ("face", LANDMARK_UV[30], LANDMARK_UV[4] + [-0.08, 0.08]),
+        ("skin", (LANDMARK_UV[30] + LANDMARK_UV[2]) / 2, LANDMARK_UV[57] - [0, 0.01]),
+    ],
+)
+def test_masks_lie_where_the_landmarks_say(name, inside, outside):
+    mask = region_mask(name, 256)
+    assert at(mask, inside) > 0.6 and at(mask, outside) < 0.05
+
+
+def test_an_unknown_region_is_named():
+    with pytest.raises(ValueError, match="ears"):
+        region_mask("ears", 8)
+
+
+def _mask(yaw_deg: float, side_px: int = 128) -> tuple[torch.Tensor, torch.Tensor]:
+    """The mask [S, S] of the mean face, and its landmarks' pixels [68, 2]."""
+    model, camera = load_face_model(), crop_camera(side_px)
+    turned = model.mean @ pose_to_rotation(yaw_deg, 0, 0).T + torch.tensor([0.0, 0.0, -1.0])
+    fragments = rasterize(turned, grid_triangles(), camera)
+    uv = interpolate(grid_uv(), grid_triangles(), fragments)
+    mask = interior_mask(turned, fragments, uv, 128)
+    assert mask.shape == (1, side_px, side_px) and mask.min() >= 0 and mask.max() <= 1
+    return mask[0], project(model.landmarks(turned[None])[0], camera)
+
+
+def test_interior_holds_the_features_and_ends_inside_the_jaw() -> None:
+    mask, landmarks_px = _mask(0)
+    column, row = landmarks_px.long().T
+    assert (mask[row[17:], column[17:]] > 0.99).all()  # brows, nose, eyes and mouth, none cut out
+    assert (mask[row[5:12], column[5:12]] < 0.3).all()  # the jaw; at the ears a pixel is many texels
+    assert (mask[0] == 0).all() and (mask[:, 0] == 0).all()
+    texture = interior_texture(64)[0]
+    column, row = (torch.from_numpy(LANDMARK_UV) * 64).long().T
+    assert (texture[row[27:], column[27:]] == 1).all()
+    assert (texture[row[:17], column[:17]] < 0.3).all() and (texture[-1] == 0).all()
+
+
+def test_what_turns_away_leaves_the_interior() -> None:
+    frontal, turned = _mask(0)[0], _mask(60)[0]
+    assert turned.sum() < 0.9 * frontal.sum()
+
+
+def test_a_face_seen_from_behind_has_no_interior() -> None:
+    assert _mask(180)[0].sum() == 0
