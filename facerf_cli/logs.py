@@ -1,4 +1,4 @@
-"""What facerf says about itself and its results: log lines, JSON rows, and the provenance in its outputs."""
+"""Log lines, JSON rows, and the provenance of outputs."""
 
 import json
 import logging
@@ -14,13 +14,13 @@ from rich.console import Console
 
 from facerf_cli import __version__
 
-# IPTC's vocabulary of digital sources (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model.
+# IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
 
-# The same for pictures that are computed throughout.
+# computed entirely,
 COMPUTER_GRAPHICS_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/algorithmicMedia"
 
-# The same for sums of photographs.
+# and sums of photographs.
 _CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeCapture"
 
 # Shared by the log and the progress bars, so that they do not overwrite each other.
@@ -30,10 +30,10 @@ LOGGER_NAME = "facerf"
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where a result comes from; every output of a verb carries it.
+    """The origin of a result, for the metadata of every output.
 
-    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for what is no synthetic
-    picture, such as a photograph that was only cropped.
+    `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for images that are not
+    synthetic, such as a cropped photograph.
     """
 
     input_name: str = ""
@@ -58,18 +58,18 @@ class Provenance:
 
 
 def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "") -> dict[str, Any]:
-    """Metadata of pictures that are weighted sums of a stack's, by the stack's own.
+    """Metadata of weighted sums of a stack's images, from the stack's own metadata.
 
-    Under a light that never was they are synthetic, be the stack made of photographs.
+    They are marked as synthetic even if the stack holds photographs, since their light did not exist.
     """
     default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
     return default.attributes() | dict(stack) | Provenance(source_type="").attributes()
 
 
 def json_line(row: Mapping[str, Any]) -> str:
-    """A row as one line of strict JSON: paths as text, numpy scalars as numbers, NaN and infinity as null.
+    """Format a row as one line of strict JSON: paths as text, numpy as numbers, NaN and infinity as null.
 
-    What is no UTF-8 in a file's name stands as an escape, so that the line can be written.
+    Bytes of a file's name that are not UTF-8 are escaped, so that the line can be written.
     """
     text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
     return text.encode(errors="backslashreplace").decode()
@@ -90,20 +90,20 @@ def _plain(value: Any) -> Any:
 
 
 class LineFormatter(logging.Formatter):
-    """`facerf: warning: …`; a plain note has no prefix. The traceback only where the caller attached one."""
+    """Formats `facerf: warning: …`; information has no prefix. A traceback follows if one is attached."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as text."""
+        """Format the record as text."""
         prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
         text = prefix + one_line(record.getMessage())
         return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line, for machines (`--log-json`)."""
+    """Formats a JSON object per line (`--log-json`)."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as a JSON line."""
+        """Format the record as a JSON line."""
         row = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
@@ -126,7 +126,7 @@ class _StderrHandler(logging.Handler):
 
 
 def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
-    """Send the log to stderr: verbosity -1 errors only, 0 notes and warnings, 1 everything."""
+    """Send the log to stderr: verbosity -1 errors only, 0 information and warnings, 1 everything."""
     logger = logging.getLogger(LOGGER_NAME)
     handler = _StderrHandler()
     handler.setFormatter(JsonFormatter() if as_json else LineFormatter())
@@ -136,7 +136,7 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
 
 
 def log_to_queue(queue: Any, level: int) -> None:
-    """Send this process's log, from a level on, to a queue alone: whatever has `put_nowait`."""
+    """Send this process's log, from a level on, to a queue only: any object with `put_nowait`."""
     logger = logging.getLogger(LOGGER_NAME)
     logger.handlers[:] = [logging.handlers.QueueHandler(queue)]
     logger.propagate = False
@@ -144,16 +144,16 @@ def log_to_queue(queue: Any, level: int) -> None:
 
 
 def unexpected(error: Exception) -> str:
-    """What is said of an error that is our fault, not the user's."""
+    """The message of an error that is a bug, not the user's fault."""
     return f"unexpected {type(error).__name__}: {error} (rerun with -v for the traceback)"
 
 
 def one_line(text: str) -> str:
-    """The text with its line breaks and runs of spaces made single spaces."""
+    """The text with line breaks and runs of spaces replaced by single spaces."""
     return " ".join(text.split())
 
 
 def counted(number: int, thing: str) -> str:
-    """`1 light`, `2 lights`; `3 people` of a person."""
+    """Format a count: `1 light`, `2 lights`; `3 people` of a person."""
     plural = {"person": "people"}.get(thing, thing + "s")
     return f"{number} {thing if number == 1 else plural}"

@@ -1,9 +1,9 @@
 """The command line: verbs, global options, errors to exit codes.
 
-A verb is a function in `facerf_cli/commands/`, named like the verb, listed in `VERBS`. typer needs every
-verb's signature before it parses the line, so this module imports all of them; therefore **a command module
-imports torch, OpenImageIO, scipy, trimesh and the rooms that use them inside its function bodies**, not at
-its top. `facerf --help` stays quick that way, and a test holds it.
+A verb is a function in `facerf_cli/cli/`, named like the verb and listed in `VERBS`. typer needs every verb's
+signature before it parses the line, so this module imports all of them. To keep `facerf --help` fast, the
+modules directly in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a verb is in
+`cli/items/`, behind a deferred import. A test checks it.
 """
 
 import logging
@@ -46,15 +46,15 @@ VERBS: tuple[Callable[..., Any], ...] = (
     envmap,
     doctor,
 )
-# Verbs that have verbs of their own.
+# Verbs with subcommands.
 GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
 EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}
-# Global options by how they are written; these are moved before the verb wherever they stand.
+# Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})
 VALUED = frozenset({"--device", "--checkpoint", "--seed"})
-# Options that take every file of these kinds that follows them, so that a shell may expand a pattern there.
+# Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
 log = logging.getLogger(LOGGER_NAME)
@@ -76,22 +76,24 @@ def _print_version(wanted: bool) -> None:
 def _global_options(
     context: typer.Context,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say more; tracebacks with errors.")
+        bool, typer.Option("--verbose", "-v", help="Log more; show tracebacks of errors.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Only errors; no progress bar.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Log errors only; no progress bar.")] = False,
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr as JSON lines.")] = False,
-    device: Annotated[DeviceName, typer.Option(help="Where torch computes.")] = Settings.device,
+    device: Annotated[DeviceName, typer.Option(help="Compute on this device.")] = Settings.device,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Trained network, .safetensors.", show_default="the one shipped"),
+        typer.Option(
+            metavar="FILE", help="Load trained networks (.safetensors).", show_default="the shipped one"
+        ),
     ] = Settings.checkpoint,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of whatever is drawn.")] = Settings.seed,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = Settings.seed,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     if verbose and quiet:
-        raise UsageError("-v and -q exclude each other")
+        raise UsageError("-v and -q: contradict each other; leave one out")
     verbosity = int(verbose) - int(quiet)
     configure_logging(verbosity, log_json)
     context.obj = Settings(verbosity, log_json, device, checkpoint, seed)
@@ -104,19 +106,19 @@ for _name, _group in GROUPS.items():
 
 
 def run() -> None:
-    """The entry point of the `facerf` script."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds, so that temporary files go
+    """Run the `facerf` script."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds: temporary files are removed
     sys.exit(main(sys.argv[1:]))
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run one command line and give its exit code; whatever goes wrong becomes one line on stderr."""
+    """Run one command line and return its exit code; an error becomes one line on stderr."""
     configure_logging()
     try:
         line = repeat_options(global_options_first(arguments or ["--help"]))
         code = app(args=line, prog_name="facerf", standalone_mode=False)
         sys.stdout.flush()
-        if code == 130:  # typer makes an exit code of Ctrl-C
+        if code == 130:  # typer turns Ctrl-C into this exit code
             return _fail(None, "interrupted", 130)
         return code if isinstance(code, int) else 0
     except UsageError as error:
@@ -126,7 +128,7 @@ def main(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         return _end_quietly()
     except SystemExit as stop:
-        if isinstance(stop.__context__, BrokenPipeError):  # typer makes an exit of it
+        if isinstance(stop.__context__, BrokenPipeError):  # typer turns it into an exit
             return _end_quietly()
         raise
     except OSError as error:
@@ -134,14 +136,16 @@ def main(arguments: Sequence[str]) -> int:
     except typer.Abort:
         return _fail(None, "aborted", 1)
     except Exception as error:
-        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # typer's: the line was wrong
-            message = error.format_message().replace("Value error, ", "")  # a library's words
+        if hasattr(error, "format_message") and hasattr(
+            error, "exit_code"
+        ):  # typer's: the command line is wrong
+            message = error.format_message().replace("Value error, ", "")  # pydantic's prefix
             return _fail(None, f"{message} {_see_help(error)}", error.exit_code)
         return _fail(error, unexpected(error), 1)
 
 
 def global_options_first(arguments: Sequence[str]) -> list[str]:
-    """The line with its global options moved to the front, so that they may also stand after the verb."""
+    """Move global options to the front, so that they may also stand after the verb."""
     moved: list[str] = []
     kept: list[str] = []
     rest = iter(arguments)
@@ -158,13 +162,13 @@ def global_options_first(arguments: Sequence[str]) -> list[str]:
 
 
 def _end_quietly() -> int:
-    """The reader of our stdout has gone: point it elsewhere, so that Python's last flush stays quiet."""
+    """Redirect stdout, whose reader has closed it, so that Python's last flush does not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
     return 128 + signal.SIGPIPE
 
 
 def repeat_options(arguments: Sequence[str]) -> list[str]:
-    """`--envmap a.exr b.exr` as `--envmap a.exr --envmap b.exr`: what a pattern in a shell becomes."""
+    """Turn `--envmap a.exr b.exr`, as a shell expands a pattern, into `--envmap a.exr --envmap b.exr`."""
     line: list[str] = []
     option, value_next = None, False
     for argument in arguments:

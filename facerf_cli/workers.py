@@ -18,31 +18,31 @@ from facerf_cli.logs import LOGGER_NAME, log_to_queue
 
 T = TypeVar("T")
 R = TypeVar("R")
-_PATIENCE_S = 10  # for a worker that was asked to end
+_PATIENCE_S = 10  # for a worker to end after SIGTERM
 
 
 @dataclass
 class _Worker:
-    """A process, our end of the pipe to it, and what it has to do."""
+    """A process, our end of the pipe to it, and its item."""
 
     process: Any
     pipe: Any
-    number: int | None = None  # of the item in its hands
+    number: int | None = None  # of the item that it processes
     started: bool = False
 
 
 def in_processes(
     work: Callable[[T], R], items: Sequence[T], jobs: int, broken: Callable[[T, Exception], R]
 ) -> Generator[tuple[int, R]]:
-    """Results as they come; a process that dies costs its own item, and another takes its place.
+    """Yield results as they come; a process that dies costs its own item, and another one replaces it.
 
-    Each has a pipe of its own, for what processes share, a lock or a queue, a killed one may leave locked.
+    Each process has its own pipe: a lock or a queue that processes share could stay locked by a killed one.
     """
     waiting = deque(range(len(items)))
     workers: dict[Any, _Worker] = {}
     try:
         for _ in range(min(jobs, len(items))):
-            _hire(workers, jobs)
+            _start_worker(workers, jobs)
         while workers:
             for pipe in wait(list(workers)):
                 worker = workers[pipe]
@@ -56,49 +56,51 @@ def in_processes(
                     del workers[pipe]
                     if number is not None:
                         if waiting:
-                            _hire(workers, jobs)
+                            _start_worker(workers, jobs)
                         yield number, broken(items[number], content)
                 else:  # "ready", or a "result"
-                    _hand_on(worker, work, items, waiting)
+                    _send_next(worker, work, items, waiting)
                     if number is not None:
                         yield number, content
     finally:
-        _dismiss(list(workers.values()))
+        _end_workers(list(workers.values()))
 
 
-def _hire(workers: dict[Any, _Worker], jobs: int) -> None:
-    """Start one more process; it says "ready" when it can be given the work, and then items."""
+def _start_worker(workers: dict[Any, _Worker], jobs: int) -> None:
+    """Start one more process; it sends "ready" when it can receive the work and items."""
     spawn = multiprocessing.get_context("spawn")  # torch does not survive a fork once its threads run
     ours, theirs = spawn.Pipe()
     level = logging.getLogger(LOGGER_NAME).level
     threads = max(1, (os.cpu_count() or 1) // jobs)
     process = spawn.Process(target=_serve, args=(theirs, level, threads))
     process.start()
-    theirs.close()  # so that theirs is the only one, and its end is the pipe's
+    theirs.close()  # so that the worker holds the only other end, and its death closes the pipe
     workers[ours] = _Worker(process, ours)
 
 
 def _receive(worker: _Worker) -> tuple[str, Any]:
-    """What a worker says, or that it died, and how."""
+    """Receive a worker's message, or notice that it died."""
     try:
         kind, content = worker.pipe.recv()
     except (EOFError, OSError):
         worker.process.join()
         worker.pipe.close()
         if worker.number is None and not worker.started:
-            raise FacerfError(f"a process could not start ({_how(worker)}); try --jobs 1") from None
-        return "died", ChildProcessError(_how(worker))
+            raise FacerfError(
+                f"a worker process could not start ({_cause_of_death(worker)}); try --jobs 1"
+            ) from None
+        return "died", ChildProcessError(_cause_of_death(worker))
     return kind, content
 
 
-def _how(worker: _Worker) -> str:
+def _cause_of_death(worker: _Worker) -> str:
     code = worker.process.exitcode
     return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
 
 
-def _hand_on(worker: _Worker, work: Callable[[T], R], items: Sequence[T], waiting: deque[int]) -> None:
-    """Give a worker the next item, or word that there is none."""
-    with suppress(BrokenPipeError, ConnectionResetError):  # it died; `_receive` finds out
+def _send_next(worker: _Worker, work: Callable[[T], R], items: Sequence[T], waiting: deque[int]) -> None:
+    """Send a worker the next item, or None at the end."""
+    with suppress(BrokenPipeError, ConnectionResetError):  # it died; `_receive` notices
         if not worker.started:
             worker.pipe.send(work)
             worker.started = True
@@ -106,8 +108,8 @@ def _hand_on(worker: _Worker, work: Callable[[T], R], items: Sequence[T], waitin
         worker.pipe.send(None if worker.number is None else (items[worker.number],))
 
 
-def _dismiss(workers: Sequence[_Worker]) -> None:
-    """End processes: by SIGTERM, which lets them take their temporary files away, and then by force."""
+def _end_workers(workers: Sequence[_Worker]) -> None:
+    """End processes by SIGTERM, which lets them remove temporary files, then by SIGKILL."""
     for worker in workers:
         worker.process.terminate()
     for worker in workers:
@@ -118,13 +120,13 @@ def _dismiss(workers: Sequence[_Worker]) -> None:
 
 
 def _serve(pipe: Any, level: int, threads: int) -> None:
-    """A worker process: results out for items in, until there is none. torch is not imported before this."""
+    """Run a worker process: a result for each item, until None. Imports torch only after this call."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds, so that temporary files go
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds: temporary files are removed
     wire = _Wire(pipe)
     log_to_queue(wire, level)
-    with suppress(EOFError, BrokenPipeError):  # the parent is gone
+    with suppress(EOFError, BrokenPipeError):  # the parent has ended
         wire.send("ready", None)
         work = pipe.recv()
         while (wrapped := pipe.recv()) is not None:
@@ -135,7 +137,7 @@ def _serve(pipe: Any, level: int, threads: int) -> None:
 
 
 class _Wire:
-    """A worker's end of the pipe, on which its threads take turns."""
+    """A worker's end of the pipe, locked between its threads."""
 
     def __init__(self, pipe: Any) -> None:
         self._pipe, self._lock = pipe, threading.Lock()
@@ -145,7 +147,7 @@ class _Wire:
             self._pipe.send((kind, content))
 
     def put_nowait(self, record: logging.LogRecord) -> None:
-        """What a `QueueHandler` does with a record."""
+        """Send a log record; called by a `QueueHandler`."""
         self.send("record", record)
 
 
@@ -190,7 +192,7 @@ def process_died(error: Exception) -> str:
 
 
 def in_order(results: Generator[tuple[int, R]]) -> Generator[R]:
-    """Results numbered from 0 as they come, in the order of their numbers."""
+    """Sort results, numbered from 0, into the order of their numbers."""
     early: dict[int, R] = {}
     following = 0
     with closing(results):

@@ -8,26 +8,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import (
-    CompositeSettings,
-    FaceView,
-    Surround,
-    change_of_light,
-    composite,
-    photo_camera,
-    view_face,
-)
+from facerf_cli.composite import Composition, PhotoDetail, Surround, Target
 from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
+from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
 RIG = rig_directions()
+ROTATION, TRANSLATION_M = pose_to_rotation(14, 4, -3), torch.tensor([0.0, 0.01, -1.25])
+FOLLOWING, KEEPING = Target(), Target(keep_background=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +48,7 @@ class Scene:
 def scene() -> Scene:
     noise = torch.Generator().manual_seed(0)
     model = load_face_model("builtin")
-    vertices = model.mean @ pose_to_rotation(14, 4, -3).T + torch.tensor([0.0, 0.01, -1.25])
+    vertices = model.mean @ ROTATION.T + TRANSLATION_M
     coarse = 0.5 + 0.15 * torch.randn(1, 3, 48, 48, generator=noise)
     pores = 1 + 0.06 * torch.randn(1, 1, TEXTURE, TEXTURE, generator=noise)
     albedo = torch.nn.functional.interpolate(coarse, (TEXTURE, TEXTURE), mode="bilinear") * pores
@@ -83,8 +80,30 @@ def view() -> FaceView:
     return view_face(scene().vertices, photo_camera(CROP, HEIGHT_PX, WIDTH_PX), CROP.side_px)
 
 
-def surround() -> Surround:
-    return Surround(scene().vertices, CROP, HEIGHT_PX, WIDTH_PX)
+def compose(
+    photo: np.ndarray,
+    source: Tensor,
+    relit: Tensor,
+    seen: Tensor,
+    target: Target = FOLLOWING,
+    crop: Crop = CROP,
+) -> np.ndarray:
+    """The photo with the scene's face relit."""
+    model = load_face_model("builtin")
+    none = torch.zeros(1)
+    fit = FaceFit(
+        model.name,
+        crop,
+        ROTATION,
+        TRANSLATION_M,
+        0 * model.identity[:, 0, 0],
+        0 * model.expression[:, 0, 0],
+        none,
+        0.0,
+    )
+    head = Head(photo, fit, FaceTexture(source, seen, source))
+    light = RigLight(torch.zeros(0, 3), torch.zeros(0, 3))
+    return Composition(model, photo, head, target).image(light, relit).pixels
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -99,19 +118,19 @@ def inside_face() -> np.ndarray:
 
 def test_own_light_gives_the_photo_back() -> None:
     photo, source, seen = unwrapped()
-    result = composite(photo, source, scene().lit(OWN), seen, view(), surround())
+    result = compose(photo, source, scene().lit(OWN), seen)
     assert psnr_db(result, photo, inside_face()) > 30
 
 
 def test_relit_texture_equal_to_the_source_changes_nothing() -> None:
     photo, source, seen = unwrapped()
-    result = composite(photo, source, source, seen, view(), surround())
+    result = compose(photo, source, source, seen)
     np.testing.assert_allclose(result, photo, atol=2e-5)
 
 
 def test_other_light_comes_out_as_if_rendered() -> None:
     photo, source, seen = unwrapped()
-    result = composite(photo, source, scene().lit(OTHER), seen, view(), None)
+    result = compose(photo, source, scene().lit(OTHER), seen, KEEPING)
     truth = scene().image(OTHER)
     drawn = view().full(view().render(scene().lit(OTHER)))
     assert psnr_db(result, truth, inside_face()) > 28
@@ -123,14 +142,14 @@ def test_other_light_comes_out_as_if_rendered() -> None:
 def test_brightness_of_the_light_scales_the_image(gain: float) -> None:
     photo, source, seen = unwrapped()
     relit = scene().lit(OTHER)
-    once = composite(photo, source, relit, seen, view(), surround())
-    scaled = composite(photo, source, gain * relit, seen, view(), surround())
+    once = compose(photo, source, relit, seen)
+    scaled = compose(photo, source, gain * relit, seen)
     np.testing.assert_allclose(scaled, gain * once, rtol=2e-3, atol=1e-4 * gain)
 
 
 def test_without_surround_only_the_face_changes() -> None:
     photo, source, seen = unwrapped()
-    result = composite(photo, source, scene().lit(OTHER), seen, view(), None)
+    result = compose(photo, source, scene().lit(OTHER), seen, KEEPING)
     outside = view().full(view().mask) == 0
     assert outside.mean() > 0.5
     np.testing.assert_array_equal(result[outside], photo[outside])
@@ -141,8 +160,8 @@ def test_a_matte_says_what_may_change() -> None:
     photo, source, seen = unwrapped()
     matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
     matte[:, 200:] = 1
-    result = composite(photo, source, scene().lit(OTHER), seen, view(), surround(), matte)
-    whole = composite(photo, source, scene().lit(OTHER), seen, view(), surround())
+    result = compose(photo, source, scene().lit(OTHER), seen, Target(matte=matte))
+    whole = compose(photo, source, scene().lit(OTHER), seen)
     np.testing.assert_array_equal(result[:, :200], photo[:, :200])
     np.testing.assert_allclose(result[:, 200:], whole[:, 200:], atol=1e-5)
 
@@ -158,29 +177,55 @@ def test_no_border_shows_where_the_surroundings_are_skin() -> None:
     relit = grey * cosine.clamp(min=0)
     border = (view().full(view().mask) > 0.01) & (view().full(view().mask) < 0.5)
 
-    def steps(around: Surround | None) -> float:
-        result = composite(flat, grey, relit, seen, view(), around)[..., 1]
+    def steps(target: Target) -> float:
+        result = compose(flat, grey, relit, seen, target)[..., 1]
         return float(np.percentile(np.hypot(*np.gradient(result))[border], 99))
 
-    assert steps(surround()) < 0.5 * steps(None)
+    assert steps(FOLLOWING) < 0.5 * steps(KEEPING)
 
 
-def test_dark_source_is_drawn_and_not_multiplied() -> None:
-    source, relit = torch.full((3, 32, 32), 0.4), torch.full((3, 32, 32), 0.3)
+def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
+    """A texture [3, T, T], seen whole, the view of a screen that shows it, and what it shows."""
+    side = source.shape[-1]
+    centres = (torch.arange(side) + 0.5) / side
+    uv = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1)
+    whole = torch.ones(side, side)
+    screen = FaceView(
+        side, side, 0, 0, uv, torch.zeros(side, side, 3), torch.zeros(side, side, 3), whole, whole
+    )
+    return FaceTexture(source, whole, source), screen, screen.render(source).numpy()
+
+
+def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
+    source = torch.full((3, 32, 32), 0.4)
     source[:, 16:19, 22:25] = 1e-6  # a cheek's
-    gain, offset = change_of_light(source, relit, torch.ones(32, 32))
-    assert float(gain.max()) < 1.1 / CompositeSettings().dark
-    torch.testing.assert_close(gain * source + offset, relit, atol=3e-4, rtol=0)  # the lips' are inpainted
+    face, screen, shown = flat_face(source)
+    photo = shown + np.float32(1e-3)  # noise of the photo over the texture
+    relit = PhotoDetail(photo, face, screen).relit(torch.full((3, 32, 32), 0.3))
+    np.testing.assert_allclose(relit, 0.3, atol=0.02)  # the quotient would be 300
+
+
+def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
+    noise = torch.Generator().manual_seed(2)
+    face, screen, shown = flat_face(0.01 + torch.rand(3, 48, 48, generator=noise))
+    photo = (shown * np.random.default_rng(0).uniform(0, 2, shown.shape)).astype(np.float32)
+    detail = PhotoDetail(photo, face, screen)
+    own_region = (region_mask("eyes", 128) + region_mask("mouth", 128) + region_mask("brows", 128)).clamp(
+        max=1
+    )
+    skin = torch.nn.functional.interpolate(own_region[None, None], (48, 48), mode="bilinear")[0, 0] < 1e-3
+    np.testing.assert_allclose(detail.relit(face.texture)[skin], photo[skin], rtol=1e-4, atol=1e-6)
+    one_sided = face.texture * (torch.arange(48) > 24)
+    assert detail.relit(one_sided).min() >= 0
 
 
 def test_eyes_keep_their_detail() -> None:
     source = torch.full((3, 128, 128), 0.4)
     eyes = region_mask("eyes", 128) > 0.99
     source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
-    relit = torch.full((3, 128, 128), 0.2)
-    gain, offset = change_of_light(source, relit, torch.ones(128, 128))
-    torch.testing.assert_close(gain[:, eyes], torch.full_like(gain[:, eyes], 0.5), rtol=0.02, atol=0)
-    assert float(offset[:, eyes].abs().max()) < 1e-3
+    face, screen, photo = flat_face(source)
+    relit = PhotoDetail(photo, face, screen).relit(torch.full((3, 128, 128), 0.2))
+    np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 
 def test_mask_lies_on_the_face_and_ends_softly() -> None:
@@ -199,8 +244,14 @@ def test_photo_camera_sees_what_the_crop_camera_sees() -> None:
 
 def test_a_face_half_outside_its_photo() -> None:
     crop = Crop(-100.0, -60.0, 219.0, 160)
-    face = view_face(scene().vertices, photo_camera(crop, 120, 90), crop.side_px)
     photo = np.full((120, 90, 3), 0.5, np.float32)
     _, source, seen = unwrapped()
-    around = Surround(scene().vertices, crop, 120, 90)
-    assert np.isfinite(composite(photo, source, scene().lit(OTHER), seen, face, around)).all()
+    assert np.isfinite(compose(photo, source, scene().lit(OTHER), seen, crop=crop)).all()
+
+
+def test_the_surround_is_linear_in_light() -> None:
+    _, source, _ = unwrapped()
+    around = Surround(scene().vertices, CROP, HEIGHT_PX, WIDTH_PX)
+    first, second = scene().lit(OWN), scene().lit(OTHER)
+    apart = around.gain(source, first) + around.gain(source, second)
+    np.testing.assert_allclose(apart, around.gain(source, first + second), rtol=1e-4)

@@ -1,11 +1,10 @@
-"""From what the user names to a sorted list of items, each with its own place in the output folder.
+"""The contract of every verb that walks folders: what is read, skipped, written and reported.
 
-The contract of every verb that walks folders (DESIGN): what is read, skipped, written, reported.
-
-A verb hands `run_batch` (files) or `run_items` (whatever else it walks) two functions: `outputs_of(item)`
-names the files that an item will have when it is finished, and `process(item)` makes them. `process` raises
-`InputError` for an item that is at fault (the run goes on); any other `FacerfError` concerns the whole run
-and ends it.
+`collect_items` turns the inputs of the command line into a sorted list of items, each with its place in the
+output folder. A verb passes two functions to `run_batch` (files) or `run_items` (other items):
+`outputs_of(item)` names the files of a finished item, and `process(item)` makes them. `process` raises
+`InputError` for a faulty item (the run continues); any other `FacerfError` concerns the whole run and ends
+it.
 """
 
 import json
@@ -32,7 +31,7 @@ from facerf_cli.workers import process_died, spread
 PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
 )
-_STACK, _SHEET = "_olat.exr", "_olat.png"  # a stack's contact sheet beside it is no photo
+_STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 
 
 @dataclass(frozen=True, order=True)
@@ -44,15 +43,16 @@ class Item:
     name: str  # the mirrored path as text; the item's identity within the output folder
 
     def output(self, ending: str) -> Path:
-        """One of its outputs: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
+        """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
         return Path(f"{self.output_base}{ending}")
 
 
 def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozenset[str]) -> list[Item]:
-    """Files as named, folders walked recursively for `suffixes`, `-` a list on stdin; sorted, each once.
+    """List the files of the inputs, sorted, each once; UsageError if there are none.
 
+    Files are taken as named, folders are walked recursively for `suffixes`, and `-` reads paths from stdin.
     The output tree mirrors the input from the deepest folder that all inputs share. Hidden files and folders
-    are left out, and so is an output folder that lies inside an input folder.
+    are left out, and so is an output folder inside an input folder.
     """
     output_real = output_folder.resolve()
     found: dict[Path, Path] = {}  # absolute -> as the user would write it
@@ -61,7 +61,7 @@ def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozense
         absolute = Path(os.path.abspath(path))
         if path.is_dir():
             if path.resolve() == output_real:
-                raise UsageError(f"{path}: the output folder is an input folder; give -o another folder")
+                raise UsageError(f"{path}: the output folder is an input folder; give another one with -o")
             roots.add(absolute)
             found.update((Path(os.path.abspath(file)), file) for file in _walk(path, output_real, suffixes))
         else:
@@ -79,7 +79,7 @@ def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozense
 
 
 def expand_stdin(inputs: Sequence[str]) -> Iterator[str]:
-    """What the user names, with the lines of standard input in the place of `-`."""
+    """Yield the inputs, with the lines of standard input in place of `-`."""
     for entry in inputs:
         if entry == "-":
             yield from filter(None, (line.rstrip("\r\n") for line in sys.stdin))
@@ -99,7 +99,7 @@ def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator
 
 
 def _unique_names(relatives: Sequence[Path]) -> list[str]:
-    """Mirrored paths without suffix; with it where two would share a name, upper and lower case alike."""
+    """Mirrored paths without suffix, or with it where two would share a name, ignoring case."""
     full = [path.as_posix() for path in relatives]
     names = [path.with_suffix("").as_posix() for path in relatives]
     while clashing := _repeated(name.casefold() for name in names):
@@ -132,7 +132,7 @@ class BatchOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What `process` made of one item: the files it wrote, and facts for the report's row."""
+    """The result of `process`: the files it wrote, and facts for the report's row."""
 
     outputs: Sequence[Path]
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -140,7 +140,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Result:
-    """One item's end, in a form that crosses a process border."""
+    """The end of one item, in a form that can be sent between processes."""
 
     item: Item
     seconds: float
@@ -199,12 +199,12 @@ def run_items(
     done = set(finished)
     todo = [item for item in items if item not in done]
     if options.dry_run:
-        return _say_what_would_be_done(todo, finished, outputs_of)
+        return _list_what_would_be_done(todo, finished, outputs_of)
     if todo and prepare:
         prepare()
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if finished:
-        advice = "--overwrite makes them again, as other options require"
+        advice = "--overwrite makes them again, for example with other options"
         log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
     recover = _Recover(outputs_of, options.overwrite)
     failures = 0
@@ -215,7 +215,7 @@ def run_items(
                 raise result.stops_the_run
             with report.open("a", encoding="utf-8") as stream:
                 stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
-            failures += _tell(result)
+            failures += _print_result(result)
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
     return 1 if failures else 0
@@ -233,7 +233,7 @@ def all_finished(
 
 
 def report_name(shard: Shard) -> str:
-    """The report's name; shards that work at the same time have one each."""
+    """The report's name; each shard has its own, since shards run at the same time."""
     return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
 
 
@@ -243,35 +243,35 @@ def sums_up(
     options: BatchOptions,
     settings: Settings,
 ) -> bool:
-    """Whether a verb that ends with something of all items, not of each, is to make that now.
+    """True if a verb may now write what depends on all items.
 
-    Without `--shard` always. A shard does when the items of all shards are finished, so the last one does;
-    not with `--overwrite`, for an earlier run's outputs look the same.
+    Without `--shard` always. A shard may when the items of all shards are finished, so the last one does; not
+    with `--overwrite`, since an earlier run's outputs look the same.
     """
     if settings.shard.of == 1:
         return True
     left = len(items) if options.overwrite else sum(not _is_finished(outputs_of(item)) for item in items)
     if left:
         state = "may be unfinished" if options.overwrite else f"({left}) are unfinished"
-        log.info("items %s, so nothing is summed up; a run without --shard and --overwrite does that", state)
+        log.info("items %s, so there is no summary; a run without --shard and --overwrite writes it", state)
     return not left
 
 
 @dataclass(frozen=True)
 class _OfFile:
-    """`process`, for items that are files."""
+    """`process` for items that are files."""
 
     process: Callable[[Item], Outcome]
 
     def __call__(self, item: Item) -> Outcome:
         if not item.input_path.exists():
-            raise InputError(f"{item.input_path}: no such file")
+            raise InputError(f"{item.input_path}: no such file; check the path")
         return self.process(item)
 
 
 @dataclass(frozen=True)
 class _Work:
-    """Runs `process` on an item and turns whatever happens into a `_Result`."""
+    """Runs `process` on an item and returns a `_Result`, whatever happens."""
 
     process: Callable[[Item], Outcome]
 
@@ -287,21 +287,21 @@ class _Work:
             return result(error=str(error), trace=traceback.format_exc())
         except FacerfError as error:
             return result(stops_the_run=error)
-        except Exception as error:  # a fault of ours must not cost the other items
+        except Exception as error:  # a bug must not cost the other items
             return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
 
 
 def _broken(item: Item, error: Exception) -> _Result:
-    """The result of an item whose process died under it."""
+    """The result of an item whose process died."""
     return _Result(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
 
 
 @dataclass(frozen=True)
 class _Recover:
-    """The result of an item that was finished when its worker was lost; None where it is to be done again."""
+    """The result of an item that its lost worker had finished; None if it must be done again."""
 
     outputs_of: Callable[[Item], Sequence[Path]]
-    overwrite: bool  # then an earlier run's outputs cannot be told from the lost worker's
+    overwrite: bool  # then an earlier run's outputs look like the lost worker's
 
     def __call__(self, item: Item) -> _Result | None:
         outputs = self.outputs_of(item)
@@ -312,7 +312,7 @@ def _is_finished(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.exists() for path in outputs)
 
 
-def _say_what_would_be_done(
+def _list_what_would_be_done(
     todo: list[Item], finished: list[Item], outputs_of: Callable[[Item], Sequence[Path]]
 ) -> int:
     for item in todo:
@@ -329,9 +329,9 @@ def _open_report(
     finished: list[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
 ) -> Path:
-    """Start the report: older rows stay, but for those of items that are about to be made anew.
+    """Start the report: older rows stay, except those of items that are about to be made again.
 
-    A run without `--shard` takes over the rows of the shards that were before it.
+    A run without `--shard` takes over the rows of earlier shards.
     """
     rows = {(row.get("verb"), row.get("item")): row for row in _rows_of(path)}
     for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
@@ -350,9 +350,7 @@ def _open_report(
     except FacerfError as error:
         cause = error.__cause__
         reason = cause.strerror if isinstance(cause, OSError) else error
-        raise UsageError(
-            f"-o {path.parent}: cannot write to such a folder ({reason}); give another one"
-        ) from error
+        raise UsageError(f"-o {path.parent}: cannot be written to ({reason}); give another folder") from error
     return path
 
 
@@ -385,8 +383,8 @@ def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, An
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
-def _tell(result: _Result) -> int:
-    """Outputs to stdout, an error to stderr; 1 for a failure."""
+def _print_result(result: _Result) -> int:
+    """Print outputs to stdout, an error to stderr; return 1 for a failure."""
     if result.error:
         log.error("%s", one_line(result.error))
         if result.trace:
@@ -400,7 +398,7 @@ def _tell(result: _Result) -> int:
 def _with_progress(
     results: Iterator[_Result], total: int, verb: str, settings: Settings
 ) -> Iterator[_Result]:
-    """Pass the results through, with a progress bar on stderr where that is a terminal."""
+    """Pass the results through, with a progress bar on stderr if that is a terminal."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
     # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.

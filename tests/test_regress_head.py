@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.models import Models, load_models
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.pipeline import Models, crop_face, fit_face, load_models, see_head
+from facerf_cli.pipeline import fit_photo, regress_head
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
 PHOTO = np.full((300, 300, 3), 0.2, np.float32)
@@ -26,25 +28,24 @@ def landmarks_px() -> np.ndarray:
 
 
 def test_without_the_network_the_fit_starts_from_the_landmarks(models: Models) -> None:
-    assert see_head(replace(models, geometry=None), PHOTO) is None
+    assert regress_head(replace(models, geometry=None), PHOTO) is None
 
 
 def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: np.ndarray) -> None:
     torch.manual_seed(0)
-    seeing = replace(models, geometry=GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval())
-    crop, cropped = crop_face(PHOTO, landmarks_px, 128)
-    start = see_head(seeing, cropped)
+    seeing = replace(
+        models, geometry=GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval()
+    )
+    start = regress_head(seeing, from_landmarks(landmarks_px, 128).apply(PHOTO))
     assert start and start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)
-    cold = fit_face(models.face, crop, landmarks_px, PHOTO.shape)
-    warm = fit_face(models.face, crop, landmarks_px, PHOTO.shape, start)
+    cold = fit_photo(replace(models, geometry=None), PHOTO, landmarks_px, 64).fit
+    warm = fit_photo(seeing, PHOTO, landmarks_px, 64).fit
     assert warm.error_iod == pytest.approx(cold.error_iod, abs=5e-4)
     moved_m = warm.vertices_camera(models.face) - cold.vertices_camera(models.face)
     assert moved_m.norm(dim=-1).max() < 2e-3
 
 
-def test_what_the_default_checkpoint_sees_in_a_blank_photo_spoils_no_fit(
+def test_the_default_network_on_a_blank_photo_does_not_spoil_the_fit(
     models: Models, landmarks_px: np.ndarray
 ) -> None:
-    crop, cropped = crop_face(PHOTO, landmarks_px, 128)
-    fit = fit_face(models.face, crop, landmarks_px, PHOTO.shape, see_head(models, cropped))
-    assert fit.error_iod < 0.02
+    assert fit_photo(models, PHOTO, landmarks_px, 64).fit.error_iod < 0.02
