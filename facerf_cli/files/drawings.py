@@ -1,7 +1,4 @@
-"""What every page that facerf writes begins and ends with; a page is one file and fetches nothing.
-
-Pictures of results, for people to look at.
-"""
+"""Overviews for people: contact sheets of images, and the frame of an HTML page."""
 
 import math
 from collections.abc import Iterable
@@ -9,23 +6,12 @@ from html import escape
 
 import numpy as np
 
-
-def html_page(title: str, style: str, body: Iterable[str]) -> str:
-    """A page of lines that are markup already; `title` is text, `style` CSS."""
-    head = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>"
-    )
-    return "\n".join([head, *body, "</body>\n</html>\n"])
-
-
-_GAP_PX = 2
-_MARK = 0.2  # of a tile's height: the mark of its light
+_GAP_PX = 2  # black, between tiles
+_MARK_SIDE, _SMALLEST_MARK_PX = 0.2, 9  # side of a light's mark, in heights of a tile
 
 
 def contact_sheet(tiles: np.ndarray, columns: int | None = None) -> np.ndarray:
-    """Tiles [N, h, w, 3] row by row on black [H, W, 3]; `columns` None makes the sheet about 3 : 2."""
+    """Arrange tiles [N, h, w, 3] row by row on black [H, W, 3]; `columns` None gives about 3 : 2."""
     count, height, width, _ = tiles.shape
     columns = min(count, columns or math.ceil(math.sqrt(1.5 * count * height / width)))
     rows = math.ceil(count / columns)
@@ -36,14 +22,25 @@ def contact_sheet(tiles: np.ndarray, columns: int | None = None) -> np.ndarray:
 
 
 def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> None:
-    """Draw into a tile's [h, w, 3] corner where its light stands: a dot in a disc seen as the camera sees it.
+    """Draw a light's direction into the lower left corner of a tile [h, w, 3]: a dot in a disc.
 
-    The dot is full for a light on the camera's side of the face, hollow for one behind.
+    The disc is the sphere of directions as the camera sees it. The dot is full for a light in front of the
+    face, hollow for one behind it.
     """
-    side = max(9, round(_MARK * tile.shape[0]))
+    side = max(_SMALLEST_MARK_PX, round(_MARK_SIDE * tile.shape[0]))
     corner = tile[-side:, :side]
     axis = (np.arange(side) + 0.5) * (2 / side) - 1
     x, y = axis[None, :], -axis[:, None]
-    off = np.hypot(x - 0.7 * direction[0], y - 0.7 * direction[1])
+    distance = np.hypot(x - 0.7 * direction[0], y - 0.7 * direction[1])
     corner[np.hypot(x, y) < 1] = 0.08 * brightness
-    corner[(off < 0.28) & ((direction[2] >= 0) | (off > 0.14))] = brightness
+    corner[(distance < 0.28) & ((direction[2] >= 0) | (distance > 0.14))] = brightness
+
+
+def html_page(title: str, style: str, body: Iterable[str]) -> str:
+    """Return a page that is one file and loads nothing; `body` is lines of markup, `style` is CSS."""
+    head = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>"
+    )
+    return "\n".join([head, *body, "</body>\n</html>\n"])

@@ -1,10 +1,10 @@
-"""Pickles read without running anything: a machine of our own that builds arrays and inert stand-ins.
+"""Pickles read without running any code: an interpreter that builds only arrays and inert stand-ins.
 
-`pickle.load` calls whatever a file names. Here no name is ever imported or called: each must stand in
-`_ALLOWED`, and what the file wants called becomes a number, an array over the file's own bytes, or a
-`StandIn` that only keeps what it was given. So FLAME's pickles, which hold chumpy and scipy.sparse objects,
-open without either package, and a hostile one can do no more than be refused. The opcodes are those that the
-standard library's `pickletools` documents; Python 2's pickles are read too.
+`pickle.load` calls any function that a file names. Here no name is imported or called: each must be in
+`_ALLOWED`, and a call becomes a number, an array over the file's own bytes, or a `StandIn` that stores the
+arguments. FLAME's pickles, which contain chumpy and scipy.sparse objects, therefore open without these
+packages, and a hostile pickle is refused. The opcodes are those of the standard library's `pickletools`;
+pickles of Python 2 are read too.
 """
 
 import io
@@ -28,16 +28,18 @@ from facerf_cli.logs import one_line
 
 _MAX_BYTES = 512 << 20  # of a file
 _MAX_OPCODES = 200_000  # FLAME has a few thousand
-_MAX_ENCODED = 512 << 20  # bytes that are made of text altogether; a few of text may be met many times
-_PLAIN_KEYS = (str, bytes, int, float, bool, type(None))  # hashing a deep tuple would recurse
+_MAX_ENCODED = 512 << 20  # bytes decoded from text in total; a short text may be decoded many times
+_PLAIN_KEYS = (str, bytes, int, float, bool, type(None))  # dict keys; a deep tuple's hash recurses
 
+# Functions with a known result: numpy's constructors, and encodings of bytes.
 _RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 _SCALAR = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
 _DTYPE = ("numpy.dtype",)
 _ENCODE = ("_codecs.encode",)
-_BYTES = ("__builtin__.bytes",)  # of nothing: how empty data is written
-_BARE = ("copy_reg._reconstructor", "copyreg._reconstructor")  # of a class, its base, and the base's state
+_BYTES = ("__builtin__.bytes",)  # without arguments: empty data
+_BARE = ("copy_reg._reconstructor", "copyreg._reconstructor")  # arguments: class, base, state of the base
+# Classes whose objects become stand-ins.
 _CLASSES = (
     *("numpy.ndarray", "__builtin__.object", "builtins.object", "__builtin__.set", "builtins.set"),
     *("collections.OrderedDict", "torch._utils._rebuild_tensor_v2"),
@@ -45,23 +47,25 @@ _CLASSES = (
     *(f"scipy.sparse.{module}.{kind}_matrix" for kind in ("csc", "csr") for module in (kind, f"_{kind}")),
     *(f"scipy.sparse._{kind}.{kind}_array" for kind in ("csc", "csr")),
 )
-# chumpy's operations may stand beside its arrays; as stand-ins they do nothing.
+# Names that begin with chumpy. are allowed too; chumpy's operations become stand-ins, which do nothing.
 _ALLOWED = frozenset((*_RECONSTRUCT, *_FROM_BUFFER, *_SCALAR, *_DTYPE, *_ENCODE, *_BYTES, *_BARE, *_CLASSES))
 
 
 @dataclass(frozen=True)
 class _Name:
+    """A name that the pickle wants to import: module and attribute joined by a dot."""
+
     text: str
 
 
 def read_inert_pickle(path: Path) -> Any:
-    """What a .pkl holds: dicts, lists, tuples, text, numbers, and `inert_arrays` of what is more than that.
+    """Read a .pkl of dicts, lists, tuples, text, numbers, and the stand-ins of `inert_arrays`.
 
-    Nothing of the file is run. What names anything else than numpy, chumpy and scipy.sparse arrays, or is
-    damaged, is an InputError of one line.
+    No code of the file runs. A damaged file, and one that names anything other than arrays of numpy, chumpy
+    and scipy.sparse, raises an InputError.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: no such file; give a face model's .pkl")
     if path.stat().st_size > _MAX_BYTES:
         raise InputError(f"{path}: too large for a face model ({_MAX_BYTES >> 20} MiB at most)")
     with path.open("rb") as file:
@@ -69,7 +73,7 @@ def read_inert_pickle(path: Path) -> Any:
 
 
 def read_inert_stream(file: BinaryIO, path: Path) -> Any:
-    """The pickle that begins where an open file stands; `path` is what an error names."""
+    """Read the pickle that begins at an open file's position; errors name `path`."""
     machine = _Machine()
     try:
         for opcode, argument, _ in pickletools.genops(io.BytesIO(file.read(_MAX_BYTES))):
@@ -79,19 +83,19 @@ def read_inert_stream(file: BinaryIO, path: Path) -> Any:
         raise InputError(f"{path}: refused: it {refused}; nothing of it was run") from None
     except (ValueError, IndexError, KeyError, TypeError, OverflowError, EOFError, MemoryError) as error:
         raise InputError(
-            f"{path}: not a pickle that can be read ({one_line(str(error))[:120]}); get the file again"
+            f"{path}: not a readable pickle ({one_line(str(error))[:120]}); get the file again"
         ) from None
 
 
 def _unwrapped(value: Any) -> Any:
-    """The one object that numpy saves as an array of objects."""
+    """Return the only object of an array of objects, which is how numpy saves one object."""
     if isinstance(value, InertArray) and isinstance(value.values, list) and len(value.values) == 1:
         return value.values[0]
     return value
 
 
 class _Machine:
-    """The pickle's stack machine; its memo holds objects by number."""
+    """The stack machine of pickles; its memo stores objects by number."""
 
     def __init__(self) -> None:
         self._stack: list[Any] = []
@@ -101,7 +105,7 @@ class _Machine:
         self._encoded = 0
 
     def step(self, opcode: str, argument: Any) -> None:
-        """Do one opcode."""
+        """Execute one opcode."""
         self._steps += 1
         if self._steps > _MAX_OPCODES:
             raise Refused(f"has more than {_MAX_OPCODES} instructions")
@@ -115,9 +119,9 @@ class _Machine:
             raise Refused(f"uses the instruction {opcode}, which no array needs")
 
     def pop(self) -> Any:
-        """The top of the stack, taken off it."""
+        """Remove and return the top of the stack."""
         if self._marks and self._marks[-1] == len(self._stack):
-            raise ValueError("a mark stands where a value should")
+            raise ValueError("a mark instead of a value")
         return self._stack.pop()
 
     def _drop(self, _: Any) -> None:
@@ -168,7 +172,7 @@ class _Machine:
     def _name(self, text: str) -> None:
         name = ".".join(text.split(" "))
         if name not in _ALLOWED and not name.startswith("chumpy."):
-            raise Refused(f"names {name[:80]}, which is no part of a face model")
+            raise Refused(f"names {name[:80]}, which is not part of a face model")
         self._stack.append(_Name(name))
 
     def _stack_name(self, _: Any) -> None:
@@ -180,7 +184,7 @@ class _Machine:
         self._stack.append(self._called(require(self.pop(), _Name).text, arguments))
 
     def _called(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        """What stands for the outcome of a call; for nothing is called."""
+        """Return the substitute for a call's result; nothing is called."""
         if name in _ENCODE:
             text, encoding = arguments
             if encoding not in ("latin1", "latin-1"):
@@ -257,7 +261,7 @@ _OPCODES: dict[str, Callable[[_Machine, Any], None]] = {
     "GLOBAL": _Machine._name,
     "STACK_GLOBAL": _Machine._stack_name,
     "REDUCE": _Machine._reduce,
-    "NEWOBJ": _Machine._reduce,  # what is made has no parts yet, as after a call
+    "NEWOBJ": _Machine._reduce,  # creates an object without a state, as a call does
     "BUILD": _Machine._build,
 }
 

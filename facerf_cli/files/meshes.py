@@ -15,33 +15,33 @@ from facerf_cli.files.atomic import atomic_path
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """vertices_m, normals [V, 3]; triangles [F, 3]; uv [V, 2], v down; texture_srgb [T, T, 3] uint8."""
+    """A triangle mesh with normals and a texture."""
 
-    vertices_m: np.ndarray
-    normals: np.ndarray
-    triangles: np.ndarray
-    uv: np.ndarray
-    texture_srgb: np.ndarray
-    metadata: dict[str, Any]
+    vertices_m: np.ndarray  # [V, 3]
+    normals: np.ndarray  # [V, 3]
+    triangles: np.ndarray  # [F, 3], counter-clockwise from outside
+    uv: np.ndarray  # [V, 2], v down
+    texture_srgb: np.ndarray  # [T, T, 3] uint8
+    metadata: dict[str, Any]  # provenance
 
 
 def write_glb(path: Path, mesh: TexturedMesh) -> None:
-    """Write one file with the texture in it; a rough dielectric."""
+    """Write one file that contains the texture, as a rough dielectric."""
     image = Image.fromarray(mesh.texture_srgb)
     material = PBRMaterial("face", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     scene = trimesh.Scene(metadata=mesh.metadata)
-    scene.add_geometry(_with(mesh, material), geom_name="face")
+    scene.add_geometry(_with_material(mesh, material), geom_name="face")
     with atomic_path(path) as temporary:
         temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
 
 
 def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
-    """Write `path`, and beside it an .mtl that names the picture `texture_name` (not written here)."""
-    material = SimpleMaterial(image=Image.new("RGB", (1, 1)), name="face")  # else no uv are exported
+    """Write `path` and an .mtl in its folder that names the texture's image (not written here)."""
+    material = SimpleMaterial(image=Image.new("RGB", (1, 1)), name="face")  # needed to export UVs
     mtl_path = path.with_suffix(".mtl")
     header = "; ".join(f"{name}: {value}" for name, value in mesh.metadata.items())
     text = trimesh.exchange.obj.export_obj(
-        _with(mesh, material), include_normals=True, mtl_name=mtl_path.name, header=header
+        _with_material(mesh, material), include_normals=True, mtl_name=mtl_path.name, header=header
     )
     with atomic_path(mtl_path) as temporary:
         temporary.write_text(f"newmtl face\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nmap_Kd {texture_name}\n", "utf-8")
@@ -49,7 +49,7 @@ def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
         temporary.write_text(text, "utf-8")
 
 
-def _with(mesh: TexturedMesh, material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
+def _with_material(mesh: TexturedMesh, material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
     up = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)  # trimesh counts v upward, as OBJ does
     return trimesh.Trimesh(
         mesh.vertices_m,

@@ -1,10 +1,10 @@
-"""OLAT stacks: one multi-part OpenEXR, half floats, a part a light; any program that reads EXR opens them.
+"""OLAT stacks: a multi-part OpenEXR of half floats with one part for each light; any EXR reader opens it.
 
-Part k is named `light000` and so on and says its light's direction (`facerf:direction`, a unit vector toward
-the light in camera space). Where lights of a stage's rig are missing, so are their numbers. A last part,
-`source`, holds what the lights were predicted from: the photo's texture (or its render), how well each pixel
-was seen, and normals in camera space. The first part's `facerf:olat` is JSON: the kind of stack, the head's
-rotation and the fit, so that a stack can be relit without its photo.
+The parts are named `light000` and so on, and hold their light's direction in `facerf:direction` (a unit
+vector toward the light in camera space). A light that is missing from a stage's rig leaves a gap in the
+numbers. The last part, `source`, holds the input of the prediction: the photo's texture (or its render), the
+visibility of each pixel, and normals in camera space. The first part's `facerf:olat` is JSON with the kind of
+stack, the head's rotation and the fit, so that a stack can be relit without its photo.
 """
 
 import json
@@ -27,28 +27,30 @@ from facerf_cli.files.images import HALF_MAX
 from facerf_cli.logs import one_line
 
 FORMAT = "facerf-olat-1"
-COMPRESSION = "zip"  # of the lossless ones the smallest, and the quickest but for none at all
-STACK_LIMIT_BYTES = 16 << 30  # of half floats in memory
-_MOST_PARTS = 4097
-_MOST_HEADER_BYTES = 1 << 20
+COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
+STACK_LIMIT_BYTES = 16 << 30  # half floats of a whole stack in memory
+_MOST_PARTS = 4097  # 4096 lights and the source
+_MOST_HEADER_BYTES = 1 << 20  # of the JSON
+_MOST_CHANNELS = 16  # of a part; other programs may add some
+_LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
 _HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
 
 
 @dataclass(frozen=True, eq=False)
 class StackHeader:
-    """All of a stack but its lights' pictures; H = W = T, the texture's side, where the kind is 'texture'."""
+    """A stack without its OLATs; if the kind is 'texture', H = W = T, the texture's side."""
 
     kind: Literal["texture", "image"]
     directions: np.ndarray  # [L, 3] unit, toward the lights, camera space
     rotation: np.ndarray  # [3, 3] head_to_camera that the lights were predicted for
     source: np.ndarray  # [H, W, 3] linear: the unwrapped photo, or the face rendered from it
-    seen: np.ndarray  # [H, W] in 0..1: visible texels, or the face's coverage
-    normals: np.ndarray  # [H, W, 3] camera space, of the photo's pose in a texture, of `rotation` in an image
-    layout_version: int  # of the UV chart
+    seen: np.ndarray  # [H, W] in 0..1: visibility of texels, or coverage of the face
+    normals: np.ndarray  # [H, W, 3] camera space; for the photo's pose (texture) or `rotation` (image)
+    layout_version: int  # of the UV map
     fit: dict[str, np.ndarray]  # `face.fit.fit_to_arrays`
     metadata: dict[str, Any] = field(default_factory=dict)  # provenance
-    rig_lights: tuple[int, ...] = ()  # the parts' numbers in their rig, to write; () counts them from 0
+    rig_lights: tuple[int, ...] = ()  # numbers of the parts to write, in their rig; () counts from 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +62,7 @@ class OlatStack:
 
 
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
-    """Write OLATs as they come, in batches [l, 3, H, W] in the order of the header's directions."""
+    """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive."""
     specs = _specs(header)
     images = (image for batch in olats for image in batch.permute(0, 2, 3, 1).cpu().numpy())
     with atomic_path(path) as temporary:
@@ -73,57 +75,13 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
         good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
         source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
         good = good and stream.write_image(_as_half(path, source))
-        complaint = stream.geterror()
+        message = stream.geterror()
         if not (stream.close() and good):
-            raise FacerfError(f"{path}: cannot write: {one_line(complaint or stream.geterror())}")
-
-
-def is_olat_stack(path: Path) -> bool:
-    """Whether a file is an OLAT stack of ours; no for what cannot be opened, an InputError by `utf8_path`."""
-    stream = oiio.ImageInput.open(utf8_path(path))
-    if stream is None:
-        oiio.geterror()  # or it prints its own words at exit
-        return False
-    found = bool(stream.spec().get_string_attribute(_HEADER))
-    stream.close()
-    return found
-
-
-def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
-    """Read a stack; counts and sizes are checked before any pixels are decoded."""
-    with _opened(path) as stream:
-        content = _header_of(path, stream.spec(), limit_bytes)
-        return OlatStack(_read_header(path, stream, content), _read_lights(path, stream, content))
-
-
-def read_olat_header(path: Path) -> StackHeader:
-    """All of a stack but its lights' pixels, whatever the size of these."""
-    with _opened(path) as stream:
-        return _read_header(path, stream, _header_of(path, stream.spec()))
-
-
-def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
-    """Some lights' pictures [l, 3, h, W] float16, or rows of them, where a stack is too large to hold."""
-    with _opened(path) as stream:
-        return _read_lights(path, stream, _header_of(path, stream.spec()), lights, rows)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[oiio.ImageInput]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
-    stream = oiio.ImageInput.open(utf8_path(path))
-    if stream is None:
-        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
-    try:
-        yield stream
-    finally:
-        stream.geterror()
-        stream.close()
+            raise FacerfError(f"{path}: cannot write: {one_line(message or stream.geterror())}")
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
-    """The header of every part."""
+    """Return the image specification of every part."""
     height, width = header.seen.shape
     attributes: Attributes = header.metadata
     specs = []
@@ -153,7 +111,7 @@ def _part(
     spec.attribute("name", name)
     spec.attribute("compression", COMPRESSION)
     spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
-    spec.attribute("DateTime", "")  # or OpenImageIO writes the hour, and no two runs give the same bytes
+    spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
     spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
     for key, value in attributes.items():
         spec.attribute(key, value)
@@ -164,6 +122,50 @@ def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
     if not np.isfinite(image).all():
         raise ValueError(f"{path}: some values are NaN or infinite")
     return np.ascontiguousarray(image.clip(-HALF_MAX, HALF_MAX), np.float16)
+
+
+def is_olat_stack(path: Path) -> bool:
+    """Return whether a file is an OLAT stack that facerf wrote; False if it cannot be opened as an image."""
+    stream = oiio.ImageInput.open(utf8_path(path))
+    if stream is None:
+        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        return False
+    found = bool(stream.spec().get_string_attribute(_HEADER))
+    stream.close()
+    return found
+
+
+def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
+    """Read a stack; counts and sizes are checked before pixels are decoded."""
+    with _opened(path) as stream:
+        content = _header_of(path, stream.spec(), limit_bytes)
+        return OlatStack(_read_header(path, stream, content), _read_lights(path, stream, content))
+
+
+def read_olat_header(path: Path) -> StackHeader:
+    """Read a stack without its OLATs; their size is not limited."""
+    with _opened(path) as stream:
+        return _read_header(path, stream, _header_of(path, stream.spec()))
+
+
+def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
+    """Read some lights' OLATs [l, 3, h, W] float16, or some of their rows, from a stack of any size."""
+    with _opened(path) as stream:
+        return _read_lights(path, stream, _header_of(path, stream.spec()), lights, rows)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[oiio.ImageInput]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    stream = oiio.ImageInput.open(utf8_path(path))
+    if stream is None:
+        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
+    try:
+        yield stream
+    finally:
+        stream.geterror()
+        stream.close()
 
 
 def _read_header(path: Path, stream: oiio.ImageInput, content: dict[str, Any]) -> StackHeader:
@@ -208,14 +210,14 @@ def _is_provenance(name: str) -> bool:
 
 
 def _header_of(path: Path, spec: oiio.ImageSpec, limit_bytes: int | None = None) -> dict[str, Any]:
-    """The first part's JSON, each entry of the type that it must have, and the pictures' shape (H, W)."""
+    """Return the first part's JSON with its types checked, and the parts' shape (H, W)."""
     content = _json_of(path, spec)
     lights = content["lights"]
     held_bytes = 0 if limit_bytes is None else 6 * lights * spec.height * spec.width
     if not 1 <= lights < _MOST_PARTS or held_bytes > (limit_bytes or 0):
         raise InputError(
             f"{path}: {lights} lights of {spec.width} x {spec.height} pixels are more than can be read "
-            f"({(limit_bytes or STACK_LIMIT_BYTES) >> 20} MiB)"
+            f"({(limit_bytes or STACK_LIMIT_BYTES) >> 20} MiB); give a stack of fewer lights or pixels"
         )
     return content | {"shape": (spec.height, spec.width)}
 
@@ -240,21 +242,22 @@ def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
         }
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{path}: damaged OLAT stack, or by another version of facerf ({type(error).__name__}: {error})"
+            f"{path}: damaged OLAT stack, or written by another version of facerf "
+            f"({type(error).__name__}: {error})"
         ) from None
 
 
 def _direction(path: Path, spec: oiio.ImageSpec) -> np.ndarray:
     value = spec.getattribute(_DIRECTION)
     direction = np.array(value if isinstance(value, tuple) else (), np.float64)
-    if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < 0.01:
-        raise InputError(f"{path}: a part of the OLAT stack has no direction of light; write the stack again")
+    if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < _LENGTH_TOLERANCE:
+        raise InputError(f"{path}: a part of the OLAT stack has no direction; write the stack again")
     return direction / np.linalg.norm(direction)
 
 
 def _part_at(path: Path, stream: oiio.ImageInput, number: int) -> oiio.ImageSpec:
     if not stream.seek_subimage(number, 0):
-        raise InputError(f"{path}: damaged OLAT stack: part {number} is missing")
+        raise InputError(f"{path}: damaged OLAT stack: part {number} is missing; write the stack again")
     return stream.spec()
 
 
@@ -266,13 +269,13 @@ def _pixels(
     shape: tuple[int, int],
     rows: slice = slice(None),
 ) -> np.ndarray:
-    """The named channels [h, W, C] of a part, or of some rows of it."""
+    """Read the named channels [h, W, C] of a part, or of some of its rows."""
     spec = _part_at(path, stream, number)
     names = list(spec.channelnames)
-    if (spec.height, spec.width) != shape or not set(channels) <= set(names) or len(names) > 16:
+    if (spec.height, spec.width) != shape or not set(channels) <= set(names) or len(names) > _MOST_CHANNELS:
         raise InputError(f"{path}: damaged OLAT stack: part {number} has another size or other channels")
     first, past, _ = rows.indices(spec.height)
-    if spec.tile_width:  # another program wrote it anew
+    if spec.tile_width:  # another program has rewritten the file in tiles
         values = stream.read_image(number, 0, 0, spec.nchannels, oiio.HALF)
         values = None if values is None else values[first:past]
     else:

@@ -1,4 +1,4 @@
-"""Pickles are read, and nothing of them is run."""
+"""Pickles are read without running any code."""
 
 import os
 import pickle
@@ -133,28 +133,28 @@ DAMAGED = {
     "a product that overflows": (array_pickle(HUGE * 2 + b"\x86"), "larger"),
     "a negative length": (array_pickle(b"J\xff\xff\xff\xff\x85"), "larger than its data"),
     "fewer numbers than data": (array_pickle(b"K\x01\x85", data=bytes(16)), "does not fit"),
-    "objects": (array_pickle(b"K\x01\x85", b"O8"), "cannot"),
+    "objects": (array_pickle(b"K\x01\x85", b"O8"), "in the wrong place"),
     "text": (array_pickle(b"K\x01\x85", b"S8"), "array of type S8"),
     "records": (array_pickle(b"K\x01\x85", b"f8,f8"), "array of type"),
     "many axes": (array_pickle(b"(" + b"K\x01" * 40 + b"t"), "does not fit"),
     "a memo far away": (b"\x80\x02Nr\xff\xff\xff\x7f.", ""),
-    "a memo that is not there": (b"\x80\x02j\x00\x00\x00\x10.", "not a pickle"),
-    "a long text that is not there": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.", "not a pickle"),
+    "a memo that is missing": (b"\x80\x02j\x00\x00\x00\x10.", "not a readable pickle"),
+    "a long text that is missing": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.", "not a readable pickle"),
     "an old instance": (b"(ios\nsystem\n.", "INST"),
     "someone else's store": (b"Pabc\n.", "PERSID"),
     "an extension": (b"\x80\x02\x82\x01.", "EXT1"),
-    "nothing": (b"", "not a pickle"),
+    "nothing": (b"", "not a readable pickle"),
     "a picture": (b"\x89PNG\r\n\x1a\n", "PERSID"),
-    "an end too soon": (pickle.dumps(ARRAYS["floats"])[:-20], "not a pickle"),
-    "an empty stack": (b"\x80\x020.", "not a pickle"),
+    "an end too soon": (pickle.dumps(ARRAYS["floats"])[:-20], "not a readable pickle"),
+    "an empty stack": (b"\x80\x020.", "not a readable pickle"),
     "a list as a key": (b"\x80\x02}]Ns.", "neither text nor a number"),
-    "a mark for a value": (b"\x80\x02(.", "not a pickle"),
-    "a call of what is no name": (b"\x80\x02X\x01\x00\x00\x00a)R.", "not a pickle"),
+    "a mark for a value": (b"\x80\x02(.", "not a readable pickle"),
+    "a call of what is no name": (b"\x80\x02X\x01\x00\x00\x00a)R.", "not a readable pickle"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", DAMAGED)
-def test_what_is_damaged_is_one_line(tmp_path: Path, case: str) -> None:
+def test_damage_is_one_line(tmp_path: Path, case: str) -> None:
     data, message = DAMAGED[case]
     path = written(tmp_path / "a.pkl", data)
     if not message:
@@ -172,7 +172,7 @@ def test_deep_nests_neither_recurse_nor_take_long(tmp_path: Path) -> None:
     assert time.perf_counter() - begin < 5
 
 
-def test_its_work_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_work_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     module = "facerf_cli.files.inert_pickle"
     monkeypatch.setattr(f"{module}._MAX_OPCODES", 1000)
     with pytest.raises(InputError, match="more than 1000 instructions"):
@@ -201,13 +201,13 @@ def test_a_sparse_matrix_is_not_trusted(tmp_path: Path) -> None:
             array_of(found)
 
 
-def test_what_holds_no_numbers_says_so(tmp_path: Path) -> None:
+def test_a_value_without_numbers_is_an_error(tmp_path: Path) -> None:
     for value in ({"a": OrderedDict(b=1)}, {"a": "text"}, {"a": None}, {"a": {1, 2}}):
         with pytest.raises(ValueError, match="where numbers should"):
             array_of(read_inert_pickle(written(tmp_path / "a.pkl", pickle.dumps(value)))["a"])
 
 
-def test_an_operation_of_chumpy_is_kept_but_not_worked_out(tmp_path: Path) -> None:
+def test_an_operation_of_chumpy_is_kept_but_not_computed(tmp_path: Path) -> None:
     data = b"\x80\x02}X\x01\x00\x00\x00acchumpy.reordering\nSelect\n)\x81}X\x01\x00\x00\x00xK\x01sbs."
     found = read_inert_pickle(written(tmp_path / "a.pkl", data))
     assert found["a"].name == "chumpy.reordering.Select" and found["a"].state == {"x": 1}
