@@ -13,7 +13,7 @@ from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
-from tests.capture.test_colours import kept_luminance
+from tests.capture.test_chart_colours import kept_luminance
 from tests.cli.test_prepare_dataset import prepare, tree
 from tests.dataset.capture import BLACK_LEVEL, write_capture
 
@@ -111,7 +111,7 @@ def test_an_older_charts_image_does_not_outlive_its_dataset(
 def test_a_file_is_no_dataset(wrong: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "file").touch()
     assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr")) == 2
-    assert "file: cannot write to such a folder" in capsys.readouterr().err
+    assert "file: cannot be written to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

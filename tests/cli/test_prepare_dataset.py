@@ -330,7 +330,7 @@ def test_intensities_of_another_unit_and_odd_texts_of_the_capture(
     capture = changed(given, tmp_path / "capture", lights=lights, subjects=subjects)
     assert prepare(capture, tmp_path / "out", "--split", "1/0/0") == 0
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 3 and all(said in line and "lamps' intensities" in line for line in lines)
+    assert len(lines) == 3 and all(said in line and "lights' intensities" in line for line in lines)
     dataset = json.loads((tmp_path / "out/dataset.json").read_text())
     assert dataset["subjects"]["0000"]["traits"] == subjects["0000"]
 

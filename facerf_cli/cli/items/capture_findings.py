@@ -93,7 +93,7 @@ def require_sound(subject: str, findings: Iterable[Finding], strict: bool) -> No
     if at_fault := stopping(findings, strict):
         first = at_fault[0]
         more = f" ({len(at_fault)} such findings, see {FINDINGS_FILE})" if len(at_fault) > 1 else ""
-        advice = "" if first.severity == "error" else "; without --strict it does not stop the subject"
+        advice = "" if first.severity == "error" else "; without --strict it is a warning"
         raise InputError(f"{first.place}: {first.check}: {first.words}{advice}{more}")
 
 
