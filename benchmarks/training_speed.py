@@ -33,7 +33,8 @@ from facerf_cli.training.joint_objective import JointObjective
 from facerf_cli.training.loop import train
 from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.settings import PRESETS, TrainSettings
-from facerf_cli.training.texture_objective import ChartObjective
+from facerf_cli.training.state import build_optimizer
+from facerf_cli.training.texture_objective import TextureObjective
 
 _HEADS = 40  # of the bank, besides the mean face: a step does not depend on how many there are
 _TINY_WIDTHS = (8, 12, 16)  # as `facerf train --preset tiny` has them
@@ -92,7 +93,7 @@ def _now() -> tuple[float, float]:
 def _bare_step(objective: Objective, settings: TrainSettings) -> Callable[[], None]:
     """A step on one batch that is drawn here."""
     batch = objective.draw(settings.batch, lambda index: seeded(settings.seed, 1, index), 1)
-    optimizer = settings.optimizer.build(objective.networks.parameters())
+    optimizer = build_optimizer(settings.optimizer, objective.networks.parameters())
 
     def step() -> None:
         optimizer.zero_grad(set_to_none=True)
@@ -133,7 +134,7 @@ def build(name: str, bank: Path | None, dataset: Path | None) -> Objective:
         return _paper(_needed(dataset, "--dataset"))
     heads, _ = held_out_bank(_needed(bank, "--bank"), "builtin", _HEADS)
     network = DefaultReflectanceNetwork(TINY_NETWORK) if name == "tiny" else DefaultReflectanceNetwork()
-    return ChartObjective(heads, network)
+    return TextureObjective(heads, network)
 
 
 def _needed(path: Path | None, option: str) -> Path:

@@ -10,7 +10,7 @@ from torch import Tensor
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.synth.texture_samples import Sample
-from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
+from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 
 SIDE, RIG = 16, 8
 NETWORK = DefaultReflectanceSettings(
@@ -54,8 +54,8 @@ def _normals() -> Tensor:
     return F.normalize(torch.stack([x, y, torch.ones_like(x)]), dim=0)
 
 
-def toy_objective(poison: int = -1) -> ChartObjective:
+def toy_objective(poison: int = -1) -> TextureObjective:
     """The same weights at every call."""
     torch.manual_seed(0)
-    settings = ChartSettings(lights=2, held_out_heads=3, held_out_draws=1, held_out_lights=2)
-    return ChartObjective(ToyFaces(poison), DefaultReflectanceNetwork(NETWORK), settings=settings)
+    settings = TextureObjectiveSettings(lights=2, held_out_heads=3, held_out_draws=1, held_out_lights=2)
+    return TextureObjective(ToyFaces(poison), DefaultReflectanceNetwork(NETWORK), settings=settings)

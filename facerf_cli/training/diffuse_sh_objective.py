@@ -1,9 +1,9 @@
-"""Stage `diffuse-sh`: the network of the diffuse baseline (`network/diffuse_sh.py`), in the chart.
+"""Stage `diffuse-sh`: the network of the diffuse baseline (`network/diffuse_sh.py`), on textures.
 
-Albedo is learnt from targets, which it has to explain under lights that are known; light from the source,
-which it has to explain with that albedo. Were the albedo to learn from the source too, a copy of it under a
-constant light would explain it at once, and training stays there. Order 2 cannot explain a single light, nor
-is the baseline used in one: a target is a sum of several. All are at the network's own exposure.
+The albedo is trained on targets under known lights, the light on the source, with the albedo held constant.
+If the source also trained the albedo, the source itself under a constant light would be a perfect solution,
+in which training stays. Spherical harmonics of order 2 cannot represent a single light, and the baseline is
+not used with one: a target is a sum of several. All are at the network's exposure.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,18 +20,18 @@ from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork
 from facerf_cli.network.inputs import to_root
 from facerf_cli.synth.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 5
-_TOTAL = 1.5  # of the weights of a sum: a face in front light then has about the albedo's radiance
-_UNEVEN = 2.0  # power of the draws that weights are made of: some sums are nearly one light
-_TINT = 0.15  # deviation of the logarithm of a light's colour
+_TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
+_UNEVEN = 2.0  # exponent of the uniform draws: some sums are nearly a single light
+_TINT = 0.15  # standard deviation of the logarithm of a light's colour
 
 
 @dataclass(frozen=True)
 class SumSettings:
-    """Single lights of a face and step, and their sums; and held-out heads, each drawn several times."""
+    """Single lights and sums of a face and step, and held-out heads, each drawn `held_out_draws` times."""
 
     lights: int = 8
     sums: int = 3
@@ -41,10 +41,10 @@ class SumSettings:
 
 @dataclass(frozen=True)
 class DiffuseBatch:
-    """B faces, M targets each: fields as in `Sample`, and the targets' light.
+    """B faces with M targets each: fields as in `Sample`, and the targets' lights.
 
     source, normals_source, normals_target [B, 3, T, T], visible and weight [B, 1, T, T], targets
-    [B, M, 3, T, T], coefficients [B, M, 9, 3] in camera space; `heads` [B] are the heads' numbers.
+    [B, M, 3, T, T], coefficients [B, M, 9, 3] in camera space; `heads` [B] are the heads' indices.
     """
 
     source: Tensor
@@ -57,13 +57,13 @@ class DiffuseBatch:
     heads: Tensor
 
     def to(self, device: torch.device) -> "DiffuseBatch":
-        """The same batch on `device`."""
+        """Copy the batch to `device`."""
         moved = {name: tensor.to(device) for name, tensor in self.__dict__.items() if name != "heads"}
         return DiffuseBatch(**moved, heads=self.heads)
 
 
 class DiffuseObjective(Objective):
-    """`root_loss` of the source in its own light, and of sums of lights that are known."""
+    """`root_loss` of the source under its estimated light, and of sums of known lights."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class DiffuseObjective(Objective):
         self._validation: list[DiffuseBatch] = []
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> DiffuseBatch:
-        """`count` faces, sample i with `generator_of(i)` alone."""
+        """Draw `count` faces, sample i from `generator_of(i)` alone."""
         drawn = []
         for i in range(count):
             generator = generator_of(i)
@@ -92,13 +92,13 @@ class DiffuseObjective(Objective):
         return concatenate(drawn)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
-        """The terms `source`, of the light alone, and `targets`, of the albedo; means over faces."""
+        """Compute `source`, for the light alone, and `targets`, for the albedo; means over faces."""
         with self.mixed_precision():
             estimate = self._network()(batch.source, batch.normals_source, batch.visible)
         source = (batch.source / estimate.exposure)[:, None]
         targets = batch.targets / estimate.exposure[:, None]
-        own, _ = explained(estimate._replace(albedo=estimate.albedo.detach()), batch)
-        _, relit = explained(estimate, batch)
+        own, _ = predicted_images(estimate._replace(albedo=estimate.albedo.detach()), batch)
+        _, relit = predicted_images(estimate, batch)
         return {
             "source": root_loss(to_root(own), source, batch.visible),
             "targets": root_loss(to_root(relit), targets, batch.weight),
@@ -106,10 +106,9 @@ class DiffuseObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean Si-MSE of held-out heads, clipped at white: of the relit sums, by pose, and of the source.
+        """Measure the mean Si-MSE of held-out heads, clipped at white: of targets, by pose, and of sources.
 
-        The sheet has a face in two rows: source and targets; the source as explained, and the relit, then
-        albedo and shading.
+        The sheet has two rows a face: source and targets; predicted source and targets, albedo and shading.
         """
         network = self._network()
         device = next(network.parameters()).device
@@ -119,7 +118,7 @@ class DiffuseObjective(Objective):
         for batch in self._held_out():
             there = batch.to(device)
             estimate = network(there.source, there.normals_source, there.visible)
-            own, relit = (image.cpu() for image in explained(estimate, there))
+            own, relit = (image.cpu() for image in predicted_images(estimate, there))
             of_source = clipped_si_mse(own, batch.source[:, None], batch.visible).mean()
             errors.append((clipped_si_mse(relit, batch.targets, batch.weight).mean(), of_source))
             turned = (batch.normals_source - batch.normals_target).abs().max()
@@ -128,7 +127,7 @@ class DiffuseObjective(Objective):
         return Validation(_metrics(torch.tensor(errors), torch.tensor(same_pose)), np.concatenate(rows))
 
     def _held_out(self) -> Iterator[DiffuseBatch]:
-        """Always the same samples, one a face; drawn once."""
+        """Yield the held-out batches of one face each, drawn once."""
         if not self._validation:
             self._validation = [
                 self._sums(head[None], seeded(_VALIDATION_SEED, int(head), draw))
@@ -138,25 +137,25 @@ class DiffuseObjective(Objective):
         yield from self._validation
 
     def _sums(self, heads: Tensor, generator: torch.Generator) -> DiffuseBatch:
-        """One face, and sums of its single lights of random colours."""
+        """Draw a face and random sums of its single lights."""
         sample = self.source.draw(heads, self.settings.lights, generator)
         weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
-        return summed(sample, weights, heads)
+        return sum_lights(sample, weights, heads)
 
     def _network(self) -> Any:
         return self.networks["diffuse_sh"]
 
 
 def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:
-    """Weights [M, L, 3] of lights, not negative, from nearly one light to all alike."""
+    """Draw non-negative weights [M, L, 3] of lights, from nearly one light to nearly equal weights."""
     share = torch.rand(sums, lights, 1, generator=generator) ** _UNEVEN
     tint = torch.exp(_TINT * torch.randn(sums, lights, 3, generator=generator))
     weights = share * tint
     return _TOTAL * weights / weights.mean(2, keepdim=True).sum(1, keepdim=True)
 
 
-def summed(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
-    """One face of a sample under M sums, weights [M, L, 3], of its lights."""
+def sum_lights(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
+    """Sum the lights of a sample of one face with weights [M, L, 3]."""
     coefficients = [rig_coefficients(RigLight(sample.lights[0], w), ORDER) for w in weights]
     return DiffuseBatch(
         source=sample.source,
@@ -170,22 +169,20 @@ def summed(sample: Sample, weights: Tensor, heads: Tensor) -> DiffuseBatch:
     )
 
 
-def explained(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Tensor, Tensor]:
-    """Sources [B, 1, 3, T, T] in their own light and targets [B, M, 3, T, T], at the network's exposure."""
+def predicted_images(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Tensor, Tensor]:
+    """Predicted sources [B, 1, 3, T, T] and targets [B, M, 3, T, T], at the network's exposure."""
     albedo = estimate.albedo[:, None]
     own = shading(batch.normals_source, estimate.coefficients[:, None])
     return albedo * own, albedo * shading(batch.normals_target, batch.coefficients)
 
 
 def _metrics(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    """Of errors [N, 2]: of what is relit, and of sources."""
-    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
-    relit = {f"si_mse{name}": float(errors[part, 0].mean()) for name, part in parts.items() if part.any()}
-    return {**relit, "si_mse_source": float(errors[:, 1].mean())}
+    """Metrics of errors [N, 2] of relit targets and of sources."""
+    return {**metrics_by_pose(errors[:, 0], same_pose), "si_mse_source": float(errors[:, 1].mean())}
 
 
 def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
-    """Two rows of pictures [2T, (M + 3) T, 3] of one face."""
+    """Two rows of textures [2T, (M + 3) T, 3] of one face."""
     exposure = estimate.exposure[0].cpu()
     seen, mask = batch.visible[0], (batch.weight[0] > 0).float()
     albedo = estimate.albedo[0].cpu()

@@ -1,9 +1,9 @@
-"""Stage `light-features`: S_f learns to tell from a texture where its one light stands.
+"""Stage `light-features`: S_f learns to predict the direction of the single light of a texture.
 
 The paper trains S_f 'to predict the light direction from images' after Meka et al. (*Deep reflectance
-fields*, 2019), and says no more of it; what it learns to look at, shading, shadows and highlights, is what
-the loss L_L then compares. Textures are those that the Reflectance Network is trained to make, of one light
-each, black where the target pose does not see the face.
+fields*, 2019) and gives no details. Its features respond to shading, shadows and highlights, which the loss
+L_L compares. Textures are the Reflectance Network's targets, of one light each, black where the target pose
+does not see the face.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ from facerf_cli.network.inputs import head_rotation, resize
 from facerf_cli.synth.texture_samples import SampleSource
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 
-_NORMALS_SIDE = 64  # at which head frames are found
+_NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 6
 
@@ -28,7 +28,7 @@ _SHEET_FACES = 6
 class LightTextures:
     """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
 
-    The lights are unit vectors in the head's own frame; `heads` [B] are the heads' numbers.
+    The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
     """
 
     textures: Tensor
@@ -36,13 +36,13 @@ class LightTextures:
     heads: Tensor
 
     def to(self, device: torch.device) -> "LightTextures":
-        """The same batch on `device`."""
+        """Copy the batch to `device`."""
         return LightTextures(self.textures.to(device), self.lights_head.to(device), self.heads)
 
 
 @dataclass(frozen=True)
 class LightFeaturesSettings:
-    """Lights of a face and step; and held-out heads, each seen `held_out_views` times."""
+    """Lights of a face and step, and held-out heads, each drawn `held_out_views` times."""
 
     lights: int = 8
     held_out_heads: int = 12
@@ -50,7 +50,7 @@ class LightFeaturesSettings:
 
 
 class LightFeaturesObjective(Objective):
-    """1 - the cosine between the predicted direction and the light's."""
+    """1 minus the cosine between the predicted and the true direction of light."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class LightFeaturesObjective(Objective):
         self._validation: LightTextures | None = None
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> LightTextures:
-        """`count` faces, sample i with `generator_of(i)` alone."""
+        """Draw `count` faces, sample i from `generator_of(i)` alone."""
         drawn = []
         for i in range(count):
             generator = generator_of(i)
@@ -78,13 +78,13 @@ class LightFeaturesObjective(Objective):
         return concatenate(drawn)
 
     def forward(self, batch: LightTextures) -> dict[str, Tensor]:
-        """The one term, a mean over faces and their lights."""
+        """Compute the term `light`, a mean over faces and lights."""
         with self.mixed_precision():
             return {"light": 1 - _cosines(self._network(), batch).mean()}
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean and median angle in degrees to the true light of held-out heads, and by where it stands."""
+        """Measure mean and median angles in degrees to the true light, also for front and back lights."""
         if self._validation is None:
             self._validation = self._held_out()
         network = self._network()
@@ -126,15 +126,15 @@ def _one_by_one(batch: LightTextures) -> Iterator[LightTextures]:
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
-    """Between predicted and true directions [B, L]."""
+    """Cosines between predicted and true directions [B, L]."""
     predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
     return (predicted * batch.lights_head).sum(-1)
 
 
 def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
-    """For some faces three rows of pictures: textures, a ball under the true light, and under the predicted.
+    """Three rows for some faces: textures, balls under the true lights, balls under the predicted lights.
 
-    The balls are seen from before the face, in the head's frame.
+    The balls are seen from the front, in the head's frame.
     """
     rows = []
     for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
@@ -146,7 +146,7 @@ def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
 
 
 def _balls(lights: Tensor, side: int) -> Tensor:
-    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black around them."""
+    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black background."""
     along = torch.linspace(-1, 1, side) * 1.05
     y, x = torch.meshgrid(-along, along, indexing="ij")
     inside = 1 - x**2 - y**2

@@ -1,5 +1,9 @@
-"""The training loop: draw, losses, backward, step, log, validate, save, resume. It knows no stage."""
+"""The training loop: draw a batch, compute losses, step, log, validate, save, resume.
 
+An `Objective` gives the stage's batches, losses and validation; the loop is the same for all stages.
+"""
+
+import copy
 import logging
 import math
 import shutil
@@ -12,35 +16,35 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.utils.data import DataLoader, Dataset
 
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.training.batches import (
-    Drawn,
-    drawn_batches,
-    first_says,
-    mean_of_all,
-    own_device,
+from facerf_cli.training.objective import Batch, Objective, seeded
+from facerf_cli.training.processes import (
+    broadcast_from_first,
+    distributed,
+    mean_over_processes,
     process_count,
+    process_device,
     process_rank,
-    shared,
 )
-from facerf_cli.training.objective import Objective, seeded
 from facerf_cli.training.run_folder import RunLog, refuse_another_run, stop_on_signals
 from facerf_cli.training.settings import TrainSettings
 from facerf_cli.training.state import State, averaged, begin, load_state, save_state, update_average
 
 CPU = torch.device("cpu")
-Row = dict[str, Any]
+_ENDLESS = 1 << 31  # steps that the sampler lists; the loop ends the run
+Row = dict[str, Any]  # of log.jsonl
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
 class Start:
-    """The checkpoint that a run begins from: its other networks, which are carried over, and its metadata."""
+    """Checkpoint of --start-from: the networks that the stage does not train, and the metadata."""
 
     carried: dict[str, nn.Module] = field(default_factory=dict)
     metadata: dict[str, Any] = field(default_factory=dict)
@@ -55,15 +59,15 @@ def train(
     device: torch.device = CPU,
     report: Callable[[Row], None] = lambda row: None,
 ) -> Path:
-    """Minimise an objective until the steps or the time are up; returns `folder/last.safetensors`.
+    """Minimise an objective until the steps or the time are up; return `folder/last.safetensors`.
 
-    On a CPU a run that ends by its steps is the same to the last digit however often it was stopped and
+    On a CPU a run that ends by its steps is the same to the last digit however often it is stopped and
     resumed, for draws and dropout depend on (seed, step, index) alone. Rows go to `folder/log.jsonl` and
-    `report`. Under torchrun (`runs.processes`) every process calls this; the first one alone writes.
+    `report`. Under torchrun (`training/processes.py`) every process calls this; process 0 alone writes.
     """
     if process_rank() == 0 and not resume:
         refuse_another_run(folder)
-    device = own_device(device)
+    device = process_device(device)
     objective.to(device)
     objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     objective.bf16 = settings.bf16
@@ -73,18 +77,16 @@ def train(
         saved, _ = load_networks(folder / "last.safetensors", LAYOUT_VERSION)
         start = Start({name: saved[name] for name in saved.keys() - objective.networks.keys()})
     if settings.done(state.step, state.seconds) >= 1:
-        log.info("%s: complete at step %d; give more --steps or --max-time to go on", folder, state.step)
-    elif process_rank() == 0:
-        with RunLog(folder, state.step) as run_log:
-            _loop(_Run(objective, folder, settings, state, start.carried, device, run_log, report))
-    else:
-        _loop(_Run(objective, folder, settings, state, start.carried, device, None, report))
+        log.info("%s: complete at step %d; increase --steps or --max-time to continue", folder, state.step)
+        return folder / "last.safetensors"
+    with RunLog(folder, state.step) if process_rank() == 0 else nullcontext() as run_log:
+        _loop(_Run(objective, folder, settings, state, start.carried, device, run_log, report))
     return folder / "last.safetensors"
 
 
 @dataclass(frozen=True)
 class _Run:
-    """What the loop works on."""
+    """Arguments and state that all parts of the loop share."""
 
     objective: Objective
     folder: Path
@@ -97,16 +99,17 @@ class _Run:
 
 
 def _loop(run: _Run) -> None:
-    """Steps from where the state is, to the end or to a signal."""
+    """Take steps from the state's on, to the end or to a signal."""
     settings, state = run.settings, run.state
     if settings.compile:
         run.objective.compile()
-    model, clock = shared(run.objective, run.objective.skips_networks), _Clock(state.seconds)
+    model, clock = distributed(run.objective, run.objective.skips_networks), _Clock(state.seconds)
     run.objective.networks.train()
     with stop_on_signals() as stop:
         for drawn in _draws(run):
             clock.waited_s += drawn.waited_s
-            seconds, signal = first_says(torch.tensor([clock.seconds(), stop.signal]).double()).tolist()
+            local = torch.tensor([clock.seconds(), stop.signal]).double()
+            seconds, signal = broadcast_from_first(local).tolist()
             row = {"step": drawn.step, "seconds": seconds}
             row |= _step(run, model, drawn, settings.done(drawn.step - 1, seconds))
             row |= {"waiting": clock.waiting()}
@@ -121,38 +124,93 @@ def _loop(run: _Run) -> None:
         stop.leave()
 
 
-def _draws(run: _Run) -> Any:
+def _draws(run: _Run) -> "Iterator[Drawn]":
     """This process's share of every batch after the state's step."""
     processes, batch = process_count(), run.settings.batch
     if batch % processes:
-        raise UsageError(f"{processes} processes cannot share a batch of {batch}; give another --batch")
+        raise UsageError(
+            f"--batch {batch}: {processes} processes cannot share it; give a multiple of {processes}"
+        )
     share, seed, workers = batch // processes, run.settings.seed, run.settings.workers
     return drawn_batches(run.objective, run.state.step + 1, share, process_rank() * share, seed, workers)
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """The batch of a step, and how long the loop waited for it."""
+
+    step: int
+    batch: Batch
+    waited_s: float
+
+
+def drawn_batches(
+    objective: Objective, first_step: int, count: int, first_index: int, seed: int, workers: int
+) -> Iterator[Drawn]:
+    """Yield samples `first_index` to `first_index + count` of the batch of every step from `first_step` on.
+
+    `workers` processes draw ahead. Each sample depends on (seed, step, index) alone.
+    """
+    steps = range(first_step, _ENDLESS)
+    loader = DataLoader(
+        _Draws(objective, count, first_index, seed),
+        batch_size=None,
+        sampler=steps,
+        num_workers=workers,
+        generator=torch.Generator(),  # not the global one, which would differ in a resumed run
+    )
+    batches = iter(loader)
+    for step in steps:
+        begin_s = time.monotonic()
+        batch = next(batches)
+        if isinstance(batch, FacerfError):
+            raise batch
+        yield Drawn(step, batch, time.monotonic() - begin_s)
+
+
+class _Draws(Dataset[Batch | FacerfError]):
+    """An objective's batches by step, for data-loading workers."""
+
+    def __init__(self, objective: Objective, count: int, first_index: int, seed: int) -> None:
+        self.objective = copy.copy(objective)
+        # Drawing needs no networks, so none are sent to the workers.
+        self.objective.__dict__ |= {"_modules": {}, "_buffers": {}}
+        self.count, self.first_index, self.seed = count, first_index, seed
+
+    def __getitem__(self, step: int) -> Batch | FacerfError:
+        def generator_of(index: int) -> torch.Generator:
+            return seeded(self.seed, step, self.first_index + index)
+
+        try:
+            return self.objective.draw(self.count, generator_of, step)
+        except FacerfError as error:  # returned, for the loader would turn it into a traceback
+            return error
+
+
 def _step(run: _Run, model: nn.Module, drawn: Drawn, done: float) -> Row:
-    """One step down the gradient; what there is to log of it. One that is not finite moves nothing."""
+    """Take one step down the gradient and return its log entries; raise where the loss is not finite."""
     settings, state = run.settings, run.state
     rate = settings.optimizer.learning_rate * settings.schedule.factor(drawn.step - 1, done)
     for group in state.optimizer.param_groups:
         group["lr"] = rate
-    torch.manual_seed(seeded(settings.seed, drawn.step, process_rank(), 0).initial_seed())  # of dropout
+    torch.manual_seed(seeded(settings.seed, drawn.step, process_rank(), 0).initial_seed())  # for dropout
     state.optimizer.zero_grad(set_to_none=True)
     terms = model(drawn.batch.to(run.device))
     loss = torch.stack(list(terms.values())).sum()
     loss.backward()  # type: ignore[no-untyped-call]
     clip = settings.gradient_clip or math.inf
     norm = nn.utils.clip_grad_norm_(state.networks.parameters(), clip)
-    values = mean_of_all(torch.stack([loss, *terms.values()]).detach())
+    values = mean_over_processes(torch.stack([loss, *terms.values()]).detach())
     total, gradient, *parts = torch.cat([values[:1], norm[None], values[1:]]).tolist()
-    _stop_if_not_finite(run, drawn, total, gradient)
+    _require_finite(run, drawn, total, gradient)
     state.optimizer.step()
     if settings.ema_decay:
         update_average(state, settings.ema_decay, drawn.step)
     return {"loss": total, "terms": dict(zip(terms, parts, strict=True)), "gradient": gradient, "rate": rate}
 
 
-def _stop_if_not_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -> None:
+def _require_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -> None:
+    """Raise FacerfError for a loss or gradient that is not finite, before it changes the weights."""
     if math.isfinite(loss) and math.isfinite(gradient):
         return
     what = "loss" if not math.isfinite(loss) else "gradient"
@@ -166,16 +224,16 @@ def _stop_if_not_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -
 
 
 def _write(run: _Run, row: Row, validate: bool, save: bool) -> None:
-    """The row, after a validation if one is due; the state last, so that all it knows of is on disk."""
+    """Validate and save if due, and write the row; the state last, so that all files it refers to exist."""
     last = run.folder / "last.safetensors"
     with averaged(run.state) if save else nullcontext():
         if validate:
             row["validation"] = _validate(run, row["step"])
         if save:
             save_networks(last, {**run.carried, **run.objective.networks}, _metadata(run, row))
-    chosen = row.get("validation", {}).get(run.objective.chooses_by, math.inf)
-    if chosen < run.state.best:
-        run.state.best = chosen
+    metric = row.get("validation", {}).get(run.objective.chooses_by, math.inf)
+    if metric < run.state.best:
+        run.state.best = metric
         with atomic_path(run.folder / "best.safetensors") as temporary:
             shutil.copyfile(last, temporary)
     assert run.log
@@ -196,7 +254,7 @@ def _validate(run: _Run, step: int) -> dict[str, float]:
 
 
 def _metadata(run: _Run, row: Row) -> dict[str, Any]:
-    """Of the checkpoint; what it began from is part of its past."""
+    """Metadata of the checkpoint, with that of --start-from as its history."""
     start, provenance = run.state.start, dict(run.objective.provenance)
     licences = [*provenance["licence"].split("; "), *start.get("licence", "").split("; ")]
     if "provenance" in start:
@@ -220,7 +278,7 @@ def _metadata(run: _Run, row: Row) -> dict[str, Any]:
 
 @dataclass
 class _Clock:
-    """Seconds of a run in all its legs, and the share of this leg's steps that waited for batches."""
+    """Duration of a run over all resumptions, and the share of step time spent waiting for batches."""
 
     before_s: float
     waited_s: float = 0.0
@@ -235,7 +293,7 @@ class _Clock:
 
     @contextmanager
     def stopped(self) -> Iterator[None]:
-        """Validating and saving is not a step."""
+        """Leave the time of the block, for validation and saving, out of the steps' time."""
         begun = time.monotonic()
         yield
         self.paused_s += time.monotonic() - begun

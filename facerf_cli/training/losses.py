@@ -1,13 +1,13 @@
-"""What training minimises. The paper's four terms come with its preset; this is the default form's own.
+"""Loss terms: the default form's own, and the paper's four ('Loss Functions'), each before its weight.
 
-The terms of the paper's loss ('Loss Functions'), each a value a sample, before their weights.
-
-What the paper leaves open, and how it stands here, so that the terms are of comparable size at its weights:
-- a squared norm is the mean over its points or coefficients, an L1 norm the mean over the mask's pixels and
+The paper leaves open the units of its terms. Here they are chosen so that the terms have comparable size at
+its weights:
+- a squared norm is the mean over points or coefficients, an L1 norm the mean over the mask's pixels and
   channels, so that a weight means the same at every size of crop and model;
-- landmarks are in units of half the crop's side, as where the picture goes from -1 to 1;
-- radiance is linear and exposed as `dataset/crops.py` says; features look at it as sRGB (`features.py`);
-- the texture of the target is compared where the target's camera sees it, and is no target to move.
+- landmarks are in units of half the crop's side, as for image coordinates from -1 to 1;
+- radiance is scene-linear, exposed as in `dataset/crops.py`; feature networks see it as sRGB
+  (`network/feature_networks.py`);
+- textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
 
 from dataclasses import dataclass
@@ -18,17 +18,17 @@ from torch import Tensor
 from facerf_cli.network.feature_networks import FeatureNetwork, feature_distance
 from facerf_cli.network.inputs import from_root, to_root
 
-_SLOPE_WEIGHT = 0.6
-_RADIANCE_WEIGHT = 16.0  # of squared errors as Si-MSE has them, against L1 on roots
-_WHITE = 1.0  # where a camera clips, at the exposure of samples
-_BRIGHTEST_ROOT = 1.25  # beyond it a photograph clips
+_SLOPE_WEIGHT = 0.6  # of differences between neighbouring texels
+_RADIANCE_WEIGHT = 16.0  # of squared errors of radiance, as in Si-MSE, against L1 on roots
+_WHITE = 1.0  # radiance at which a camera clips, at the exposure of samples
+_BRIGHTEST_ROOT = 1.25  # above it a photograph clips
 
 
 def root_loss(root: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """L1 on roots (`to_root`) and on their differences between neighbours, and squares of the radiance's.
+    """L1 on roots (`to_root`) and on differences of neighbouring roots, plus squared errors of radiance.
 
     root [B, L, 3, T, T] is the prediction's root (may be negative), target [B, L, 3, T, T] linear,
-    weight [B, 1, T, T] is where the target pose sees the face. The mean of the faces' own means.
+    weight [B, 1, T, T] is positive where the target pose sees the face. The mean of the faces' means.
     """
     wanted = to_root(target.clamp(0, 4))
     mask = weight[:, None]
@@ -44,7 +44,7 @@ def root_loss(root: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """Scale-invariant mean squared error [B, L] (Zhou et al., ICCV 2019): after the best single scale.
+    """Mean squared error [B, L] after the best single scale (Si-MSE; Zhou et al., ICCV 2019).
 
     prediction, target [B, L, 3, T, T] linear; weight [B, 1, T, T].
     """
@@ -56,13 +56,13 @@ def si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
 
 
 def clipped_si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-    """`si_mse` of what a camera would have kept of both: a few glints of the truth outweigh all faces."""
+    """`si_mse` of radiance clipped at white; without clipping a few highlights outweigh all faces."""
     return si_mse(prediction.clamp(max=_WHITE), target.clamp(max=_WHITE), weight)
 
 
 @dataclass(frozen=True)
 class PaperWeights:
-    """lambda_l, lambda_r, lambda_p, lambda_f of the whole, and lambda_alpha, lambda_beta of its priors."""
+    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r."""
 
     landmarks: float = 25.0
     regularisation: float = 1.0
@@ -73,9 +73,9 @@ class PaperWeights:
 
 
 def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor:
-    """L_l of one picture of each sample [B]: landmarks of the mesh and the detector's [B, N, 2].
+    """L_l [B]: mean squared distance of the mesh's and the detector's landmarks [B, N, 2].
 
-    The mean of their squared distances, lengths in units of half the crop's side.
+    Lengths are in units of half the crop's side.
     """
     difference = (found_px - detected_px) * (2 / side_px)
     return difference.square().sum(-1).mean(1)
@@ -83,48 +83,48 @@ def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor
 
 @torch.no_grad()
 def closest_points(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """Index [B, N] of the candidate [B, C, 2] that lies closest to each detected point [B, N, 2].
+    """Index [B, N] of the candidate [B, C, 2] closest to each detected point [B, N, 2].
 
-    Contour landmarks slide on the mesh: its vertices that are these landmarks for now are a constant.
+    Contour landmarks slide on the mesh; the choice of their vertices has no gradient.
     """
     return torch.cdist(detected_px, candidates_px, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
 
 
 def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
-    """The candidates [B, C, 2] closest to the detected points [B, N, 2], as [B, N, 2] with their gradient."""
+    """Candidates [B, C, 2] closest to the detected points [B, N, 2]: [B, N, 2], with gradient."""
     ids = closest_points(candidates_px, detected_px)
     return candidates_px.gather(1, ids[..., None].expand(-1, -1, 2))
 
 
 def regularisation(alpha: Tensor, beta: Tensor, weights: PaperWeights = PaperWeights()) -> Tensor:
-    """L_r of one picture of each sample [B]: means of squared identity [B, Ki] and expression [B, Ke]."""
+    """L_r [B]: weighted means of squared identity [B, Ki] and expression coefficients [B, Ke]."""
     return weights.alpha * alpha.square().mean(1) + weights.beta * beta.square().mean(1)
 
 
 def photometric_loss(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """L_p [B]: mean difference of pictures [B, 3, H, W] in the mask [B, 1, H, W], 0 if it is empty."""
+    """L_p [B]: mean L1 difference of images [B, 3, H, W] in the mask [B, 1, H, W], 0 if it is empty."""
     difference = ((prediction - target).abs() * mask).mean(1, keepdim=True)
     return difference.sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1.0)
 
 
 @dataclass(frozen=True)
-class Seen:
-    """A prediction and its truth [B, 3, H, W], linear, and where they are compared, mask [B, 1, H, W]."""
+class MaskedPair:
+    """A prediction and its target [B, 3, H, W], linear, compared in the mask [B, 1, H, W]."""
 
     prediction: Tensor
     target: Tensor
     mask: Tensor
 
     def distance(self, net: FeatureNetwork) -> Tensor:
-        """Of the features of both, masked alike [B]."""
+        """Distance [B] of the features of both, masked."""
         return feature_distance(net, self.prediction * self.mask, self.target * self.mask)
 
 
-def appearance_loss(net: FeatureNetwork, image: Seen, texture: Seen) -> Tensor:
-    """L_I [B]: V_f of the masked picture and of the texture."""
+def appearance_loss(net: FeatureNetwork, image: MaskedPair, texture: MaskedPair) -> Tensor:
+    """L_I [B]: distance of V_f features, of the image and of the texture."""
     return image.distance(net) + texture.distance(net)
 
 
-def light_loss(net: FeatureNetwork, texture: Seen) -> Tensor:
-    """L_L [B]: S_f, which knows where light comes from, of the texture."""
+def light_loss(net: FeatureNetwork, texture: MaskedPair) -> Tensor:
+    """L_L [B]: distance of S_f features, which depend on the light's direction, of the texture."""
     return texture.distance(net)

@@ -1,4 +1,4 @@
-"""What a stage of training minimises, as the loop in `training/loop.py` sees it."""
+"""The interface between a training stage and the loop in `training/loop.py`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -11,65 +11,71 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Validation:
-    """What networks are worth on held-out people."""
+    """Quality of the networks on held-out people."""
 
     metrics: dict[str, float]
     sheet: np.ndarray | None  # contact sheet [H, W, 3], scene-linear
 
 
 class Batch(Protocol):
-    """What one step learns from; tensors on the CPU until it is moved."""
+    """Samples of one step, on the CPU until moved."""
 
     def to(self, device: torch.device) -> Self:
-        """The same batch on `device`."""
+        """Copy the batch to `device`."""
 
 
 class Objective(nn.Module):
-    """Draws batches, weighs their losses, and measures what was learnt.
+    """A training stage: its batches, its loss terms and its validation.
 
-    The loop knows no more of a stage than this. Subclasses set the three attributes after
-    `super().__init__()` and implement `draw`, `forward` and `validate`.
+    Subclasses set the first three attributes after `super().__init__()` and implement `draw`, `forward` and
+    `validate`.
     """
 
     networks: nn.ModuleDict  # trained, averaged, saved: by the names of network.saved.FORMS
-    chooses_by: str  # the metric of `validate`, lower is better, that chooses best.safetensors
-    provenance: dict[str, Any]  # for the checkpoint; its 'licence' is the words for the whole
-    skips_networks: bool = False  # whether a batch may leave some of their weights without a gradient
-    bf16: bool = False  # set by the loop: networks may run in mixed precision, see `mixed_precision`
+    chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
+    provenance: dict[str, Any]  # for the checkpoint; 'licence' is that of the whole
+    skips_networks: bool = False  # True if a batch may leave some weights without a gradient
+    bf16: bool = False  # set by the loop, for `mixed_precision`
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:
-        """`count` samples, sample i with `generator_of(i)` alone, so that it never depends on its neighbours.
+        """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
 
-        A kind that holds for a whole batch is drawn with `seeded(seed, step)`. Runs in data-loading workers:
-        tensors of the CPU, and the networks are not touched.
+        A choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
+        CPU and without the networks.
         """
         raise NotImplementedError
 
     def forward(self, batch: Any) -> dict[str, Tensor]:
-        """Weighted terms of the loss, each a mean over the batch's samples; their sum is minimised."""
+        """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
         raise NotImplementedError
 
     def validate(self) -> Validation:
-        """Measure the networks as they are on held-out people, on the same samples every time."""
+        """Measure the networks on held-out people, on the same samples every time."""
         raise NotImplementedError
 
     def mixed_precision(self) -> torch.autocast:
-        """For the networks' share of `forward` alone: geometry and losses want single precision."""
+        """Context for the networks in `forward`; geometry and losses need single precision."""
         device = next(self.networks.parameters()).device
         return torch.autocast(device.type, torch.bfloat16, enabled=self.bf16)
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A generator of the CPU that depends on all of these non-negative numbers, their order and count."""
+    """Make a CPU generator from non-negative numbers; their order and count matter, too."""
     state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
     return torch.Generator().manual_seed(state >> 1)
+
+
+def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
+    """Mean Si-MSE of errors [N]: of all, and by whether the target has the source's pose [N]."""
+    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
+    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
 
 
 Samples = TypeVar("Samples")
 
 
 def concatenate(samples: Sequence[Samples]) -> Samples:
-    """One batch of samples: dataclasses whose fields are all tensors [B, ...]."""
+    """Join samples into a batch; they are dataclasses whose fields are all tensors [B, ...]."""
     first: Any = samples[0]
     joined: Samples = type(first)(
         *(torch.cat([getattr(sample, field.name) for sample in samples]) for field in fields(first))

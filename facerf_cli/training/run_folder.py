@@ -1,4 +1,4 @@
-"""The files of a run: log.jsonl, validation-*.png and, where it is installed, what TensorBoard shows.
+"""The folder of a run: log.jsonl, validation-*.png and, if installed, TensorBoard events; and its signals.
 
 Ctrl-C and SIGTERM end a run between two steps, so that nothing is lost; a second one ends it at once.
 """
@@ -17,22 +17,24 @@ from typing import Any
 
 import numpy as np
 
+from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
 from facerf_cli.logs import LOGGER_NAME, json_line
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)
 
 
 def refuse_another_run(folder: Path) -> None:
-    """UsageError where a folder holds a run already, which would be written over."""
+    """Raise UsageError where a folder holds a run already, which training would overwrite."""
     if any((folder / name).exists() for name in ("state.pt", "log.jsonl", "last.safetensors")):
-        raise UsageError(f"{folder}: holds a run already; give --resume to go on with it, or another folder")
+        raise UsageError(f"{folder}: holds a run already; give --resume to continue it, or another folder")
 
 
 class RunLog:
-    """Rows to log.jsonl and TensorBoard. Rows after `step`, which a killed run leaves, are taken out."""
+    """Writer of log.jsonl and TensorBoard; it removes rows after `step`, which a killed run leaves."""
 
     def __init__(self, folder: Path, step: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -54,7 +56,7 @@ class RunLog:
             self.board.close()
 
     def write(self, row: dict[str, Any]) -> None:
-        """Write a row; what it holds of dictionaries is named by both keys in TensorBoard."""
+        """Write a row; entries of its dictionaries are named OUTER/INNER in TensorBoard."""
         self.file.write(json_line(row) + "\n")
         self.file.flush()
         if self.board:
@@ -66,13 +68,11 @@ class RunLog:
         path = self.folder / f"validation-{step:07d}.png"
         write_display(path, sheet.astype(np.float32), exposure=1.0)  # EV
         if self.board:
-            from facerf_cli.colour import linear_to_srgb
-
             self.board.add_image("sheet", linear_to_srgb(sheet.clip(0, 1)), step, dataformats="HWC")
 
 
 def _step_of(line: str) -> float:
-    """The step of a row, infinite for a line that was not written to its end."""
+    """Step of a row; infinite for an incomplete line."""
     try:
         return float(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
@@ -93,22 +93,19 @@ def _tensorboard(folder: Path, step: int) -> Any:
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:
-        log.info("no TensorBoard here: the log is in log.jsonl alone (pip install 'facerf[tensorboard]')")
+        log.info("TensorBoard is not installed (pip install 'facerf[tensorboard]'); the log is in log.jsonl")
         return None
     return SummaryWriter(folder, purge_step=step + 1)
 
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
 @dataclass
 class Stop:
-    """Whether the run was asked to end."""
+    """The signal that asked the run to end; 0 for none."""
 
     signal: int = 0
 
     def leave(self) -> None:
-        """End as the signal would have."""
+        """End the process as the signal would have."""
         if self.signal == signal.SIGINT:
             raise KeyboardInterrupt
         if self.signal:
@@ -117,7 +114,7 @@ class Stop:
 
 @contextmanager
 def stop_on_signals() -> Iterator[Stop]:
-    """Note the signals in the place of their handlers; threads but the main one cannot."""
+    """Record signals instead of handling them within the block; only in the main thread."""
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop

@@ -1,78 +1,71 @@
-"""How a run of training goes: optimiser, schedule, precision and when it ends; and the presets."""
+"""Settings of a training run: stage, optimizer, schedule, precision and length; and the presets.
+
+The command line reads its defaults here, so this module imports no torch.
+"""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
-import torch
-from torch import nn
+Preset = Literal["default", "paper", "tiny"]
+Stage = Literal["reflectance", "geometry", "joint", "light-features", "diffuse-sh"]
 
 
 @dataclass(frozen=True)
 class AdamW:
-    """Of the presets `default` and `tiny`."""
+    """Optimizer of the presets `default` and `tiny`."""
 
     learning_rate: float = 1.5e-3
     betas: tuple[float, float] = (0.9, 0.98)
     weight_decay: float = 1e-4
 
-    def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-        """The optimiser of these weights."""
-        return torch.optim.AdamW(
-            parameters, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay
-        )
-
 
 @dataclass(frozen=True)
 class Adadelta:
-    """Of the preset `paper` (its 'Training'); rho and eps are TensorFlow's, which the paper used."""
+    """Optimizer of the preset `paper` (paper, 'Training'); rho and eps are TensorFlow's, which it used."""
 
     learning_rate: float = 0.05
     rho: float = 0.95
     eps: float = 1e-8
 
-    def build(self, parameters: Iterable[nn.Parameter]) -> torch.optim.Optimizer:
-        """The optimiser of these weights."""
-        return torch.optim.Adadelta(parameters, lr=self.learning_rate, rho=self.rho, eps=self.eps)
-
 
 @dataclass(frozen=True)
 class Cosine:
-    """Linear warm-up, then a half cosine over the steps or the time of the run down to `floor`."""
+    """Linear warm-up, then half a cosine down to `floor`, over the run's steps or time."""
 
     warmup_steps: int = 150
     floor: float = 0.02
 
     def factor(self, step: int, done: float) -> float:
-        """Of the learning rate at a step, counted from 0, when the share `done` of the run is over."""
+        """Factor of the learning rate at a step, from 0, when the share `done` of the run is over."""
         warm = min(1.0, (step + 1) / self.warmup_steps)
         return warm * (self.floor + (1 - self.floor) * 0.5 * (1 + math.cos(math.pi * min(done, 1.0))))
 
 
 @dataclass(frozen=True)
 class Constant:
-    """The same rate throughout."""
+    """Constant learning rate."""
 
     def factor(self, step: int, done: float) -> float:
-        """1."""
+        """Factor of the learning rate: 1."""
         return 1.0
 
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """What the loop goes by; its own values are the preset `default`."""
+    """Settings of the training loop; the defaults are the preset `default`."""
 
-    batch: int = 4  # of all processes together
+    batch: int = 4  # samples a step, of all processes together
     optimizer: AdamW | Adadelta = AdamW()
     schedule: Cosine | Constant = Cosine()
-    gradient_clip: float | None = 1.0  # longest norm; None: as it comes
-    ema_decay: float | None = 0.998  # of the weights that are validated and saved; None: the last ones
+    gradient_clip: float | None = 1.0  # largest norm; None: no clipping
+    ema_decay: float | None = 0.998  # of the weights that are validated and saved; None: not averaged
     bf16: bool = True
-    validate_every: int = 500
-    steps: int | None = None  # the run ends with whichever of these two comes first
+    validate_every: int = 500  # steps
+    steps: int | None = None  # the run ends after so many steps or max_seconds, whichever comes first
     max_seconds: float | None = None
     seed: int = 0
-    workers: int = 0  # processes that draw batches; 0: the loop itself
+    workers: int = 0  # processes that draw batches; 0: the training process itself
     compile: bool = False
 
     def done(self, step: int, seconds: float) -> float:
@@ -81,7 +74,7 @@ class TrainSettings:
         return max(by_steps, seconds / self.max_seconds if self.max_seconds else 0.0)
 
 
-PRESETS = {
+PRESETS: dict[Preset, TrainSettings] = {
     "default": TrainSettings(),
     "paper": TrainSettings(
         batch=1,
@@ -101,5 +94,5 @@ PRESETS = {
         validate_every=10,
     ),
 }
-# Settings that a run may be resumed with although it was begun with others.
+# Settings that may differ between a run and its resumption.
 MAY_CHANGE = frozenset({"steps", "max_seconds", "validate_every", "workers", "compile"})

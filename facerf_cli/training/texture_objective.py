@@ -1,6 +1,6 @@
-"""Stage `reflectance`: the Reflectance Network alone, in the chart, on the bank or a dataset's textures.
+"""Stage `reflectance`: the Reflectance Network alone, on textures of synthetic heads or of a dataset.
 
-With S_f the paper's feature loss on textures, L_L, joins the form's own.
+With S_f the paper's feature loss on textures, L_L, is added to the default form's loss.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,44 +17,44 @@ from facerf_cli.network.inputs import from_root, to_root
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
 from facerf_cli.synth.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 5
 
 
 @dataclass(frozen=True)
-class ChartSettings:
-    """Lights of a face and step; and held-out heads, each drawn `held_out_draws` times."""
+class TextureObjectiveSettings:
+    """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
 
     lights: int = 4
     held_out_heads: int = 12
     held_out_draws: int = 4
     held_out_lights: int = 6
-    light_features: float = 0.25  # weight of L_L, whose gradient is then a third of the rest's
+    light_features: float = 0.25  # weight of L_L; its gradient is then a third of the other term's
 
 
 @dataclass(frozen=True)
-class ChartBatch:
-    """Samples, and the numbers of their heads [B]."""
+class TextureBatch:
+    """Samples and the indices of their heads [B]."""
 
     sample: Sample
     heads: Tensor
 
-    def to(self, device: torch.device) -> "ChartBatch":
-        """The same batch on `device`."""
-        return ChartBatch(self.sample.to(device), self.heads)
+    def to(self, device: torch.device) -> "TextureBatch":
+        """Copy the batch to `device`."""
+        return TextureBatch(self.sample.to(device), self.heads)
 
 
-class ChartObjective(Objective):
-    """`root_loss` of OLAT textures at the network's own exposure; `light` is a frozen S_f."""
+class TextureObjective(Objective):
+    """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
 
     def __init__(
         self,
         source: SampleSource,
         network: nn.Module | None = None,
         light: LightNetwork | None = None,
-        settings: ChartSettings = ChartSettings(),
+        settings: TextureObjectiveSettings = TextureObjectiveSettings(),
     ) -> None:
         super().__init__()
         network = network or DefaultReflectanceNetwork()
@@ -69,23 +69,23 @@ class ChartObjective(Objective):
         self.heads, self.held_out = source.heads(settings.held_out_heads)
         self._validation: list[Sample] = []
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> ChartBatch:
-        """`count` faces, sample i with `generator_of(i)` alone."""
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> TextureBatch:
+        """Draw `count` faces, sample i from `generator_of(i)` alone."""
         samples, heads = [], []
         for i in range(count):
             generator = generator_of(i)
             head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
             samples.append(self.source.draw(head, self.settings.lights, generator))
             heads.append(head)
-        return ChartBatch(concatenate(samples), torch.cat(heads))
+        return TextureBatch(concatenate(samples), torch.cat(heads))
 
-    def forward(self, batch: ChartBatch) -> dict[str, Tensor]:
-        """The term `root`, a mean over faces."""
+    def forward(self, batch: TextureBatch) -> dict[str, Tensor]:
+        """Compute the term `root` and, with S_f, `light_features`, means over faces."""
         network, sample = self._network(), batch.sample
         with self.mixed_precision():
             encoded = network.encode(sample.source, sample.normals_source, sample.visible)
             root = _root(network, encoded, sample).float()
-        # The network divides by its own measure of exposure, which the fill of unseen texels does not enter.
+        # The network measures the exposure on seen texels alone, and divides by it.
         target = sample.target / encoded.exposure[:, None]
         terms = {"root": root_loss(root, target, sample.weight)}
         if self.light is not None:
@@ -98,9 +98,9 @@ class ChartObjective(Objective):
 
     @torch.no_grad()
     def validate(self) -> Validation:
-        """Mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
+        """Measure the mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
 
-        The sheet has a face in two rows: source and true OLATs, then what is seen of it and the predicted.
+        The sheet has two rows a face: source and true OLATs; visible source and predicted OLATs.
         """
         network = self._network()
         device = next(network.parameters()).device
@@ -115,10 +115,10 @@ class ChartObjective(Objective):
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
-        return Validation(_by_pose(torch.stack(errors), torch.tensor(same_pose)), np.concatenate(rows))
+        return Validation(metrics_by_pose(torch.stack(errors), torch.tensor(same_pose)), np.concatenate(rows))
 
     def _held_out(self) -> Iterator[Sample]:
-        """Always the same samples, one a face; drawn once."""
+        """Yield the held-out samples of one face each, drawn once."""
         lights = self.settings.held_out_lights
         if not self._validation:
             self._validation = [
@@ -136,24 +136,19 @@ def _set_mean_face(network: DefaultReflectanceNetwork, source: SampleSource) -> 
     try:
         network.set_mean_face(*source.mean_face())
     except ValueError as error:
-        raise InputError(f"{error}, as these heads were baked; give --bank or --start-from others") from None
+        raise InputError(f"{error}, as the heads were baked; give another --bank or --start-from") from None
 
 
 def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
-    """Roots [B, L, 3, T, T] at the normalised exposure, of either form."""
+    """Predicted roots [B, L, 3, T, T] at the network's exposure, for both forms of the network."""
     if isinstance(network, DefaultReflectanceNetwork):
         return network.decode_root(encoded, sample.normals_target, sample.lights)
     linear: Tensor = network.decode(encoded, sample.normals_target, sample.lights)
     return to_root(linear.float() / encoded.exposure[:, None])
 
 
-def _by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
-    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
-
-
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
-    """Two rows of pictures [2T, (L + 1) T, 3] of a sample's face."""
+    """Two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
     mask = (sample.weight[0] > 0).float()
     truth = torch.cat([sample.source[0], *(sample.target[0] * mask)], -1)
     guess = torch.cat([sample.source[0] * sample.visible[0], *(predicted[0] * mask)], -1)

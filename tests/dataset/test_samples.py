@@ -24,7 +24,7 @@ from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.loop import train
 from facerf_cli.training.settings import PRESETS
-from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
+from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 
 SIDE, LIGHTS = 32, 20
@@ -166,7 +166,9 @@ def test_a_changed_stack_or_a_damaged_texture_is_unwrapped_again(
 
 
 def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: DatasetTextures, tmp_path: Path) -> None:
-    objective = ChartObjective(lazy, DefaultReflectanceNetwork(NETWORK), settings=ChartSettings(lights=3))
+    objective = TextureObjective(
+        lazy, DefaultReflectanceNetwork(NETWORK), settings=TextureObjectiveSettings(lights=3)
+    )
     path = train(objective, tmp_path, replace(PRESETS["tiny"], steps=60, validate_every=100))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])

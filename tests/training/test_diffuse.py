@@ -8,8 +8,8 @@ from facerf_cli.training.diffuse_sh_objective import (
     DiffuseObjective,
     SumSettings,
     draw_sums,
-    explained,
-    summed,
+    predicted_images,
+    sum_lights,
 )
 from facerf_cli.training.objective import seeded
 
@@ -75,9 +75,9 @@ def test_an_albedo_lit_by_lambert_in_a_dome_is_explained_exactly() -> None:
     weights = (
         (1 + rig @ torch.tensor([0.5, -0.2, 0.4])).view(1, -1, 1) * torch.tensor([1.0, 0.6, 0.3]) / len(rig)
     )
-    batch = summed(sample, weights, torch.zeros(1))
+    batch = sum_lights(sample, weights, torch.zeros(1))
     estimate = DiffuseEstimate(albedo, batch.coefficients[:, 0], torch.ones(1, 1, 1, 1))
-    for image in explained(estimate, batch):
+    for image in predicted_images(estimate, batch):
         assert torch.allclose(image, batch.targets, rtol=0.02, atol=1e-4)
 
 

@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.downloads import Published
+from facerf_cli.files.downloads import PublishedFile
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
@@ -41,7 +41,7 @@ def test_imagenet_is_the_published_file_in_the_cache(
 ) -> None:
     asked = []
 
-    def fetched(published: Published, option: str) -> Path:
+    def fetched(published: PublishedFile, option: str) -> Path:
         asked.append((published, option))
         torch.save(weights, tmp_path / "vgg.pth")
         return tmp_path / "vgg.pth"
@@ -120,12 +120,12 @@ def test_a_checkpoint_without_light_features_is_refused(tmp_path: Path) -> None:
     network = DefaultReflectanceNetwork(DefaultReflectanceSettings(32, (8, 8), (8, 8), 2, 4))
     path = tmp_path / "last.safetensors"
     save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
-    with pytest.raises(InputError, match="holds no S_f; give one by `facerf train --stage light-features`"):
+    with pytest.raises(InputError, match="has no network light_features; give one of `facerf train"):
         load_light_features(path)
 
 
 def test_offline_names_the_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nowhere = Published("http://127.0.0.1:9/vgg16-397923af.pth", VGG16.sha256, VGG16.size_limit)
+    nowhere = PublishedFile("http://127.0.0.1:9/vgg16-397923af.pth", VGG16.sha256, VGG16.size_limit)
     monkeypatch.setattr(feature_networks, "VGG16", nowhere)
     monkeypatch.setattr("facerf_cli.files.downloads.cache_folder", lambda: tmp_path)
     with pytest.raises(FacerfError, match=r"cannot be fetched .*, or give --vgg-weights PATH$"):

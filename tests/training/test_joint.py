@@ -11,7 +11,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import draw_pairs
 from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import load_pairs, envmap_names, write_pairs
+from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
@@ -19,15 +19,10 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, Geome
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.sky.skies import ProceduralMaps
-from facerf_cli.training.joint_objective import (
-    JointObjective,
-    JointSettings,
-    pose_heads,
-    render_textures,
-    unwrap_images,
-)
+from facerf_cli.training.joint_objective import JointObjective, JointSettings
 from facerf_cli.training.losses import PaperWeights
 from facerf_cli.training.objective import seeded
+from facerf_cli.training.posed_heads import pose_heads, render_textures, unwrap_images
 from tests.dataset.dataset_fixture import write_small_dataset
 
 CROP_PX, SIDE = 48, 32

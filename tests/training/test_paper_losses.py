@@ -6,8 +6,8 @@ from torch import Tensor
 
 from facerf_cli.network.feature_networks import VggFeatures, feature_distance
 from facerf_cli.training.losses import (
+    MaskedPair,
     PaperWeights,
-    Seen,
     appearance_loss,
     closest_points,
     landmark_loss,
@@ -88,10 +88,10 @@ def net() -> VggFeatures:
     return VggFeatures(width=0.1).requires_grad_(False)
 
 
-def _seen(side: int) -> Seen:
+def _seen(side: int) -> MaskedPair:
     mask = torch.zeros(2, 1, side, side)
     mask[..., 2:-2] = 1
-    return Seen(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
+    return MaskedPair(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
 
 
 def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
@@ -109,7 +109,7 @@ def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
 def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:
     image, texture = _seen(24), _seen(16)
     target = texture.target.requires_grad_()
-    appearance_loss(net, image, Seen(texture.prediction, target, texture.mask)).sum().backward()
+    appearance_loss(net, image, MaskedPair(texture.prediction, target, texture.mask)).sum().backward()
     assert target.grad is None
     for seen in (image, texture):
         grad = seen.prediction.grad

@@ -13,7 +13,7 @@ from facerf_cli.synth.heads_bank import Bank
 from facerf_cli.training.loop import train
 from facerf_cli.training.objective import concatenate, seeded
 from facerf_cli.training.settings import PRESETS
-from facerf_cli.training.texture_objective import ChartObjective, ChartSettings
+from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 from tests.toy_faces import ToyFaces, toy_objective
 
 NETWORK = DefaultReflectanceSettings(
@@ -22,8 +22,8 @@ NETWORK = DefaultReflectanceSettings(
 
 
 def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> None:
-    settings = ChartSettings(lights=3, held_out_heads=2, held_out_draws=2)
-    objective = ChartObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
+    settings = TextureObjectiveSettings(lights=3, held_out_heads=2, held_out_draws=2)
+    objective = TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     train(objective, tmp_path, replace(PRESETS["tiny"], steps=60))
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     losses = torch.tensor([row["loss"] for row in rows])
@@ -50,8 +50,8 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_halves() -> None:
 
 
 def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apart(bank: Bank) -> None:
-    settings = ChartSettings(held_out_heads=2, held_out_draws=12)
-    objective = ChartObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
+    settings = TextureObjectiveSettings(held_out_heads=2, held_out_draws=12)
+    objective = TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), settings=settings)
     first, second = objective.validate(), objective.validate()
     assert first.metrics == second.metrics
     assert first.metrics.keys() == {"si_mse", "si_mse_same_pose", "si_mse_other_pose"}
@@ -62,8 +62,8 @@ def test_validation_measures_the_same_samples_every_time_and_tells_the_poses_apa
 def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
     torch.manual_seed(0)
     light = LightNetwork(LightSettings(width=0.05, grid=4, hidden=8)).eval().requires_grad_(False)
-    settings = ChartSettings(lights=2, held_out_heads=3)
-    objective = ChartObjective(ToyFaces(), toy_objective().networks["reflectance"], light, settings)
+    settings = TextureObjectiveSettings(lights=2, held_out_heads=3)
+    objective = TextureObjective(ToyFaces(), toy_objective().networks["reflectance"], light, settings)
     batch = objective.draw(2, lambda i: seeded(1, i), 1)
     terms = objective(batch)
     assert terms.keys() == {"root", "light_features"} and float(terms["light_features"].detach()) > 0
@@ -74,9 +74,11 @@ def test_the_loss_on_features_pulls_the_prediction_toward_the_target() -> None:
     assert "light" not in objective.networks
 
 
-def test_the_papers_form_trains_in_the_chart(tmp_path: Path) -> None:
+def test_the_papers_form_trains_on_textures(tmp_path: Path) -> None:
     network = PaperReflectanceNetwork(PaperReflectanceSettings(16, (8, 8), 8))
-    objective = ChartObjective(ToyFaces(), network, settings=ChartSettings(lights=2, held_out_heads=3))
+    objective = TextureObjective(
+        ToyFaces(), network, settings=TextureObjectiveSettings(lights=2, held_out_heads=3)
+    )
     loss = objective(objective.draw(2, lambda i: seeded(1, i), 1))["root"]
     loss.backward()
     assert loss.isfinite() and all(p.grad is not None for p in network.parameters())
@@ -85,8 +87,10 @@ def test_the_papers_form_trains_in_the_chart(tmp_path: Path) -> None:
 @pytest.mark.parametrize("normals", [True, False])
 def test_without_normals_the_network_does_not_see_them(normals: bool) -> None:
     torch.manual_seed(0)
-    settings = DefaultReflectanceSettings(16, (8, 8), (8, 8), template_channels=1, rig_lights=8, normals=normals)
-    objective = ChartObjective(ToyFaces(), DefaultReflectanceNetwork(settings))
+    settings = DefaultReflectanceSettings(
+        16, (8, 8), (8, 8), template_channels=1, rig_lights=8, normals=normals
+    )
+    objective = TextureObjective(ToyFaces(), DefaultReflectanceNetwork(settings))
     sample = objective.draw(1, lambda i: seeded(1, i), 1).sample
     network = objective.networks["reflectance"]
     turned = sample.normals_source.flip(-1) * torch.tensor([-1.0, 1, 1]).view(3, 1, 1)

@@ -14,8 +14,8 @@ import torch.multiprocessing as mp
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_networks
-from facerf_cli.training.batches import drawn_batches, joined_processes
-from facerf_cli.training.loop import Start, train
+from facerf_cli.training.loop import Start, drawn_batches, train
+from facerf_cli.training.processes import joined_processes
 from facerf_cli.training.settings import PRESETS, Adadelta, TrainSettings
 from tests.toy_faces import toy_objective
 
@@ -111,7 +111,7 @@ import os, signal, sys, torch
 sys.modules["tensorboard"] = None
 from facerf_cli.training import loop as training
 from facerf_cli.training import state
-from tests.training.test_training import TINY, toy_objective
+from tests.training.test_loop import TINY, toy_objective
 from pathlib import Path
 calls = 0
 def dies(function, at):
@@ -155,7 +155,7 @@ def test_a_run_is_not_written_over_nor_resumed_otherwise(tmp_path: Path) -> None
     train(toy_objective(), tmp_path, replace(TINY, steps=1))
     with pytest.raises(UsageError, match="holds a run already; give --resume"):
         train(toy_objective(), tmp_path, TINY)
-    with pytest.raises(UsageError, match="was begun with batch 2; resume it with the same options"):
+    with pytest.raises(UsageError, match="the run began with batch 2; resume it with the same options"):
         train(toy_objective(), tmp_path, replace(TINY, batch=4), resume=True)
     (tmp_path / "state.pt").write_bytes((tmp_path / "state.pt").read_bytes()[:2000])
     with pytest.raises(InputError, match=r"state\.pt: cannot be resumed") as caught:
@@ -252,7 +252,7 @@ def _free_port() -> int:
 
 def test_a_batch_is_shared_in_equal_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("facerf_cli.training.loop.process_count", lambda: 3)
-    with pytest.raises(UsageError, match="3 processes cannot share a batch of 2"):
+    with pytest.raises(UsageError, match="--batch 2: 3 processes cannot share it"):
         train(toy_objective(), tmp_path, TINY)
 
 
