@@ -122,8 +122,8 @@ def test_what_cannot_be_used_is_one_line(
         2, line(dataset, maps=str(tmp_path / "empty"))
     )
     assert "write procedural:N" in says(2, line(dataset, maps="procedural:0"))
-    assert "1000000 are the most" in says(2, line(dataset, maps="procedural:999999999"))
-    assert "--memory inf: give a number" in says(2, line(dataset, "--memory", "inf"))
+    assert "give at most 1000000" in says(2, line(dataset, maps="procedural:999999999"))
+    assert "--memory inf: not a size; give a number" in says(2, line(dataset, "--memory", "inf"))
     assert "dataset.json: no such file" in says(1, line(tmp_path / "empty"))
     assert "--envmaps nowhere: no such folder" in says(2, line(dataset, maps="nowhere"))
     assert main(line(dataset, images=1)) == 0

@@ -16,7 +16,7 @@ from tests.dataset.dataset_fixture import write_small_dataset
 def test_a_bad_time_is_refused(tmp_path: Path, time: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "-o", str(tmp_path / "run"), f"--max-time={time}"]) == 2
     assert capsys.readouterr().err.strip().splitlines() == [
-        f"facerf: error: --max-time {time}: write a number and s, m or h, such as 45m"
+        f"facerf: error: --max-time {time}: not a time; write a number and s, m or h, such as 45m"
     ]
     assert not (tmp_path / "run").exists()
 
@@ -54,35 +54,38 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
     [
         (
             ["--dataset", "d", "--heads", "20"],
-            "--heads is for synthetic heads, and --dataset takes",
+            "--heads: is for synthetic heads, which --dataset replaces",
         ),
-        (["--dataset", "d", "--bank", "b"], "--bank is for synthetic heads, and --dataset takes their place"),
-        (["--dataset", "d", "--heads-from", "builtin"], "--heads-from is for synthetic heads"),
-        (["--dataset", "d", "--views", "2"], "--views is for synthetic heads"),
-        (["--texture-size", "64"], "--texture-size is for a prepared dataset; give --dataset"),
-        (["--preset", "paper"], "the stage joint learns from a prepared dataset; give --dataset"),
-        (["--stage", "joint", "--dataset", "d", "--heads", "20"], "--heads means nothing to the stage joint"),
+        (["--dataset", "d", "--bank", "b"], "--bank: is for synthetic heads, which --dataset replaces"),
+        (["--dataset", "d", "--heads-from", "builtin"], "--heads-from: is for synthetic heads"),
+        (["--dataset", "d", "--views", "2"], "--views: is for synthetic heads"),
+        (["--texture-size", "64"], "--texture-size: applies to a dataset; give --dataset, too"),
+        (["--preset", "paper"], "--stage joint: needs a prepared dataset; give --dataset"),
+        (
+            ["--stage", "joint", "--dataset", "d", "--heads", "20"],
+            "--heads: does not apply to the stage",
+        ),
         (
             ["--stage", "joint", "--dataset", "d", "--fit-with", "m"],
-            "--fit-with means nothing to the stage joint",
+            "--fit-with: does not apply to the stage joint",
         ),
-        (["--stage", "geometry", "--dataset", "d"], "--dataset means nothing to the stage geometry"),
-        (["--vgg-weights", "imagenet"], "--vgg-weights means nothing to the stage reflectance"),
-        (["--photos", "p"], "--photos means nothing to the stage reflectance"),
+        (["--stage", "geometry", "--dataset", "d"], "--dataset: does not apply to the stage geometry"),
+        (["--vgg-weights", "imagenet"], "--vgg-weights: does not apply to the stage reflectance"),
+        (["--photos", "p"], "--photos: does not apply to the stage reflectance"),
         (
             ["--stage", "light-features", "--mean-face"],
-            "--mean-face means nothing to the stage light",
+            "--mean-face: does not apply to the stage light",
         ),
         (
             ["--stage", "diffuse-sh", "--without-normals"],
-            "--without-normals means nothing to the stage diffuse-sh",
+            "--without-normals: does not apply to the stage diffuse-sh",
         ),
-        (["--dataset", "d", "--mean-face"], "--mean-face: a dataset was fitted already"),
+        (["--dataset", "d", "--mean-face"], "--mean-face: the dataset is fitted already"),
         (
             ["--without-normals", "--start-from", "f"],
-            "--without-normals: the networks of --start-from",
+            "--without-normals: --start-from fixes",
         ),
-        (["--max-time", "0s"], "--max-time 0s: write a number and s, m or h, such as 45m"),
+        (["--max-time", "0s"], "--max-time 0s: not a time; write a number and s, m or h, such as 45m"),
         (["--heads", "13"], "--heads 13: the mean face and 12 heads are held out; give more"),
     ],
 )
@@ -150,9 +153,9 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert main([*line, "--steps", "3"]) == 2
     assert "holds a run already; give --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--batch", "3"]) == 2
-    assert "this run was begun with batch 2" in capsys.readouterr().err
+    assert "the run began with batch 2" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
-    assert "this run was begun on other data" in capsys.readouterr().err
+    assert "the run began with other data" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,166 +1,179 @@
-"""What `facerf train` trains: an objective, its networks and its data, from the options.
+"""One run of `facerf train`: the objective of its stage, with networks and data, and the training loop."""
 
-How a run of training shows itself: a bar on a terminal, a line a validation elsewhere.
-"""
-
-import logging
-from dataclasses import dataclass, field, replace
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
-from facerf_cli.cli.options import Settings
+import torch
+from torch import nn
+
+from facerf_cli.cli.batch import PHOTO_SUFFIXES, collect_items
+from facerf_cli.cli.items.train_progress import TrainProgress
+from facerf_cli.cli.options import torch_device
+from facerf_cli.cli.train import TrainOptions
+from facerf_cli.dataset.crops import mean_translation_m
+from facerf_cli.dataset.dataset import read_dataset
+from facerf_cli.dataset.photos import Photos, open_photos
+from facerf_cli.dataset.samples import open_dataset_textures
 from facerf_cli.errors import UsageError
-from facerf_cli.logs import LOGGER_NAME, STDERR
+from facerf_cli.face.morphable import load_face_model, save_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.light.sphere import RIG_LIGHTS
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
+from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
+from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
+from facerf_cli.synth.face_crops import RenderedFaces
+from facerf_cli.synth.head_images import add_head_images
+from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
+from facerf_cli.synth.texture_samples import SampleSource
+from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
+from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
+from facerf_cli.training.joint_objective import JointObjective, JointSettings
+from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
+from facerf_cli.training.loop import Start, train
+from facerf_cli.training.objective import Objective
+from facerf_cli.training.pretrained import load_light_features, load_vgg
+from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
+from facerf_cli.training.run_folder import refuse_another_run
+from facerf_cli.training.settings import Preset, Stage
+from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 
-if TYPE_CHECKING:
-    from torch import nn
-
-    from facerf_cli.synth.heads_bank import Bank
-    from facerf_cli.synth.texture_samples import SampleSource
-    from facerf_cli.training.objective import Objective
-
-Preset = Literal["default", "paper", "tiny"]
-Stage = Literal["reflectance", "geometry", "joint", "light-features", "diffuse-sh"]
+_WORKERS_ON_GPU = 4
 _TINY_WIDTHS = (8, 12, 16)
-_TINY_LIGHTS = 20  # of the rig that heads are baked under
+_TINY_LIGHTS = 20  # of the rig that the preset `tiny` bakes heads under
+
+Networks = dict[str, nn.Module]  # by name; of --start-from
 
 
 @dataclass(frozen=True)
-class _Sizes:
-    """Of what a preset draws."""
+class _PresetSizes:
+    """Amounts of data and sizes of networks of a preset."""
 
     heads: int = 240
     views: int = 8
-    images: int = 24  # of a head, for the Geometry Network
+    images: int = 24  # of each head, for the Geometry Network
     joint_side: int = 256  # of the stage joint's crops and textures
     held_out_heads: int = 12
     light_width: float = 0.25  # of S_f; 1 is VGG-16's
 
 
-_SIZES: dict[Preset, _Sizes] = {
-    "default": _Sizes(),
-    "paper": _Sizes(joint_side=512, light_width=1.0),
-    "tiny": _Sizes(heads=16, views=2, images=2, joint_side=64, held_out_heads=4, light_width=0.05),
+_SIZES: dict[Preset, _PresetSizes] = {
+    "default": _PresetSizes(),
+    "paper": _PresetSizes(joint_side=512, light_width=1.0),
+    "tiny": _PresetSizes(heads=16, views=2, images=2, joint_side=64, held_out_heads=4, light_width=0.05),
 }
 
 
-@dataclass(frozen=True)
-class TrainOptions:
-    """The line, checked; `networks` are those of --start-from."""
-
-    output: Path
-    preset: Preset
-    stage: Stage
-    dataset: Path | None
-    heads_from: str
-    fit_with: str
-    heads: int | None
-    views: int | None
-    bank: Path | None
-    texture_size: int
-    photos: Path | None
-    vgg_weights: str | None
-    light_features: Path | None
-    without_normals: bool
-    mean_face: bool
-    jobs: int
-    settings: Settings
-    networks: dict[str, "nn.Module"] = field(default_factory=dict)
-
-    @property
-    def sizes(self) -> _Sizes:
-        """The preset's, and what the line says of them."""
-        preset = _SIZES[self.preset]
-        return replace(preset, heads=self.heads or preset.heads, views=self.views or preset.views)
+def run_training(options: TrainOptions) -> None:
+    """Train in this process or, under torchrun, in several, and print the path of the last checkpoint."""
+    with joined_processes():
+        device, first = torch_device(options.settings), process_rank() == 0
+        training = replace(options.training, workers=_workers(options, device))
+        networks, start = _load_start(options.start_from, options.stage)
+        with first_process_first():
+            if first and not options.resume:
+                refuse_another_run(options.output)  # before hours of baking
+            objective = _build_objective(options, networks)
+        with TrainProgress(training.steps, training.max_seconds, options.settings, first) as progress:
+            checkpoint = train(
+                objective, options.output, training, start, options.resume, device, progress.row
+            )
+        if first:
+            print(checkpoint)
 
 
-def build_objective(options: TrainOptions) -> "Objective":
-    """The stage's objective; bakes, unwraps and finds whatever it draws from, where that is missing."""
+def _workers(options: TrainOptions, device: torch.device) -> int:
+    if options.workers is not None:
+        return options.workers
+    return _WORKERS_ON_GPU if device.type == "cuda" else int((os.cpu_count() or 1) > 1)
+
+
+def _load_start(path: Path | None, stage: Stage) -> tuple[Networks, Start]:
+    """Load a checkpoint: the networks that the stage trains, and the content that the run copies."""
+    if path is None:
+        return {}, Start()
+    networks, metadata = load_networks(path, LAYOUT_VERSION)
+    names = ("reflectance", "geometry") if stage == "joint" else (stage.replace("-", "_"),)
+    trained = {name: network for name, network in networks.items() if name in names}
+    return trained, Start({k: v for k, v in networks.items() if k not in names}, metadata)
+
+
+def _sizes(options: TrainOptions) -> _PresetSizes:
+    """Sizes of the preset, with --heads and --views if given."""
+    preset = _SIZES[options.preset]
+    return replace(preset, heads=options.heads or preset.heads, views=options.views or preset.views)
+
+
+def _build_objective(options: TrainOptions, networks: Networks) -> Objective:
+    """Make the stage's objective; bake, unwrap or detect its data where that is missing."""
     builders = {
-        "reflectance": _chart,
+        "reflectance": _texture,
         "geometry": _geometry,
         "light-features": _light_features,
         "joint": _joint,
         "diffuse-sh": _diffuse_sh,
     }
-    return builders[options.stage](options)
+    return builders[options.stage](options, networks)
 
 
-def trained_networks(stage: Stage) -> tuple[str, ...]:
-    """Names of the networks that a stage trains."""
-    return ("reflectance", "geometry") if stage == "joint" else (stage.replace("-", "_"),)
-
-
-def _chart(options: TrainOptions) -> "Objective":
-    from facerf_cli.training.pretrained import load_light_features
-    from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
-
+def _texture(options: TrainOptions, networks: Networks) -> Objective:
     light = load_light_features(options.light_features) if options.light_features else None
-    network = options.networks.get("reflectance") or _reflectance(options)
-    settings = TextureObjectiveSettings(held_out_heads=options.sizes.held_out_heads)
+    network = networks.get("reflectance") or _reflectance_network(options)
+    settings = TextureObjectiveSettings(held_out_heads=_sizes(options).held_out_heads)
     return TextureObjective(_samples(options), network, light, settings)
 
 
-def _light_features(options: TrainOptions) -> "Objective":
-    from facerf_cli.network.feature_networks import LightNetwork, LightSettings
-    from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
-
-    network: Any = options.networks.get("light_features")
-    network = network or LightNetwork(LightSettings(width=options.sizes.light_width))
-    settings = LightFeaturesSettings(held_out_heads=options.sizes.held_out_heads)
+def _light_features(options: TrainOptions, networks: Networks) -> Objective:
+    sizes = _sizes(options)
+    network: Any = networks.get("light_features")
+    network = network or LightNetwork(LightSettings(width=sizes.light_width))
+    settings = LightFeaturesSettings(held_out_heads=sizes.held_out_heads)
     return LightFeaturesObjective(_samples(options), network, settings)
 
 
-def _diffuse_sh(options: TrainOptions) -> "Objective":
-    from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
-    from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
-
+def _diffuse_sh(options: TrainOptions, networks: Networks) -> Objective:
     sizes = DiffuseSettings()
     if options.preset == "tiny":
         sizes = DiffuseSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 4, 4, 16)
-    network: Any = options.networks.get("diffuse_sh") or DiffuseNetwork(sizes)
-    settings = SumSettings(held_out_heads=options.sizes.held_out_heads)
+    network: Any = networks.get("diffuse_sh") or DiffuseNetwork(sizes)
+    settings = SumSettings(held_out_heads=_sizes(options).held_out_heads)
     return DiffuseObjective(_samples(options), network, settings)
 
 
-def _geometry(options: TrainOptions) -> "Objective":
-    from facerf_cli.synth.face_crops import RenderedFaces
-    from facerf_cli.synth.head_images import add_head_images
-    from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
-
-    folder = options.bank or options.output / "bank"
-    provenance, sizes = _bake(options, folder), options.sizes
+def _geometry(options: TrainOptions, networks: Networks) -> Objective:
+    folder, sizes = _bank_folder(options), _sizes(options)
+    provenance = _bake(options, folder)
     images = folder / "pictures"
     add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
     faces = RenderedFaces(images, provenance)
-    network: Any = options.networks.get("geometry")
+    network: Any = networks.get("geometry")
     network = network or _geometry_network(options, faces.mean_translation_m())
     settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
     return GeometryObjective(faces, network, settings)
 
 
-def _joint(options: TrainOptions) -> "Objective":
-    from facerf_cli.dataset.crops import mean_translation_m
-    from facerf_cli.dataset.dataset import read_dataset
-    from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.training.joint_objective import JointObjective, JointSettings
-    from facerf_cli.training.pretrained import load_light_features, load_vgg
-
+def _joint(options: TrainOptions, networks: Networks) -> Objective:
     assert options.dataset
     dataset = read_dataset(options.dataset)
-    vgg = options.vgg_weights is not None or options.preset == "paper"  # which does not go without
-    appearance = load_vgg(options.vgg_weights) if vgg else None
+    needs_vgg = options.vgg_weights is not None or options.preset == "paper"
+    appearance = load_vgg(options.vgg_weights) if needs_vgg else None
     if options.preset == "paper" and options.light_features is None:
         raise UsageError(
-            "the paper's loss wants S_f: give --light-features FILE, which "
-            "`facerf train --stage light-features` makes, or take another preset"
+            "--preset paper: its loss needs S_f; give --light-features FILE, a checkpoint of "
+            "`facerf train --stage light-features`, or another preset"
         )
-    side = options.sizes.joint_side
+    side = _sizes(options).joint_side
     return JointObjective(
         dataset,
-        load_face_model(),  # a Geometry Network's, whatever the dataset was fitted with
-        options.networks.get("reflectance") or _reflectance(options),
-        options.networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
+        load_face_model(),  # the built-in one, for the Geometry Network, whatever the dataset is fitted with
+        networks.get("reflectance") or _reflectance_network(options),
+        networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
         appearance,
         load_light_features(options.light_features) if options.light_features else None,
         _photos(options, side),
@@ -168,10 +181,7 @@ def _joint(options: TrainOptions) -> "Objective":
     )
 
 
-def _photos(options: TrainOptions, side: int) -> Any:
-    from facerf_cli.cli.batch import PHOTO_SUFFIXES, collect_items
-    from facerf_cli.dataset.photos import open_photos
-
+def _photos(options: TrainOptions, side: int) -> Photos | None:
     if options.photos is None:
         return None
     items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
@@ -179,10 +189,7 @@ def _photos(options: TrainOptions, side: int) -> Any:
     return open_photos(paths, options.output / "photos", side, options.jobs)
 
 
-def _reflectance(options: TrainOptions) -> Any:
-    from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
-    from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
-
+def _reflectance_network(options: TrainOptions) -> nn.Module:
     normals = not options.without_normals
     if options.preset == "paper":
         return PaperReflectanceNetwork(PaperReflectanceSettings(normals=normals))
@@ -193,52 +200,46 @@ def _reflectance(options: TrainOptions) -> Any:
     return DefaultReflectanceNetwork(DefaultReflectanceSettings(normals=normals))
 
 
-def _geometry_network(options: TrainOptions, mean_m: tuple[float, float, float] | None = None) -> Any:
-    from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-
+def _geometry_network(options: TrainOptions, mean_translation_m: tuple[float, float, float]) -> nn.Module:
     form: Any = "paper" if options.preset == "paper" else "default"
-    return GeometryNetwork(GeometryNetworkSettings(form, mean_translation_m=mean_m or (0.0, 0.0, -1.1)))
+    return GeometryNetwork(GeometryNetworkSettings(form, mean_translation_m=mean_translation_m))
 
 
-def _samples(options: TrainOptions) -> "SampleSource":
-    """A dataset's textures, or the bank."""
-    from facerf_cli.dataset.samples import open_dataset_textures
-    from facerf_cli.light.sphere import RIG_LIGHTS
-
+def _samples(options: TrainOptions) -> SampleSource:
+    """Open a dataset's textures, or the bank of synthetic heads."""
     if options.dataset:
-        rig = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS  # of the mean face's shadows
+        rig_lights = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS
         return open_dataset_textures(
-            options.dataset, options.fit_with, options.texture_size, options.jobs, rig
+            options.dataset, options.fit_with, options.texture_size, options.jobs, rig_lights
         )
-    return _fill_bank(options, options.bank or options.output / "bank")
+    return _fill_bank(options, _bank_folder(options))
 
 
-def _fill_bank(options: TrainOptions, folder: Path) -> "Bank":
-    from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.synth.heads_bank import add_views, load_bank
+def _bank_folder(options: TrainOptions) -> Path:
+    return options.bank or options.output / "bank"
 
+
+def _fill_bank(options: TrainOptions, folder: Path) -> Bank:
+    """Bake the heads and fit the views that are missing, and open the bank."""
     provenance = _bake(options, folder)
-    fitted_with = _mean_model(options, folder) if options.mean_face else options.fit_with
+    fitted_with = _save_pose_model(options, folder) if options.mean_face else options.fit_with
     fitted = load_face_model(fitted_with)
-    views = folder / f"views-{fitted.name}"
-    add_views(folder / "heads", views, fitted_with, options.sizes.views, options.jobs, options.settings.seed)
+    views, count = folder / f"views-{fitted.name}", _sizes(options).views
+    add_views(folder / "heads", views, fitted_with, count, options.jobs, options.settings.seed)
     fit = {"fitted_with": fitted.credit, "skin": "procedural (facerf)"}
     return load_bank(folder / "heads", views, provenance | fit)
 
 
 def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
-    """Bake the heads that are missing; what they are made of."""
-    from facerf_cli.face.morphable import load_face_model
-    from facerf_cli.light.transport import BakeSettings
-    from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
-
-    heads, held_out, bake = options.sizes.heads, options.sizes.held_out_heads, HeadBakeSettings()
+    """Bake the heads that are missing; return their provenance."""
+    sizes, bake = _sizes(options), HeadBakeSettings()
+    heads, held_out = sizes.heads, sizes.held_out_heads
     if heads < held_out + 2:
         raise UsageError(f"--heads {heads}: the mean face and {held_out} heads are held out; give more")
     if options.preset == "tiny":
         bake = HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
     drawn = load_face_model(options.heads_from)
-    load_face_model(options.fit_with)  # a bad one is named before anything is baked
+    load_face_model(options.fit_with)  # raises for an invalid model before anything is baked
     bake_heads(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
     found = len(list((folder / "heads").glob("*.safetensors")))
     return {
@@ -247,76 +248,9 @@ def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     }
 
 
-def _mean_model(options: TrainOptions, folder: Path) -> str:
-    """The face model to fit with, with shapes that do nothing: its fit is a pose."""
-    from facerf_cli.face.morphable import load_face_model, save_face_model
-
+def _save_pose_model(options: TrainOptions, folder: Path) -> str:
+    """Save the face model of --fit-with without shapes, with which a fit is a pose alone; return its path."""
     still = load_face_model(options.fit_with).pose_only()
     path = folder / f"{still.name}.npz"
     save_face_model(path, still)
     return str(path)
-
-
-_SMOOTH = 0.95  # of the losses that are shown
-log = logging.getLogger(LOGGER_NAME)
-
-
-class TrainProgress:
-    """Step, losses, the last validation, the share of time that waited for data, and the time left."""
-
-    def __init__(self, steps: int | None, max_seconds: float | None, settings: Settings, shown: bool) -> None:
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[left]}"),
-        )
-        self.on = shown and STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-        self.steps, self.max_seconds = steps, max_seconds
-        self.bar = Progress(*columns, console=STDERR, disable=not self.on)
-        self.task = self.bar.add_task("training", total=1.0, left="")
-        self.smooth: dict[str, float] = {}
-        self.validation = ""
-        self.begun: tuple[int, float] | None = None
-
-    def __enter__(self) -> "TrainProgress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.bar.stop()
-
-    def row(self, row: dict[str, Any]) -> None:
-        """Show one row of the log."""
-        losses = {"loss": row["loss"], **(row["terms"] if len(row["terms"]) > 1 else {})}
-        for name, value in losses.items():
-            self.smooth[name] = _SMOOTH * self.smooth.get(name, value) + (1 - _SMOOTH) * value
-        words = "  ".join(f"{name} {value:.4g}" for name, value in self.smooth.items())
-        if "validation" in row:
-            self.validation = "  ".join(f"{name} {value:.4g}" for name, value in row["validation"].items())
-            if not self.on:
-                log.info("step %d  %s  |  %s", row["step"], words, self.validation)
-        text = f"step {row['step']}  {words}  waiting {100 * row['waiting']:.0f} %"
-        text += f"  |  {self.validation}" if self.validation else ""
-        left_s = self._left_s(row)
-        done = 0.0 if left_s is None else row["seconds"] / max(row["seconds"] + left_s, 1e-9)
-        left = "" if left_s is None else f"{_clock(left_s)} left"
-        self.bar.update(self.task, completed=done, description=text, left=left)
-
-    def _left_s(self, row: dict[str, Any]) -> float | None:
-        """By the pace of this leg, or by the clock, whichever ends first; None while it has no pace yet."""
-        self.begun = self.begun or (row["step"], row["seconds"])
-        steps = row["step"] - self.begun[0]
-        left = []
-        if self.max_seconds:
-            left.append(self.max_seconds - row["seconds"])
-        if self.steps and steps:
-            left.append((self.steps - row["step"]) * (row["seconds"] - self.begun[1]) / steps)
-        return max(0.0, min(left)) if left else None
-
-
-def _clock(seconds: float) -> str:
-    minutes = int(seconds) // 60
-    return f"{minutes // 60}:{minutes % 60:02d}:{int(seconds) % 60:02d}"

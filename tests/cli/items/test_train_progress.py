@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from facerf_cli.cli.items.train import TrainProgress
+from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import Settings
 
 
