@@ -1,4 +1,4 @@
-"""Light directions for a draft of stage.json, from a list of lights beside the images.
+"""Light directions for a draft of stage.json, from a list of lights next to the images.
 
 A list has lines `name x y z` or `x y z`, x to the image's right, y up, z toward the camera: an LP file of
 reflectance transformation imaging, whose first line is the number of lines that follow, or a plain text file.

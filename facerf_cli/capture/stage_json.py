@@ -1,4 +1,4 @@
-"""Reader of `stage.json`, the description of a capture that stands beside its images.
+"""Reader of `stage.json`, the description of a capture that stands next to its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
      "colour_space": "lin_rec709", "black_level": 0.0,

@@ -1,4 +1,4 @@
-"""Directions of lights from lists beside the images."""
+"""Directions of lights from lists next to the images."""
 
 from pathlib import Path
 

@@ -74,7 +74,9 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
 def test_strict_stops_for_a_warning(capture: Path, tmp_path: Path, capsys: Said, plant: Plant) -> None:
     plant(CLIPPED)
     assert prepare(capture, tmp_path, "--strict") == 1
-    assert "0001/C0: clipped: 3 frames are clipped; without --strict it is a warning" in capsys.readouterr().err
+    assert (
+        "0001/C0: clipped: 3 frames are clipped; without --strict it is a warning" in capsys.readouterr().err
+    )
     assert read_dataset(tmp_path).subjects == ("0000",)
 
 
@@ -122,7 +124,11 @@ def test_only_checks_write_their_findings_and_nothing_else(
 def test_only_checks_have_no_shards(capture: Path, tmp_path: Path, capsys: Said) -> None:
     assert prepare(capture, tmp_path / "out", "--checks", "only", "--shard", "1/2") == 2
     said = capsys.readouterr().err
-    assert "--shard: --checks only checks all subjects; omit it" in said and said.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert (
+        "--shard: --checks only checks all subjects; omit it" in said
+        and said.count("\n") == 1
+        and not (tmp_path / "out").exists()
+    )
 
 
 def test_real_checks_in_processes_find_the_missing_frame(capture: Path, tmp_path: Path, capsys: Said) -> None:

@@ -124,7 +124,10 @@ def test_a_file_is_no_dataset(wrong: Path, tmp_path: Path, capsys: Said) -> None
         (["--colour-chart", "chart.exr", "--chart-corners", "0,0 900,0 900,9 0,9"], "outside its 330 x 240"),
         (["--colour-chart", "0000/C0/L000.exr"], "no ColorChecker Classic found"),
         (["--chart-corners", "1,2 3,4 5,6 7,8"], "give --colour-chart too"),
-        (["--colour-chart", "{camera}.exr", "--chart-corners", "1,2 3,4 5,6 7,8"], "names an image per camera"),
+        (
+            ["--colour-chart", "{camera}.exr", "--chart-corners", "1,2 3,4 5,6 7,8"],
+            "names an image per camera",
+        ),
     ],
 )
 def test_wrong_charts_stop_the_run(
