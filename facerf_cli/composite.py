@@ -8,7 +8,8 @@ the relit one R, a photo pixel P becomes
 
 For bright sources both are the quotient P R / S. Where the source is nearly black the quotient would be
 noise, and e, a small share of the source's mean, keeps the pixel near R. Under the photo's own light (R = S)
-the photo comes back. Every step is linear in R, so two lights composed apart add up to both composed at once.
+the photo comes back. Hair and background follow by `Surround`. All steps are linear in light: two lights
+composed apart add up to both composed at once.
 """
 
 from collections.abc import Mapping
@@ -41,6 +42,7 @@ _SURROUND = 3  # crops along each side of the square in which hair and backgroun
 _SURROUND_PX = 64  # pixels along a crop there
 _SPREAD = 0.04  # standard deviation of the blur of the change of light, in crop sides
 _REACH = 0.22  # of that change to the side, in crop sides; beyond it all follows the mean change
+_DARKER, _BRIGHTER = 12.0, 1.6  # that change is at most so far below and above the mean change of a light
 _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and below are hair and neck
 
 
@@ -60,6 +62,17 @@ class Target:
 
 
 AS_IN_PHOTO = Target()
+
+
+@dataclass(frozen=True, eq=False)
+class Relit:
+    """A head under one light: its texture [3, T, T], and the change of light around it (`Surround`).
+
+    `surround` [3, s, s] is None where nothing around the head follows the light.
+    """
+
+    texture: Tensor
+    surround: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,35 +102,38 @@ class Composition:
         self._face, self._target = head.face, target
         self._detail = None if self._photo is None else PhotoDetail(self._photo, head.face, self.view)
         follows = self._photo is not None and not target.keep_background
-        self._surround = Surround(vertices, crop, *size_px) if follows else None
+        self.surround = Surround(vertices, crop, head.face.texture, *size_px) if follows else None
         self._mask = self.view.full(self.view.mask)
         self._layers = {"face.A": self._mask} if self._photo is not None else {}
         places = {"normal": self.view.normal, "position": self.view.position_m, "uv": self.view.uv}
         self._layers |= {name: self.view.full(values) for name, values in places.items()}
 
-    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
-        """The head in its frame under `light`, whose relit texture [3, T, T] is given.
+    def image(self, light: RigLight, relit: Relit) -> RelitImage:
+        """The head in its frame under `light`, as relit by it.
 
-        The change of light around the face is read from the texture; `light` is for relighters of what lies
-        around it.
+        What is relit determines the image; `light` is for relighters of what lies around the face.
         """
         if self._photo is None or self._detail is None:
-            return RelitImage(self.view.full(self.view.render(relit)), self._mask, self._layers)
-        surround = np.float32(1) if self._surround is None else self._surround.gain(self._face.texture, relit)
-        result = self._photo * surround
+            return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask, self._layers)
+        result = self._photo.copy()
+        if self.surround is not None and relit.surround is not None:
+            result *= self.surround.over_photo(relit.surround)
         mask = self.view.mask.numpy()[..., None]
-        result[self.view.window] += mask * (self._detail.relit(relit) - result[self.view.window])
+        result[self.view.window] += mask * (self._detail.relit(relit.texture) - result[self.view.window])
         if (matte := self._target.matte) is not None:
             result = self._photo + matte[..., None] * (result - self._photo)
         return RelitImage(result, None, self._layers)
 
-    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
         """The image's pixels at an exposure in EV; where the photo is kept, of its new light."""
         gain = 2**ev
-        return self.image(light, relit * gain).pixels if self._keeps_photo else image.pixels * gain
+        if not self._keeps_photo:
+            return image.pixels * gain
+        surround = None if relit.surround is None else relit.surround * gain
+        return self.image(light, Relit(relit.texture * gain, surround)).pixels
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
-        """The exposure that shows the lit face well; in a kept photo, as bright as the face was there."""
+        """The exposure that shows the lit face well; in a kept photo, as bright as it was there."""
         chosen_ev = _auto_exposure_ev(relit, self._face.visible)
         own_ev = _auto_exposure_ev(self._face.texture, self._face.visible) if self._keeps_photo else 0.0
         return chosen_ev - own_ev
@@ -173,10 +189,13 @@ def _mean(texture: Tensor, weight: Tensor) -> Tensor:
 class Surround:
     """The change of light on the face, spread outward and blurred: hair, neck and background follow it.
 
-    With distance it becomes the mean change. It is linear in the relit texture.
+    With distance it becomes the mean change. Next to the face it stays near the mean, since a bright rim
+    there looks like a glow. The bounds apply to each light, so sums over lights stay linear.
     """
 
-    def __init__(self, vertices_camera: Tensor, crop: Crop, height_px: int, width_px: int) -> None:
+    def __init__(
+        self, vertices_camera: Tensor, crop: Crop, source: Tensor, height_px: int, width_px: int
+    ) -> None:
         side = _SURROUND * _SURROUND_PX
         camera = Camera(CROP_FOCAL_PER_SIDE * _SURROUND_PX, side, side, side / 2, side / 2)
         self._view = view_face(vertices_camera, camera, _SURROUND_PX)
@@ -185,23 +204,33 @@ class Surround:
         away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
         self._near = 1 - smooth(away_px / (_REACH * _SURROUND_PX))
         self._grid = _photo_grid(crop, height_px, width_px)
+        self._mean_source, self._around_source = self._mean_and_blur(source[None])
 
-    def gain(self, source: Tensor, relit: Tensor) -> np.ndarray:
-        """The change of light [H, W, 3] over the photo, for textures [3, T, T]."""
-        pair = torch.from_numpy(self._view.full(self._view.render(torch.cat([source, relit]))))
-        pair = pair.permute(2, 0, 1)
-        mean = (pair * self._mask).sum((1, 2), keepdim=True) / self._mask.sum().clamp(min=_TINY)
-        sigma = _SPREAD * _SURROUND_PX
-        filled = inpaint(pair, self._mask).numpy()
-        blurred = torch.from_numpy(gaussian_filter(filled, (0, sigma, sigma), mode="nearest"))
-        floor = _DARK * mean[:3]
-        change = mean[3:] / mean[:3].clamp(min=_TINY)
-        local = (blurred[3:] + floor * change) / (blurred[:3] + floor).clamp(min=_TINY)
-        spread = torch.lerp(change.expand_as(local), local, self._near)
-        over_photo = F.grid_sample(
-            spread[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
+    def changes(self, olats: Tensor) -> Tensor:
+        """The change of light [L, 3, s, s] from the source to each of OLAT textures [L, 3, T, T]."""
+        mean, around = self._mean_and_blur(olats)
+        floor = _DARK * self._mean_source
+        change = mean / self._mean_source.clamp(min=_TINY)
+        local = (around + floor * change) / (self._around_source + floor).clamp(min=_TINY)
+        local = local.minimum(change * _BRIGHTER).maximum(change / _DARKER)
+        return torch.lerp(change.expand_as(local), local, self._near)
+
+    def over_photo(self, change: Tensor) -> np.ndarray:
+        """A change of light [3, s, s] over the photo [H, W, 3]."""
+        over = F.grid_sample(
+            change[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
         )
-        return over_photo[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
+        return over[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
+
+    def _mean_and_blur(self, textures: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean colours [N, 3, 1, 1] of textures [N, 3, T, T] on the face, and their blur [N, 3, s, s]."""
+        rendered = self._view.full(self._view.render(textures.flatten(0, 1)))
+        planes = torch.from_numpy(rendered).permute(2, 0, 1)
+        mean = (planes * self._mask).sum((1, 2)) / self._mask.sum().clamp(min=_TINY)
+        sigma = _SPREAD * _SURROUND_PX
+        blurred = gaussian_filter(inpaint(planes, self._mask).numpy(), (0, sigma, sigma), mode="nearest")
+        shape = (len(textures), 3)
+        return mean.view(*shape, 1, 1), torch.from_numpy(blurred).view(*shape, *self._mask.shape)
 
 
 def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:

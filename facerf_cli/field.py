@@ -1,6 +1,6 @@
 """The neural reflectance field of one face: its texture under any single light, and any sum of lights."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,10 +16,9 @@ from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models
 from facerf_cli.network.inputs import colour_cast
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
+from facerf_cli.network.reflectance import ReflectanceNetwork
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
-_DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
 _LIGHT_SIDE, _QUOTIENT_LIGHTS = 128, 50  # texels on which light is estimated; lights for the photo's quotient
 _SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
@@ -62,7 +61,7 @@ class Field:
             yield self.quotient.corrected(olats) if self.quotient else olats
 
     @property
-    def _network(self) -> DefaultReflectanceNetwork:
+    def _network(self) -> ReflectanceNetwork:
         if self.models.network is None:
             raise UsageError(
                 f"{self.models.checkpoint_name}: a checkpoint without a Reflectance Network, which the field "
@@ -74,7 +73,7 @@ class Field:
         """Lights that are decoded at once."""
         most = _LIGHTS_ON_CPU if self.models.device.type == "cpu" else lights
         texels = self.face.texture.shape[-1] ** 2
-        bytes_per_light = 4 * (_DECODER_CHANNELS * self._network.settings.side**2 + 16 * texels)
+        bytes_per_light = self._network.bytes_per_light(texels)
         return max(1, min(most, self.memory_bytes // bytes_per_light))
 
 
@@ -121,11 +120,21 @@ def _coarse_rig() -> Tensor:
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
     """Sum OLATs [L, 3, ...], given in batches, by rgb weights [M, L, 3]: [M, 3, ...] (paper, 'Relighting').
 
-    Batches are never all held. Textures are summed before they are rendered, since a render costs more.
+    Textures are summed before they are rendered, since a render costs more.
     """
-    total, done = torch.zeros(()), 0
+    return weighted_sums(batches, weights, lambda olats: olats)[0]
+
+
+def weighted_sums(
+    batches: Iterable[Tensor], weights: Tensor, *parts: Callable[[Tensor], Tensor]
+) -> list[Tensor]:
+    """`weighted_sum` of several functions of the same OLATs; the batches are never all held at once."""
+    totals, done = [torch.zeros(()) for _ in parts], 0
     for olats in batches:
-        part = torch.einsum("mlc,lcn->mcn", weights[:, done : done + len(olats)], olats.flatten(2))
-        total = total + part.view(*part.shape[:2], *olats.shape[2:])
+        some = weights[:, done : done + len(olats)]
+        for number, part in enumerate(parts):
+            values = part(olats)
+            flat = torch.einsum("mlc,lcn->mcn", some, values.flatten(2))
+            totals[number] = totals[number] + flat.view(*flat.shape[:2], *values.shape[2:])
         done += len(olats)
-    return total
+    return totals

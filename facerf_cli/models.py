@@ -12,7 +12,7 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
+from facerf_cli.network.reflectance import ReflectanceNetwork
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 
@@ -25,7 +25,7 @@ class Models:
     """
 
     face: MorphableModel
-    network: DefaultReflectanceNetwork | None
+    network: ReflectanceNetwork | None
     geometry: nn.Module | None  # the Geometry Network, where a fit starts
     diffuse: DiffuseNetwork | None  # the network of the baseline diffuse-sh
     checkpoint_name: str

@@ -21,12 +21,12 @@ from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
-from facerf_cli.composite import AS_IN_PHOTO, Composition, RelitImage, Target
+from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Target
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk
+from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk, weighted_sums
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
@@ -172,19 +172,36 @@ def relight(
     if it is not given.
     """
     reflectance = reflectance or reflectance_of(models, head)
-    relit = relit_textures(head, reflectance, light.directions, light.weights[None], target)[0]
-    return Composition(models.face, photo, head, target).image(light, relit)
+    composition = Composition(models.face, photo, head, target)
+    weights = light.weights[None]
+    relit = next(relit_by(composition, head, reflectance, light.directions, weights, target))
+    return composition.image(light, relit)
 
 
-def relit_textures(
-    head: Head, reflectance: Reflectance, directions: Tensor, weights: Tensor, target: Target = AS_IN_PHOTO
-) -> Tensor:
-    """Textures [M, 3, T, T] of a head under M sums, rgb weights [M, L, 3], of lights [L, 3].
+def relit_by(
+    composition: Composition,
+    head: Head,
+    reflectance: Reflectance,
+    directions: Tensor,
+    weights: Tensor,
+    target: Target = AS_IN_PHOTO,
+) -> Iterator[Relit]:
+    """Relight a head under M sums, rgb weights [M, L, 3], of lights [L, 3], for a composition.
 
-    One prediction of the lights serves all sums; `Composition` makes an image of each.
+    One prediction of the lights serves all sums. Of the field, which is linear in light, the surround is
+    summed over its lights, too; the models that the paper compares with are not linear where they are
+    clamped.
     """
-    rotation = None if target.fit is None else target.fit.rotation
-    return reflectance.relit(directions, weights, _turn(head.fit, rotation))
+    surround = composition.surround
+    turn = _turn(head.fit, None if target.fit is None else target.fit.rotation)
+    if surround is not None and isinstance(reflectance, Field):
+        summed = weighted_sums(
+            reflectance.olats(directions, turn), weights, lambda olats: olats, surround.changes
+        )
+        yield from map(Relit, *summed)
+        return
+    for texture in reflectance.relit(directions, weights, turn):
+        yield Relit(texture, None if surround is None else surround.changes(texture[None])[0])
 
 
 def _turn(fit: FaceFit, rotation: Tensor | None) -> Tensor | None:

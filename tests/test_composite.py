@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, PhotoDetail, Surround, Target
+from facerf_cli.composite import Composition, PhotoDetail, Relit, Target
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
@@ -103,7 +103,9 @@ def compose(
     )
     head = Head(photo, fit, FaceTexture(source, seen, source))
     light = RigLight(torch.zeros(0, 3), torch.zeros(0, 3))
-    return Composition(model, photo, head, target).image(light, relit).pixels
+    composition = Composition(model, photo, head, target)
+    around = None if composition.surround is None else composition.surround.changes(relit[None])[0]
+    return composition.image(light, Relit(relit, around)).pixels
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -247,11 +249,3 @@ def test_a_face_half_outside_its_photo() -> None:
     photo = np.full((120, 90, 3), 0.5, np.float32)
     _, source, seen = unwrapped()
     assert np.isfinite(compose(photo, source, scene().lit(OTHER), seen, crop=crop)).all()
-
-
-def test_the_surround_is_linear_in_light() -> None:
-    _, source, _ = unwrapped()
-    around = Surround(scene().vertices, CROP, HEIGHT_PX, WIDTH_PX)
-    first, second = scene().lit(OWN), scene().lit(OTHER)
-    apart = around.gain(source, first) + around.gain(source, second)
-    np.testing.assert_allclose(apart, around.gain(source, first + second), rtol=1e-4)

@@ -12,7 +12,7 @@ from facerf_cli.composite import Composition, Target
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models
-from facerf_cli.pipeline import explain, reflectance_of, relight, relit_textures
+from facerf_cli.pipeline import explain, reflectance_of, relight, relit_by
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Method:
     ) -> Iterator[np.ndarray]:
         """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, network_alone)
-        textures = relit_textures(head, reflectance, directions, weights, target).detach()
         composition = Composition(self.models.face, photo, head, target)
-        for row, texture in zip(weights, textures, strict=True):
-            yield composition.image(RigLight(directions, row), texture).pixels
+        relit = relit_by(composition, head, reflectance, directions, weights, target)
+        for row, of_row in zip(weights, relit, strict=True):
+            yield composition.image(RigLight(directions, row), of_row).pixels

@@ -25,7 +25,7 @@ from facerf_cli.cli.items.photo import (
 )
 from facerf_cli.cli.relight import Relight
 from facerf_cli.colour import auto_exposure_ev
-from facerf_cli.composite import Composition, RelitImage, Target
+from facerf_cli.composite import Composition, Relit, RelitImage, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
@@ -35,7 +35,7 @@ from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
-from facerf_cli.pipeline import reflectance_of, relit_textures
+from facerf_cli.pipeline import reflectance_of, relit_by
 
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
@@ -45,12 +45,12 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 
 
 class Composer(Protocol):
-    """What turns relit textures into images: a `Composition`, or the images of a stack as they are."""
+    """What composes images: a `Composition`, or for a stack of images `_RenderedStack`."""
 
-    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
-        """The image of a relit texture [3, T, T]."""
+    def image(self, light: RigLight, relit: Relit) -> RelitImage:
+        """The image of a head under a light, as relit by it."""
 
-    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
         """The image's pixels at an exposure in EV."""
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
@@ -59,12 +59,12 @@ class Composer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """Relit textures of M setups, rgb weights [M, L, 3] of lights [L, 3], and what composes them."""
+    """A head relit by M setups, rgb weights [M, L, 3] of lights [L, 3], and what composes it."""
 
     composer: Composer
     directions: Tensor
     weights: Tensor
-    textures: Callable[[slice], Tensor]  # [m, 3, T, T] of some of the setups
+    relit: Callable[[slice], list[Relit]]  # by some of the setups
     bytes_each: int
     alpha: np.ndarray | None = None  # of the photo
 
@@ -93,15 +93,15 @@ def _relight_face(
     reflectance = reflectance_of(models, head, work.reflectance, work.network_alone, work.memory_bytes)
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
-    def textures(rows: slice) -> Tensor:
-        return relit_textures(head, reflectance, directions, weights[rows], target)
+    def relit(rows: slice) -> list[Relit]:
+        return list(relit_by(composition, head, reflectance, directions, weights[rows], target))
 
     metadata = provenance(item, work.photo, models.checkpoint_name)
     if work.reflectance != "field":
         metadata["facerf:reflectance"] = work.reflectance
     alpha = image.alpha if work.composite == "photo" else None
     bytes_each = head.face.texture.nbytes
-    shown = _Shown(composition, directions, weights, textures, bytes_each, alpha)
+    shown = _Shown(composition, directions, weights, relit, bytes_each, alpha)
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
 
@@ -126,13 +126,13 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     directions = torch.from_numpy(stack.header.directions).float()
     weights = weights_over_stack(work.setups, directions, work.sampling)
 
-    def textures(rows: slice) -> Tensor:
+    def relit(rows: slice) -> list[Relit]:
         batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
-        return weighted_sum(batches, weights[rows])
+        return list(map(Relit, weighted_sum(batches, weights[rows])))
 
     metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
     bytes_each = 12 * stack.header.seen.size
-    shown = _Shown(composer, directions, weights, textures, bytes_each)
+    shown = _Shown(composer, directions, weights, relit, bytes_each)
     return dict(_write_setups(item, "", shown, work, metadata)), facts
 
 
@@ -161,10 +161,10 @@ class _RenderedStack:
     seen: np.ndarray
     normals: np.ndarray  # [H, W, 3]
 
-    def image(self, light: RigLight, relit: Tensor) -> RelitImage:
-        return RelitImage(relit.permute(1, 2, 0).numpy(), self.seen, {"normal": self.normals})
+    def image(self, light: RigLight, relit: Relit) -> RelitImage:
+        return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen, {"normal": self.normals})
 
-    def exposed(self, light: RigLight, relit: Tensor, image: RelitImage, ev: float) -> np.ndarray:
+    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
         return image.pixels * 2**ev
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
@@ -180,33 +180,32 @@ def _write_setups(
     """
     at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
     parts = [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
-    whole = shown.textures(parts[0]) if len(parts) == 1 else None
+    whole = shown.relit(parts[0]) if len(parts) == 1 else None
 
-    def textures_of(part: slice) -> Tensor:
-        return shown.textures(part) if whole is None else whole
+    def relit_by_part(part: slice) -> list[Relit]:
+        return shown.relit(part) if whole is None else whole
 
-    exposures_ev = _exposures_ev(parts, textures_of, shown.composer, work)
+    exposures_ev = _exposures_ev(parts, relit_by_part, shown.composer, work)
     for part in parts:
-        for setup, weights, texture in zip(
-            work.setups[part], shown.weights[part], textures_of(part), strict=True
-        ):
+        rows = zip(work.setups[part], shown.weights[part], relit_by_part(part), strict=True)
+        for setup, weights, relit in rows:
             path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
             light = RigLight(shown.directions, weights)
-            image = shown.composer.image(light, texture)
-            _write(path, image, shown.composer.exposed(light, texture, image, ev), shown.alpha, ev, metadata)
+            image = shown.composer.image(light, relit)
+            _write(path, image, shown.composer.exposed(light, relit, image, ev), shown.alpha, ev, metadata)
             yield path, ev
 
 
 def _exposures_ev(
-    parts: Iterable[slice], textures_of: Callable[[slice], Tensor], composer: Composer, work: Relight
+    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Relit]], composer: Composer, work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if work.exposure_ev is not None:
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure_ev)
     found: dict[str, float] = {}
     for part in parts:
-        for setup, texture in zip(work.setups[part], textures_of(part), strict=True):
-            chosen_ev = round(composer.auto_exposure_ev(texture), 2)
+        for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
+            chosen_ev = round(composer.auto_exposure_ev(relit.texture), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
     return found
 

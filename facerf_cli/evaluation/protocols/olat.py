@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, Target
+from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
 from facerf_cli.evaluation.crop_view import angle_class, angle_of, turn_class
@@ -82,7 +82,8 @@ def _lambert(person: Person, head: Head, asked: _Question) -> np.ndarray:
     """The source's texture under the light's cosine, rendered in the target's crop."""
     cosine = torch.einsum("c,cd,dij->ij", asked.light, asked.turn, head.face.normals).clamp_min(0)
     composition = Composition(person.model, None, head, Target(asked.crop.view.fit, "face"))
-    return composition.image(RigLight(asked.light[None], _WHITE[0]), head.face.texture * cosine).pixels
+    relit = Relit(head.face.texture * cosine)
+    return composition.image(RigLight(asked.light[None], _WHITE[0]), relit).pixels
 
 
 def _facts(person: Person, pair: Pair, asked: _Question) -> dict[str, str | float]:
