@@ -25,8 +25,10 @@ _SLOPE = 0.2  # of the leaky rectifiers
 _GROUPS = 4  # of the group normalisations
 _LIGHT_CONVOLUTIONS = 5  # over the U-Net's features and the target's normals
 _FIRST_ROOT = 0.3  # square root of the radiance that an untrained network predicts everywhere, about
-_DECODER_CHANNELS = 220  # bound of what the decoder holds at once for each light, at its working side
-_TEXTURE_CHANNELS = 16  # bound of what the output holds at once for each light, at the side of the texture
+# Channels that count for the memory of one light, at the working side and at the side of the texture: the
+# default form's, which by count are enough for this form, too.
+_DECODER_CHANNELS = 220
+_TEXTURE_CHANNELS = 16
 
 
 @dataclass(frozen=True)
