@@ -1,7 +1,7 @@
-"""Colour spaces: from the encodings of files to scene-linear Rec.709, and to sRGB for display.
+"""Colour spaces: from the encodings of files to scene-linear Rec.709, and from there to sRGB for display.
 
 Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
-the ACES spaces). Names that are not known here are looked up in the OpenColorIO configuration ($OCIO, else
+the ACES spaces). A name that is not defined here is looked up in the OpenColorIO configuration ($OCIO, or
 `ocio://default`).
 """
 
@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import OpenImageIO as oiio
 
 from facerf_cli.errors import UsageError
 
-# x, y of red, green, blue and white.
+# Chromaticities x, y of red, green, blue and white.
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _P3_CHROMATICITIES = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.3290)
 _REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.3290)
@@ -22,33 +23,34 @@ _AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.3376
 _AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
 
-# Cone responses of XYZ after Bradford (Lam 1985).
+# From XYZ to the cone responses of the Bradford transform (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _ADOBE_GAMMA = 563 / 256
-_BLOCK_VALUES = 2**18
-# The same primaries, what no camera's or display's go beyond, and the least that spans colours.
+_BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
+# Limits of chromaticities: the tolerance of equal ones, the largest coordinate, and the smallest area or
+# coordinate of primaries that span a space.
 _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
-AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # where that percentile of the luminance is put
+AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, float32 of any shape; negative values are mirrored."""
+    """Decode sRGB (IEC 61966-2-1), float32 of any shape; negative values are mirrored."""
     size = np.abs(encoded)
     linear = np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4)
     return np.copysign(linear, encoded).astype(np.float32)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1, float32 of any shape; negative values are mirrored, values above 1 go on."""
+    """Encode sRGB (IEC 61966-2-1), float32 of any shape, also beyond 1; negative values are mirrored."""
     size = np.abs(linear)
     encoded = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055)
     return np.copysign(encoded, linear).astype(np.float32)
 
 
 def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """The inverse of ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
+    """Invert ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
     alpha, beta = 1.09929682680944, 0.018053968510807
     size = np.abs(encoded)
     linear = np.where(size < 4.5 * beta, size / 4.5, ((size + alpha - 1) / alpha) ** (1 / 0.45))
@@ -61,15 +63,15 @@ def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ColourSpace:
-    """Primaries and a decoding curve; both None for a space that OpenColorIO converts."""
+    """A colour space by its primaries and decoding curve; without primaries OpenColorIO converts it."""
 
     name: str
     chromaticities: tuple[float, ...] | None
-    decode: Callable[[np.ndarray], np.ndarray] | None = None
+    decode: Callable[[np.ndarray], np.ndarray] | None = None  # None if linear
 
     @property
     def is_linear(self) -> bool:
-        """Whether values are proportional to light, where that is known here."""
+        """Whether values are known to be proportional to light."""
         return self.chromaticities is not None and self.decode is None
 
 
@@ -83,7 +85,7 @@ LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
 
-# Compared without case, spaces and punctuation; with the interchange names that OpenImageIO uses.
+# Compared without case, spaces and punctuation; includes the interchange names that OpenImageIO uses.
 _ALIASES = {
     LINEAR: "linear linrec709 linearrec709 linrec709scene linsrgb linearrec709srgb",
     SRGB: "srgb srgbrec709scene srgbtexture srgbtx srgbencodedrec709srgb",
@@ -99,7 +101,7 @@ _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in al
 
 
 def find_space(name: str) -> ColourSpace | None:
-    """The space of that name, ours or OpenColorIO's; None where neither knows it."""
+    """Return the space of this name, defined here or by OpenColorIO; None if it is unknown."""
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     if plain in _BY_ALIAS:
         return _BY_ALIAS[plain]
@@ -107,9 +109,9 @@ def find_space(name: str) -> ColourSpace | None:
 
 
 def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
-    """The linear space of these primaries and white, under its name where it is known here.
+    """Return the linear space of these primaries and white, with its usual name if it has one.
 
-    None where they are no such thing: white is to lie within the triangle of the primaries.
+    None if they are impossible: white must lie inside the triangle of the primaries.
     """
     xy = np.array(chromaticities, float).reshape(4, 2)
     if not (np.abs(xy) < _LARGEST_XY).all() or not (np.abs(xy[:, 1]) > _LEAST_XY).all():
@@ -125,23 +127,22 @@ def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
 
 
 def named_space(name: str) -> ColourSpace:
-    """The space that a user names; an unknown name is an error that lists near ones."""
+    """Return the space that a user names; an unknown name raises a UsageError that lists similar ones."""
     space = find_space(name)
     if space is None:
         ours = [known.name for known in _ALIASES]
         near = difflib.get_close_matches(name, [*ours, *_ocio_names().values()], 3, 0.5)
-        hint = f"near names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
+        hint = f"similar names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
         raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
     return space
 
 
 @cache
 def _ocio_names() -> dict[str, str]:
-    import OpenImageIO as oiio
-
+    """Map case-folded names and aliases of the OpenColorIO configuration to their spelling."""
     configuration = oiio.ColorConfig()
-    if trouble := configuration.geterror():  # else OpenImageIO goes on with a handful of names of its own
-        raise UsageError(f"$OCIO: {trouble}")
+    if error := configuration.geterror():  # otherwise OpenImageIO continues with a few built-in names
+        raise UsageError(f"$OCIO: {error}")
     names = [name for name in configuration.getColorSpaceNames() if not configuration.isData(name)]
     names += [alias for name in names for alias in configuration.getAliases(name)]
     names += configuration.getRoles()
@@ -149,7 +150,7 @@ def _ocio_names() -> dict[str, str]:
 
 
 def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
-    """Values [H, W, 3] in `space` as scene-linear Rec.709; nothing is clipped, so wide gamuts go negative."""
+    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values."""
     if space.chromaticities is None:
         return _convert_by_ocio(pixels, space.name)
     linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
@@ -160,7 +161,7 @@ def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
 
 
 def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
-    """A curve over [H, W, C], some rows at a time: in the processor's cache it is several times faster."""
+    """Apply a curve to [H, W, C] in blocks of rows, which fit the processor's cache: several times faster."""
     rows = max(1, _BLOCK_VALUES // max(1, pixels[0].size))
     result = np.empty(pixels.shape, np.float32)
     for start in range(0, len(pixels), rows):
@@ -169,8 +170,6 @@ def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> 
 
 
 def _convert_by_ocio(pixels: np.ndarray, name: str) -> np.ndarray:
-    import OpenImageIO as oiio
-
     source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
     for linear_name in ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)"):
         converted = oiio.ImageBufAlgo.colorconvert(source, name, linear_name)
@@ -180,14 +179,14 @@ def _convert_by_ocio(pixels: np.ndarray, name: str) -> np.ndarray:
 
 
 def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
-    """[3, 3] from linear RGB to XYZ with Y = 1 for white; x, y of red, green, blue and white."""
+    """Return the matrix [3, 3] from linear RGB of these primaries to XYZ, with Y = 1 for white."""
     xy = np.array(chromaticities, float).reshape(4, 2)
     xyz = np.concatenate([xy, 1 - xy.sum(-1, keepdims=True)], -1) / xy[:, 1:]  # [4, 3], each of Y = 1
     return xyz[:3].T * np.linalg.solve(xyz[:3].T, xyz[3])
 
 
 def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
-    """[3, 3] from linear RGB of these primaries to linear Rec.709, white to white by Bradford."""
+    """Return the matrix [3, 3] from linear RGB of these primaries to linear Rec.709 (Bradford adaptation)."""
     source, target = rgb_to_xyz(chromaticities), rgb_to_xyz(REC709_CHROMATICITIES)
     gain = (_BRADFORD @ target.sum(1)) / (_BRADFORD @ source.sum(1))
     adaptation = np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
@@ -195,12 +194,12 @@ def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
 
 
 def luminance(linear: np.ndarray) -> np.ndarray:
-    """Y [...] of linear Rec.709 [..., 3]."""
+    """Return the luminance Y [...] of linear Rec.709 [..., 3]."""
     return linear @ rgb_to_xyz(REC709_CHROMATICITIES)[1].astype(linear.dtype)
 
 
 def lab_d65(linear: np.ndarray) -> np.ndarray:
-    """CIE L*a*b* under D65 [..., 3] of linear Rec.709 [..., 3]."""
+    """Convert linear Rec.709 [..., 3] to CIE L*a*b* under D65 [..., 3]."""
     matrix = rgb_to_xyz(REC709_CHROMATICITIES)
     relative = linear @ matrix.T / matrix.sum(1)
     root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
@@ -209,10 +208,9 @@ def lab_d65(linear: np.ndarray) -> np.ndarray:
 
 
 def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """The exposure that puts the 99th percentile of the luminance at 0.8, in EV to a hundredth.
+    """Return the exposure that maps the 99th percentile of the luminance to 0.8, in EV, to two decimals.
 
-    linear [H, W, 3]; where `mask` [H, W] is given, only pixels above one half of it count. A black picture
-    keeps 0 EV.
+    linear is [H, W, 3]. Only pixels where `mask` [H, W] exceeds one half count. A black image gives 0 EV.
     """
     values = luminance(linear)
     values = values.ravel() if mask is None else values[mask > 0.5]

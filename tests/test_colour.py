@@ -94,22 +94,22 @@ def test_blocks_make_no_seams() -> None:
     np.testing.assert_array_equal(ours.in_blocks(ours.srgb_to_linear, tall), ours.srgb_to_linear(tall))
 
 
-def test_an_unknown_name_lists_near_ones() -> None:
-    with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(near names: ACEScg"):
+def test_an_unknown_name_lists_similar_ones() -> None:
+    with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(similar names: ACEScg"):
         ours.named_space("ACEScgg")
     with pytest.raises(UsageError, match=r"known: linear Rec\.709, sRGB"):
         ours.named_space("qqqqq")
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
-def test_auto_exposure_puts_the_percentile_in_its_place(scale: float) -> None:
+def test_auto_exposure_maps_the_percentile_to_its_target(scale: float) -> None:
     linear = np.random.default_rng(0).random((40, 30, 3)).astype(np.float32) * scale
     exposed = linear * 2 ** ours.auto_exposure_ev(linear)
     high = np.percentile(ours.luminance(exposed), ours.AUTO_EXPOSURE_PERCENTILE)
     assert high == pytest.approx(ours.AUTO_EXPOSURE_TARGET_LINEAR, rel=0.01)
 
 
-def test_auto_exposure_looks_inside_the_mask_only_and_leaves_black_alone() -> None:
+def test_auto_exposure_uses_the_mask_and_leaves_black_alone() -> None:
     linear = np.ones((4, 6, 3), np.float32)
     linear[:, 3:] = 1000
     mask = np.zeros((4, 6), np.float32)

@@ -1,4 +1,4 @@
-"""Metrics are what they are said to be: against the reference scorer, slow twins, and bounds."""
+"""Metrics against the reference scorer, slow twins, and bounds."""
 
 import importlib
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ Images = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 @pytest.fixture
 def images() -> Images:
-    """Prediction, truth [14, 19, 3] and a soft mask; both pictures go beyond 0 and 1."""
+    """Prediction, truth [14, 19, 3] and a soft mask; both images exceed 0..1."""
     random = np.random.default_rng(1)
     truth = random.gamma(1.5, 0.3, (14, 19, 3)).astype(np.float32)
     prediction = (0.4 * truth + 0.1 * random.normal(size=truth.shape)).astype(np.float32)
@@ -90,7 +90,7 @@ def test_si_mse_is_that_of_training(images: Images) -> None:
     assert si_mse(*images) == pytest.approx(expected.item(), rel=1e-9)
 
 
-def test_a_scale_of_the_prediction_means_nothing_to_si_mse_and_ssim(images: Images) -> None:
+def test_si_mse_and_ssim_ignore_the_scale_of_the_prediction(images: Images) -> None:
     prediction, truth, mask = images
     for metric in (si_mse, si_mse_clipped, si_rel, ssim, dssim):
         assert metric(7 * prediction, truth, mask) == pytest.approx(metric(prediction, truth, mask), rel=1e-5)
@@ -105,7 +105,7 @@ def test_a_scale_is_never_negative(images: Images) -> None:
         assert np.isfinite(ssim(prediction, truth, mask))
 
 
-def test_what_lies_outside_the_mask_means_nothing(images: Images) -> None:
+def test_pixels_outside_the_mask_do_not_count(images: Images) -> None:
     prediction, truth, mask = images
     wild = np.where(mask[..., None] > 0, prediction, np.float32(50))
     for metric in (best_scale, si_mse, si_mse_clipped, mse, psnr, ssim):
@@ -119,7 +119,7 @@ def test_equal_images(images: Images) -> None:
     assert psnr(truth, truth, mask) == pytest.approx(PSNR_HIGHEST_DB)
 
 
-def test_a_glint_of_the_truth_weighs_less_once_clipped() -> None:
+def test_a_clipped_highlight_of_the_truth_counts_less() -> None:
     truth = np.full((5, 6, 3), 0.3)
     prediction, mask = truth.copy(), np.ones((5, 6))
     truth[2, 2] = 40
@@ -160,7 +160,7 @@ def test_ita_of_known_colours() -> None:
     assert [tone_of(x) for x in (55.1, 55, 0, -30, -90)] == ["very light", "light", "brown", "dark", "dark"]
 
 
-def test_drift_is_of_the_skin_alone() -> None:
+def test_tone_drift_uses_only_the_skin() -> None:
     albedo = np.array([0.45, 0.30, 0.22])
     truth = np.broadcast_to(0.3 * albedo, (6, 8, 3)).copy()
     skin = np.zeros((6, 8))

@@ -1,9 +1,9 @@
-"""Axes, the fixed camera and the head pose, each defined here and nowhere else.
+"""Axes, the fixed camera and the head pose, each defined only here.
 
-Camera space is right-handed, in metres: x to the picture's right, y up, z out of the face toward the
-camera. The camera sits at the origin and looks down -z, so what it sees has z < 0; the head pose is what
-varies (paper, 'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the
-right, y down, and their centres at index + `PIXEL_CENTRE`.
+Camera space is right-handed, in metres: x to the image's right, y up, z out of the face toward the camera.
+The camera is at the origin and looks along -z, so visible points have z < 0; the head pose varies (paper,
+'Reflectance Field Representation'). Pixels have their origin at the top-left corner, x to the right, y down,
+and their centres at index + `PIXEL_CENTRE`.
 """
 
 import math
@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-CROP_FOCAL_PER_SIDE = 4.0
+CROP_FOCAL_PER_SIDE = 4.0  # focal length of a face crop, in sides of the crop
 PIXEL_CENTRE = 0.5
+_SMALL_ANGLE2 = 1e-4  # squared radians; below it the series of `so3_exp` is exact to 1e-12
+_GIMBAL_LOCK = 1e-6  # cosine of the pitch below which yaw and roll are not distinct
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion; everything in pixels of its own picture."""
+    """A pinhole camera without distortion; lengths and positions are in pixels of its image."""
 
     focal_px: float
     width_px: int
@@ -28,25 +30,25 @@ class Camera:
 
 
 def crop_camera(side_px: int) -> Camera:
-    """The camera of every face crop: focal length 4 x its side, centred principal point."""
+    """Return the camera of a face crop: focal length 4 x the side, centred principal point."""
     return Camera(CROP_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
 
 
 def project(points_camera: Tensor, camera: Camera) -> Tensor:
-    """Camera-space points [..., 3] in metres to pixels [..., 2]; only meaningful for z < 0."""
+    """Project camera-space points [..., 3] in metres to pixels [..., 2]; valid only for z < 0."""
     x, y, z = points_camera.unbind(-1)
     scale = camera.focal_px / -z
     return torch.stack([camera.cx_px + scale * x, camera.cy_px - scale * y], -1)
 
 
 def pixel_rays(px: Tensor, camera: Camera) -> Tensor:
-    """The viewing ray through pixels [..., 2], scaled to z = -1: [..., 3]; a point at depth d is d * ray."""
+    """Return viewing rays [..., 3] through pixels [..., 2], with z = -1: a point at depth d is d * ray."""
     x, y = (px[..., 0] - camera.cx_px) / camera.focal_px, (camera.cy_px - px[..., 1]) / camera.focal_px
     return torch.stack([x, y, -torch.ones_like(x)], -1)
 
 
 def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tensor:
-    """Pixel position (x, y) of every pixel's centre [H, W, 2], float32."""
+    """Return the position (x, y) in pixels of every pixel's centre [H, W, 2], float32."""
     y = torch.arange(camera.height_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
     x = torch.arange(camera.width_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
     grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
@@ -54,9 +56,9 @@ def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tens
 
 
 def pose_to_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Tensor:
-    """head_to_camera = Rz(roll) Rx(pitch) Ry(yaw), [3, 3] float32.
+    """Return head_to_camera = Rz(roll) Rx(pitch) Ry(yaw), [3, 3] float32.
 
-    yaw > 0 turns the nose to the picture's right, pitch > 0 down, roll > 0 counter-clockwise on screen.
+    yaw > 0 turns the nose to the image's right, pitch > 0 down, roll > 0 counter-clockwise in the image.
     """
     yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
     ry = _matrix([math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)])
@@ -70,10 +72,10 @@ def _matrix(*rows: list[float]) -> Tensor:
 
 
 def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:
-    """The (yaw, pitch, roll) in degrees of a rotation [3, 3]; at pitch +-90 the roll is taken as 0."""
+    """Return (yaw, pitch, roll) in degrees of a rotation [3, 3]; at pitch +-90 the roll is set to 0."""
     r = head_to_camera.detach().double().cpu()
     pitch = math.asin(max(-1.0, min(1.0, r[2, 1].item())))
-    if math.hypot(r[0, 1].item(), r[1, 1].item()) < 1e-6:  # straight up or down: yaw is roll
+    if math.hypot(r[0, 1].item(), r[1, 1].item()) < _GIMBAL_LOCK:  # only yaw +- roll is defined
         yaw, roll = math.atan2(r[0, 2].item(), r[0, 0].item()), 0.0
     else:
         yaw = math.atan2(-r[2, 0].item(), r[2, 2].item())
@@ -82,9 +84,9 @@ def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:
 
 
 def so3_exp(omega: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of axis-angle vectors [..., 3] in radians; differentiable at zero too."""
+    """Return rotation matrices [..., 3, 3] of axis-angle vectors [..., 3] in radians; differentiable at 0."""
     angle2 = (omega * omega).sum(-1)[..., None, None]
-    small = angle2 < 1e-4  # the series' next term is below 1e-12 there, and sqrt has no gradient at 0
+    small = angle2 < _SMALL_ANGLE2  # sqrt has no gradient at 0
     safe = torch.where(small, torch.ones_like(angle2), angle2)
     angle = safe.sqrt()
     sine = torch.where(small, 1 - angle2 / 6 + angle2**2 / 120, angle.sin() / angle)
@@ -95,7 +97,7 @@ def so3_exp(omega: Tensor) -> Tensor:
 
 
 def skew_matrix(vector: Tensor) -> Tensor:
-    """[v]x [..., 3, 3] of vectors [..., 3], so that [v]x w is the cross product v x w."""
+    """Return [v]x [..., 3, 3] for vectors v [..., 3]: [v]x w is the cross product v x w."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)

@@ -1,10 +1,11 @@
-"""Which triangle each pixel sees, where in it, and how far away: a z-buffer in plain torch.
+"""A z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
 
-Every triangle is cut into pixel rows and every row into its run of pixels, all of them at once, so the work
-grows with what is covered and not with the bounding boxes. A pixel belongs to a triangle if its centre lies
-in it; a run holds its left end and not its right, a triangle its upper end and not its lower, and both
-triangles of a shared edge compute the same crossing, so that there are neither holes nor doubles. Visibility
-has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle have.
+All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with the
+covered area and not with the bounding boxes. A pixel belongs to a triangle if its centre lies inside. A run
+includes its left end and excludes its right, a triangle includes its upper end and excludes its lower, and
+both triangles of a shared edge compute the same crossing, so each pixel on an edge is covered exactly once.
+Visibility has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle
+have one. All arithmetic is elementwise, so the result does not depend on how triangles are split into parts.
 """
 
 from collections.abc import Iterator
@@ -15,45 +16,46 @@ from torch import Tensor
 
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
 
-NEAR_M = 0.01  # a triangle with a corner nearer than this, or behind the camera, is dropped whole
-_SLIVER_PX2 = 1e-9  # twice the area under which a projected triangle counts as degenerate and is dropped
-_CHUNK_PX = 1 << 24  # bounding-box pixels that are worked on at a time; bounds the memory
-_FAR_KEY = torch.iinfo(torch.int64).max
+NEAR_M = 0.01  # a triangle is dropped if a corner is nearer than this, or behind the camera
+_SLIVER_PX2 = 1e-9  # a projected triangle with less than half this area is degenerate and is dropped
+_CHUNK_PX = 1 << 24  # bounding-box pixels that are processed at a time; bounds the memory
+_FAR_KEY = torch.iinfo(torch.int64).max  # of a pixel without a triangle
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """What each pixel of a picture sees."""
+    """The visible point of each pixel of an image."""
 
-    triangle: Tensor  # [H, W] int64, -1 where nothing is seen
-    barycentric: Tensor  # [H, W, 3] perspective-correct, differentiable in the vertices; 0 where nothing
-    depth_m: Tensor  # [H, W] distance along the viewing axis (-z), differentiable; inf where nothing
+    triangle: Tensor  # [H, W] int64, -1 for none
+    barycentric: Tensor  # [H, W, 3] perspective-correct, differentiable in the vertices; 0 for none
+    depth_m: Tensor  # [H, W] distance along the viewing axis (-z), differentiable; inf for none
 
     @property
     def covered(self) -> Tensor:
-        """[H, W] bool: some triangle is seen."""
+        """Pixels [H, W] bool with a visible triangle."""
         return self.triangle >= 0
 
 
 @dataclass(frozen=True, eq=False)
 class _Screen:
-    """Triangles [N] that can be seen at all, in float64: a float32 pixel is too coarse for slivers."""
+    """Triangles [N] inside the image, projected in float64; float32 is too coarse for slivers."""
 
-    triangle: Tensor  # [N] id in the mesh
+    triangle: Tensor  # [N] index in the mesh
     corners_px: Tensor  # [N, 3, 2]
     inverse_depth: Tensor  # [N, 3]
     first_row: Tensor  # [N] int64
     rows: Tensor  # [N] int64
-    box_px: Tensor  # [N] bounding box inside the picture, in pixels
+    box_px: Tensor  # [N] pixels of the bounding box inside the image
 
     def part(self, index: Tensor) -> "_Screen":
+        """Select some of the triangles."""
         return _Screen(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fragments:
-    """Z-buffer vertices [V, 3] and triangles [F, 3] of either winding; equal depths go to the lower id.
+    """Rasterize vertices [V, 3] and triangles [F, 3] of either winding; at equal depth the lower index wins.
 
-    The barycentric weights and the depth carry gradients to the vertices; which triangle is seen does not.
+    The barycentric weights and the depth have gradients to the vertices; the choice of triangle has none.
     """
     with torch.no_grad():
         triangle = _visible_triangles(vertices_camera.detach(), triangles, camera)
@@ -71,7 +73,7 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
 
 
 def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> Tensor:
-    """Vertex attributes [V, C] at every pixel [H, W, C], zero where nothing is seen.
+    """Interpolate vertex attributes [V, C] to pixels [H, W, C]; pixels without a triangle are zero.
 
     Differentiable in the attributes and, through the barycentric weights, in the vertices.
     """
@@ -87,26 +89,27 @@ def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> 
 
 
 def front_facing(vertices_camera: Tensor, triangles: Tensor) -> Tensor:
-    """[F] bool: the triangle's counter-clockwise side looks at the camera."""
+    """Return [F] bool: whether a triangle's counter-clockwise side faces the camera."""
     a, b, c = vertices_camera[triangles].unbind(1)
     return (torch.linalg.cross(b - a, c - a) * a).sum(-1) < 0
 
 
 def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Tensor:
-    """Id of the nearest triangle at each pixel [H * W] int64, -1 where there is none."""
+    """Return the index of the nearest triangle at each pixel [H * W] int64, -1 for none."""
     screen = _on_screen(vertices_camera, triangles, camera)
     pixels = camera.height_px * camera.width_px
     nearest = torch.full((pixels,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
     for part in _chunks(screen):
         owner, pixel = _cover(part, camera.width_px)
         depth_bits = _fragment_depth(part, owner, pixel, camera.width_px).view(torch.int32)
-        # The bits of a positive float order like the float, so one integer minimum finds depth and triangle.
+        # Bits of positive floats sort like the floats, so an integer minimum finds both depth and triangle.
         key = (depth_bits.long() << 32) | part.triangle[owner]
         nearest.scatter_reduce_(0, pixel, key, "amin")
     return torch.where(nearest == _FAR_KEY, -1, nearest & 0xFFFFFFFF)
 
 
 def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> _Screen:
+    """Project the mesh and drop triangles that cover no pixel."""
     vertices = vertices_camera.double()
     px = project(vertices, camera)
     in_front = (vertices[:, 2] < -NEAR_M) & px.isfinite().all(-1)
@@ -125,12 +128,12 @@ def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> _S
 
 
 def _first_centre(position_px: Tensor) -> Tensor:
-    """Index of the first pixel whose centre is at or beyond the position, as a float."""
+    """Return the index of the first pixel whose centre is at or beyond the position, as a float."""
     return (position_px - PIXEL_CENTRE).ceil()
 
 
 def _chunks(screen: _Screen) -> Iterator[_Screen]:
-    """The triangles in order, in parts of bounded bounding-box area."""
+    """Split the triangles, in order, into parts of limited bounding-box area."""
     if len(screen.triangle) == 0:
         return
     chunk = screen.box_px.cumsum(0) // _CHUNK_PX
@@ -142,7 +145,7 @@ def _chunks(screen: _Screen) -> Iterator[_Screen]:
 
 
 def _cover(screen: _Screen, width_px: int) -> tuple[Tensor, Tensor]:
-    """Each pair of a triangle and a pixel whose centre it holds: index into `screen` [P], pixel [P]."""
+    """Return all pairs of a triangle and a pixel centre inside it: index into `screen` [P], pixel [P]."""
     owner, row = _expand(screen.first_row, screen.rows)
     left, right = _row_crossings(screen.corners_px, owner, row.double() + PIXEL_CENTRE)
     first = _first_centre(left).clamp(0, width_px).long()
@@ -152,23 +155,23 @@ def _cover(screen: _Screen, width_px: int) -> tuple[Tensor, Tensor]:
 
 
 def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """Runs of integers written out: the run's index [sum(count)] and first + 0, 1, ... count - 1."""
+    """Expand runs of integers: the run's index [sum(count)] and first + 0, 1, ... count - 1."""
     run = torch.repeat_interleave(count)
     begin = count.cumsum(0) - count
     return run, torch.arange(len(run), device=run.device) + (first - begin)[run]
 
 
 def _row_crossings(corners_px: Tensor, owner: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
-    """Left and right end [R] of the part of a triangle that the line y = const runs through."""
+    """Return where the line at height `y_px` [R] enters and leaves the triangle `owner` [R]."""
     left = torch.full_like(y_px, torch.inf)
     right = torch.full_like(y_px, -torch.inf)
     for k in range(3):
         start, end = corners_px[:, k], corners_px[:, (k + 1) % 3]
-        # From the upper end down, and from the left where level: the neighbour then rounds alike.
+        # Order the ends canonically (top, then left), so that the neighbouring triangle rounds equally.
         swap = (start[:, 1] > end[:, 1]) | ((start[:, 1] == end[:, 1]) & (start[:, 0] > end[:, 0]))
         x0, y0 = torch.where(swap[:, None], end, start).unbind(-1)
         x1, y1 = torch.where(swap[:, None], start, end).unbind(-1)
-        slope = (x1 - x0) / (y1 - y0)  # infinite or NaN for a level edge, which no row crosses
+        slope = (x1 - x0) / (y1 - y0)  # infinite or NaN for a horizontal edge, which no row crosses
         x = x0[owner] + (y_px - y0[owner]) * slope[owner]
         crosses = (y0[owner] <= y_px) & (y_px < y1[owner])
         left = torch.where(crosses, torch.minimum(left, x), left)
@@ -177,7 +180,7 @@ def _row_crossings(corners_px: Tensor, owner: Tensor, y_px: Tensor) -> tuple[Ten
 
 
 def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int) -> Tensor:
-    """Depth [P] float32 of each pair; 1 / depth is linear on the screen."""
+    """Return the depth [P] float32 of each pair; 1 / depth is linear in the image."""
     a, b, c = screen.corners_px.unbind(1)
     (abx, aby), (acx, acy) = (b - a).unbind(-1), (c - a).unbind(-1)
     ia, ib, ic = screen.inverse_depth.unbind(-1)
@@ -187,17 +190,20 @@ def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int
     base = ia - slope_x * (a[:, 0] - PIXEL_CENTRE) - slope_y * (a[:, 1] - PIXEL_CENTRE)
     column, row = pixel % width_px, pixel // width_px
     inverse = base[owner] + slope_x[owner] * column + slope_y[owner] * row
-    low, high = screen.inverse_depth.amin(-1), screen.inverse_depth.amax(-1)  # slivers round badly
+    low, high = (
+        screen.inverse_depth.amin(-1),
+        screen.inverse_depth.amax(-1),
+    )  # slivers round badly
     return (1 / inverse.clamp(low[owner], high[owner])).float()
 
 
 def _hit(
     vertices_camera: Tensor, triangles: Tensor, seen: Tensor, pixel: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Barycentric weights [P, 3] and depth [P], float64, where pixels [P] see triangles `seen` [P].
+    """Return barycentric weights [P, 3] and depth [P], float64, of triangles `seen` [P] at pixels [P].
 
-    With a, b, c the corners and w the weights, w_a a + w_b b + w_c c = depth * ray; by Cramer's rule
-    w_a = depth * ray . (b x c) / (a . (b x c)), and so on round. Float64, since much cancels.
+    For corners a, b, c and weights w: w_a a + w_b b + w_c c = depth * ray. By Cramer's rule
+    w_a = depth * ray . (b x c) / (a . (b x c)), and cyclically. Float64, because of cancellation.
     """
     corners = vertices_camera.double().nan_to_num()[triangles].permute(1, 2, 0).contiguous()  # [3, xyz, F]
     a, b, c = corners
@@ -211,7 +217,7 @@ def _hit(
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:
-    """Cross product of [3, N]; an axis at a time is several times faster than along the last."""
+    """Return the cross product of [3, N]; several times faster than with the axis last."""
     return torch.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

@@ -1,8 +1,8 @@
-"""Between pictures and UV textures: unwrap, inpaint, normals, render.
+"""Textures in UV space: render to an image, unwrap from an image, inpaint, and bake normals.
 
-A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid sits at
-(j, i) / (side - 1). Textures are [C, T, T]; u runs right, v down, texel (row i, column j) is centred at
-((j + 0.5) / T, (i + 0.5) / T).
+A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid is at
+(j, i) / (side - 1). Textures are [C, T, T]; u runs right, v down, and the centre of texel (row i, column j)
+is at ((j + 0.5) / T, (i + 0.5) / T).
 """
 
 import math
@@ -15,29 +15,30 @@ from torch import Tensor
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 
-_TINY = 1e-12
+_TINY = 1e-12  # avoids division by zero
+_STEP_QUANTILE = 0.95  # of the distance between texels in an image, by which it is scaled down
 
 
 @dataclass(frozen=True)
 class UnwrapSettings:
-    """When a texel counts as seen."""
+    """Conditions for a texel to count as visible."""
 
-    hidden_m: float = 0.0025  # a texel is hidden if something lies this much in front of it
-    unseen_cosine: float = 0.12  # to the viewing ray; at and below it a texel counts as unseen,
-    seen_cosine: float = 0.35  # at and above it as seen, smoothly in between
-    depth_side_px: int = 512  # the depth map is at least this long, whatever the picture's size
-    samples: int = 4  # at most samples x samples per texel; a finer picture is averaged down first
+    hidden_m: float = 0.0025  # a texel is hidden if a surface is this far in front of it
+    unseen_cosine: float = 0.12  # of normal and viewing ray: invisible at and below this,
+    seen_cosine: float = 0.35  # fully visible at and above this, smooth in between
+    depth_side_px: int = 512  # least length of the depth map's longer side
+    samples: int = 4  # at most samples x samples in a texel; a larger image is scaled down first
 
 
 def vertex_normals(vertices: Tensor, triangles: Tensor) -> Tensor:
-    """Unit normals [V, 3], area-weighted means over the triangles; +z where there is no area at all."""
+    """Return unit normals [V, 3], means of the triangles' normals weighted by area; +z without any area."""
     a, b, c = vertices[triangles].unbind(1)
     area_normals = torch.linalg.cross(b - a, c - a).repeat_interleave(3, 0)
     return _unit(torch.zeros_like(vertices).index_add(0, triangles.reshape(-1), area_normals))
 
 
 def _unit(vectors: Tensor) -> Tensor:
-    """Unit vectors [..., 3]; zero vectors become +z, without a gradient."""
+    """Normalize vectors [..., 3]; zero vectors become +z, without a gradient."""
     length2 = _dot(vectors, vectors)
     zero = (length2 == 0)[..., None]
     up = torch.tensor([0.0, 0, 1], dtype=vectors.dtype, device=vectors.device)
@@ -46,20 +47,20 @@ def _unit(vectors: Tensor) -> Tensor:
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]  # sum(-1) is far slower
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]  # sum(-1) is much slower
 
 
 def texel_centres_uv(
     side: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """(u, v) of every texel's centre [T, T, 2]."""
+    """Return (u, v) of every texel's centre [T, T, 2]."""
     centre = (torch.arange(side, dtype=dtype, device=device) + 0.5) / side
     v, u = torch.meshgrid(centre, centre, indexing="ij")
     return torch.stack([u, v], -1)
 
 
 def bake_attributes(attributes: Tensor, grid_side: int, texture_side: int) -> Tensor:
-    """Vertex attributes [V, C] of a uniform grid at the texels' centres [C, T, T]."""
+    """Interpolate vertex attributes [V, C] of a uniform grid to the texels' centres [C, T, T]."""
     if len(attributes) != grid_side**2:
         raise ValueError(f"a grid of side {grid_side} has {grid_side**2} vertices, not {len(attributes)}")
     grid = attributes.T.reshape(1, -1, grid_side, grid_side)
@@ -68,14 +69,14 @@ def bake_attributes(attributes: Tensor, grid_side: int, texture_side: int) -> Te
 
 
 def normal_map(vertices_camera: Tensor, triangles: Tensor, texture_side: int) -> Tensor:
-    """Camera-space unit normals of a uniform grid mesh in UV [3, T, T]."""
+    """Return camera-space unit normals [3, T, T] of a uniform grid mesh in UV space."""
     normals = vertex_normals(vertices_camera, triangles)
     baked = bake_attributes(normals, math.isqrt(len(normals)), texture_side)
     return _unit(baked.permute(1, 2, 0)).permute(2, 0, 1)
 
 
 def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
-    """Texture [C, T, T] (or any picture) at (u, v) [H, W, 2], bilinear, border-clamped: [H, W, C]."""
+    """Sample a texture [C, T, T] at (u, v) [H, W, 2]: [H, W, C], bilinear, clamped at the border."""
     grid = (2 * uv - 1)[None].to(texture.dtype)
     return F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
 
@@ -83,9 +84,10 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
 def render_texture(
     texture: Tensor, vertices_camera: Tensor, triangles: Tensor, uv: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Picture [H, W, C] of a textured mesh, black beyond it, and coverage [H, W], 0 or 1 at its centres.
+    """Render a textured mesh with vertex `uv` [V, 2] to an image [H, W, C] and a coverage [H, W] of 0 or 1.
 
-    `uv` [V, 2] are the vertices'. Differentiable in the texture and, by the interpolation, in the vertices.
+    The image is black outside the mesh. Differentiable in the texture and, through the interpolation, in the
+    vertices.
     """
     fragments = rasterize(vertices_camera, triangles, camera)
     coverage = fragments.covered.to(texture.dtype)
@@ -101,16 +103,15 @@ def unwrap(
     texture_side: int,
     settings: UnwrapSettings = UnwrapSettings(),
 ) -> tuple[Tensor, Tensor]:
-    """Picture [C, H, W] to the texture [C, T, T] of a uniform grid mesh, and how well it is seen [T, T].
+    """Unwrap an image [C, H, W] to a uniform grid mesh's texture [C, T, T]; also return visibility [T, T].
 
-    A texel is the mean of up to samples x samples points in it, so that it averages over the pixels that it
-    covers; hidden points do not enter, and the others weigh by how squarely they are seen. The texture is 0
-    where nothing is seen. Differentiable in the picture and the vertices; visibility is a constant.
+    A texel is the weighted mean of up to samples x samples points in it, so that it averages over the pixels
+    that it covers. A point's weight is 0 if it is hidden, and falls with the angle between normal and viewing
+    ray. The texture is 0 where visibility is 0. Differentiable in the image and the vertices; visibility is
+    constant.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
-        raise ValueError(
-            f"the picture is {tuple(image.shape)}, the camera's {camera.height_px, camera.width_px}"
-        )
+        raise ValueError(f"image {tuple(image.shape)}: the camera's is {camera.height_px, camera.width_px}")
     image, camera, samples = _match_scale(image, vertices_camera, camera, texture_side, settings.samples)
     side = math.isqrt(len(vertices_camera))
     points = bake_attributes(vertices_camera, side, texture_side * samples).permute(1, 2, 0)
@@ -127,11 +128,11 @@ def unwrap(
 def _match_scale(
     image: Tensor, vertices_camera: Tensor, camera: Camera, texture_side: int, samples: int
 ) -> tuple[Tensor, Camera, int]:
-    """Average the picture down by a power of two, and choose the samples a texel, for a sample a pixel."""
+    """Scale the image down by a power of two, and choose samples per texel, for about one sample a pixel."""
     side = math.isqrt(len(vertices_camera))
     px = bake_attributes(project(vertices_camera.detach(), camera), side, texture_side)
     step_px = torch.cat([px.diff(dim=1).norm(dim=0).flatten(), px.diff(dim=2).norm(dim=0).flatten()])
-    step = float(step_px.nan_to_num(0, 0).sort().values[int(0.95 * len(step_px))])
+    step = float(step_px.nan_to_num(0, 0).sort().values[int(_STEP_QUANTILE * len(step_px))])
     shrink = 2 ** max(0, math.ceil(math.log2(max(step, 1) / samples)))
     if shrink > 1:
         camera = Camera(
@@ -148,7 +149,7 @@ def _match_scale(
 def _visibility(
     points: Tensor, vertices_camera: Tensor, triangles: Tensor, camera: Camera, settings: UnwrapSettings
 ) -> Tensor:
-    """How well each point [T, T, 3] of the mesh is seen [T, T] in 0..1."""
+    """Return the visibility [T, T] in 0..1 of points [T, T, 3] of the mesh."""
     normals = normal_map(vertices_camera, triangles, points.shape[0]).permute(1, 2, 0)
     cosine = -_dot(normals, points) / _dot(points, points).sqrt()
     fade = ((cosine - settings.unseen_cosine) / (settings.seen_cosine - settings.unseen_cosine)).clamp(0, 1)
@@ -160,6 +161,7 @@ def _visibility(
 
 
 def _depth_camera(camera: Camera, settings: UnwrapSettings) -> Camera:
+    """Return the camera of the depth map: the image's, scaled up to the least size."""
     scale = max(1.0, settings.depth_side_px / max(camera.width_px, camera.height_px))
     width_px, height_px = math.ceil(camera.width_px * scale), math.ceil(camera.height_px * scale)
     return Camera(camera.focal_px * scale, width_px, height_px, camera.cx_px * scale, camera.cy_px * scale)
@@ -168,10 +170,10 @@ def _depth_camera(camera: Camera, settings: UnwrapSettings) -> Camera:
 def _in_front_by(
     points: Tensor, normals: Tensor, vertices_camera: Tensor, triangles: Tensor, camera: Camera
 ) -> Tensor:
-    """By how many metres the nearest surface lies in front of each point [T, T]; negative if behind.
+    """Return how many metres the nearest surface is in front of each point [T, T]; negative if behind.
 
-    Depth is compared where the depth map has it, at the pixel's centre: the point is moved there along its
-    own tangent plane, so that a slanted surface does not hide itself.
+    The depth map is exact at pixel centres, so the point is moved to the centre of its pixel along its
+    tangent plane; otherwise a slanted surface would hide itself.
     """
     depth_m = rasterize(vertices_camera, triangles, camera).depth_m
     px = project(points, camera).nan_to_num(0, 0, 0)
@@ -184,15 +186,15 @@ def _in_front_by(
 
 
 def inpaint(texture: Tensor, visible: Tensor) -> Tensor:
-    """Texture [C, T, T] with its unseen texels filled from the seen ones nearest to them, by push and pull.
+    """Fill invisible texels of a texture [C, T, T] from the nearest visible ones (push-pull).
 
-    `visible` [T, T] in 0..1 is how far each texel is trusted; what is fully seen is returned as it was.
+    `visible` [T, T] in 0..1 is the weight of each texel; fully visible texels stay unchanged.
     """
     if min(visible.shape) == 1:
         return texture * (visible > 0)
     weight = F.avg_pool2d(visible[None], 2, ceil_mode=True, count_include_pad=False)
     coarse = F.avg_pool2d(texture * visible, 2, ceil_mode=True, count_include_pad=False)
     coarse = coarse / weight.clamp(min=_TINY)
-    filled = inpaint(coarse, (4 * weight[0]).clamp(max=1))  # one seen texel out of four is enough below
+    filled = inpaint(coarse, (4 * weight[0]).clamp(max=1))  # one visible texel of four is enough
     fill = F.interpolate(filled[None], size=visible.shape, mode="bilinear", align_corners=False)[0]
     return visible * texture + (1 - visible) * fill

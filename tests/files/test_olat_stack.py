@@ -74,7 +74,7 @@ def test_other_programs_see_a_part_a_light(path: Path) -> None:
 def test_oiiotool_opens_it(path: Path) -> None:
     tool = Path(sys.executable).parent / "oiiotool"
     if not tool.is_file():
-        pytest.skip("oiiotool is not installed beside python")
+        pytest.skip("oiiotool is not installed in the folder of python")
     said = subprocess.run([tool, "--info", path], capture_output=True, text=True, check=True).stdout
     assert f"({LIGHTS + 1} subimages)" in said
 

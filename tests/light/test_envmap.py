@@ -12,7 +12,7 @@ from facerf_cli.light.sphere import (
     latlong_solid_angles,
     rig_directions,
 )
-from tests.oracles.envmap import weigh_slowly
+from tests.oracles.envmap import envmap_weights_slowly
 
 RIG = rig_directions()
 
@@ -53,7 +53,7 @@ def test_a_constant_map_lights_a_white_surface_with_its_own_radiance(height: int
 @pytest.mark.parametrize("rotate_deg", [0, 10.0])
 def test_a_coarse_map_is_cut_at_the_cells_and_not_at_its_pixels(rotate_deg: float) -> None:
     envmap = torch.rand(4, 8, 3, generator=torch.Generator().manual_seed(5))
-    truth = torch.from_numpy(weigh_slowly(envmap.numpy(), RIG.numpy(), rotate_deg)).float()
+    truth = torch.from_numpy(envmap_weights_slowly(envmap.numpy(), RIG.numpy(), rotate_deg)).float()
     error = envmap_weights(envmap, RIG, rotate_deg) - truth
     assert error.abs().max() < 0.04 * truth.mean()
     assert error.std() < 0.01 * truth.mean()

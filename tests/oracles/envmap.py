@@ -1,14 +1,14 @@
-"""A map's weights by asking, many times in every pixel, which light is nearest; slow and obvious."""
+"""Weights of an environment map: the nearest light at many points of every pixel; slow and obvious."""
 
 import math
 
 import numpy as np
 
 
-def weigh_slowly(
+def envmap_weights_slowly(
     envmap: np.ndarray, directions: np.ndarray, rotate_deg: float, samples: int = 80
 ) -> np.ndarray:
-    """Weights [L, 3] of lights [L, 3] under a map [H, W, 3], from samples x samples points a pixel."""
+    """Return weights [L, 3] of lights [L, 3] under a map [H, W, 3], from samples x samples points a pixel."""
     height, width = envmap.shape[:2]
     weights = np.zeros((len(directions), 3))
     for row in range(height):

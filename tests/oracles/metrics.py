@@ -1,4 +1,4 @@
-"""The metrics, slowly: each by its definition, a pixel at a time."""
+"""Metrics, slowly: each by its definition, one pixel at a time."""
 
 import math
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def best_scale(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """The least of the error over scales, by a search without derivatives."""
+    """Minimize the error over scales by ternary search."""
     low, high = 0.0, 100.0
     for _ in range(200):
         third = (high - low) / 3
@@ -35,7 +35,7 @@ def mse(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
 
 
 def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Wang et al. 2004 about each pixel; pictures go on mirrored beyond their edge, which is twice there."""
+    """Wang et al. 2004 at each pixel; beyond the border the image is mirrored, with its edge repeated."""
     scale = best_scale(prediction, truth, mask)
     window = [math.exp(-0.5 * (step / 1.5) ** 2) for step in range(-5, 6)]
     total = weight = 0.0

@@ -1,4 +1,4 @@
-"""Every triangle against every pixel, by solving for the ray's hit; slow and obvious."""
+"""A rasterizer that solves for the hit of every pixel's ray with every triangle; slow and obvious."""
 
 import torch
 from torch import Tensor
@@ -9,7 +9,7 @@ from facerf_cli.raster.camera import Camera
 def rasterize_slowly(
     vertices_camera: Tensor, triangles: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Triangle [H, W] (-1 = none), barycentric [H, W, 3] and depth [H, W] (inf = none), differentiable."""
+    """Return triangle [H, W] (-1 = none), barycentric [H, W, 3] and depth [H, W] (inf = none)."""
     triangle = torch.full((camera.height_px, camera.width_px), -1)
     nothing, infinity = torch.zeros(3, dtype=torch.float64), torch.tensor(torch.inf, dtype=torch.float64)
     barycentric = [[nothing] * camera.width_px for _ in range(camera.height_px)]

@@ -1,4 +1,4 @@
-"""Real spherical harmonics out of scipy's complex ones, an index at a time; slow and obvious."""
+"""Real spherical harmonics from scipy's complex ones, one index at a time; slow and obvious."""
 
 import math
 
@@ -7,9 +7,9 @@ from scipy.special import sph_harm_y
 
 
 def real_harmonic(degree: int, m: int, direction: np.ndarray) -> float:
-    """Y_lm along one unit direction [3]: sqrt(2) times the real (m > 0) or imaginary (m < 0) part.
+    """Return Y_lm at a unit direction [3]: sqrt(2) times the real (m > 0) or imaginary (m < 0) part.
 
-    scipy's carry the Condon-Shortley phase (-1)^m, which is taken out.
+    scipy includes the Condon-Shortley phase (-1)^m, which is removed.
     """
     polar, azimuth = math.acos(direction[2]), math.atan2(direction[1], direction[0])
     value = complex(sph_harm_y(degree, abs(m), polar, azimuth)) * (-1) ** m
@@ -17,7 +17,7 @@ def real_harmonic(degree: int, m: int, direction: np.ndarray) -> float:
 
 
 def project_slowly(envmap: np.ndarray, order: int, samples: int) -> np.ndarray:
-    """Coefficients [K, C] of a lat-long map [H, W, C], from samples x samples points in every pixel."""
+    """Return coefficients [K, C] of a lat-long map [H, W, C], from samples x samples points a pixel."""
     height, width = envmap.shape[:2]
     coefficients = np.zeros(((order + 1) ** 2, envmap.shape[2]))
     rows, columns = height * samples, width * samples

@@ -1,10 +1,10 @@
-"""VGG-16's trunk, slowly: each output value by itself, from the numbers of its neighbourhood."""
+"""VGG-16's convolutions, slowly: each output value from its neighbourhood."""
 
 import numpy as np
 
 
 def features(tensors: dict[str, np.ndarray], linear: np.ndarray) -> dict[str, np.ndarray]:
-    """conv1_2, conv2_2 and conv3_3 after their ReLU, [C, H, W], of a linear picture [3, H, W]."""
+    """Return conv1_2, conv2_2 and conv3_3 after their ReLU, [C, H, W], of a linear image [3, H, W]."""
     encoded = np.array([[[_srgb(value) for value in row] for row in plane] for plane in linear])
     x = np.stack([(encoded[0] - 0.485) / 0.229, (encoded[1] - 0.456) / 0.224, (encoded[2] - 0.406) / 0.225])
     found = {}
@@ -20,9 +20,9 @@ def features(tensors: dict[str, np.ndarray], linear: np.ndarray) -> dict[str, np
         "conv3_3": 14,
     }.items():
         if place is None:
-            x = _halved(x)
+            x = halved(x)
         else:
-            x = _convolved(x, tensors[f"features.{place}.weight"], tensors[f"features.{place}.bias"])
+            x = convolved(x, tensors[f"features.{place}.weight"], tensors[f"features.{place}.bias"])
             found[name] = x
     return {name: found[name] for name in ("conv1_2", "conv2_2", "conv3_3")}
 
@@ -31,7 +31,7 @@ def _srgb(linear: float) -> float:
     return 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
 
 
-def _convolved(x: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
+def convolved(x: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> np.ndarray:
     _, height, width = x.shape
     around = np.zeros((x.shape[0], height + 2, width + 2))
     around[:, 1:-1, 1:-1] = x
@@ -43,7 +43,7 @@ def _convolved(x: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> np.ndarra
     return result
 
 
-def _halved(x: np.ndarray) -> np.ndarray:
+def halved(x: np.ndarray) -> np.ndarray:
     channels, height, width = x.shape
     result = np.empty((channels, height // 2, width // 2))
     for i in range(height // 2):

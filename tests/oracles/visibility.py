@@ -4,7 +4,7 @@ import numpy as np
 
 
 def occluded(origins: np.ndarray, direction: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Whether a triangle [F, 3, 3] lies along `direction` [3] from each origin [N, 3]; bool [N]."""
+    """Return whether a triangle [F, 3, 3] lies along `direction` [3] from each origin [N, 3]; bool [N]."""
     edge_1, edge_2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(direction, edge_2)
     determinant = (edge_1 * p).sum(-1)

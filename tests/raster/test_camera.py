@@ -22,17 +22,17 @@ def test_projection_by_hand() -> None:
     torch.testing.assert_close(px, torch.tensor([[21.0, 9], [31, 9], [21, 4]]))
 
 
-def test_pixel_centres_of_a_image_that_is_not_square() -> None:
+def test_pixel_centres_of_an_image_that_is_not_square() -> None:
     centres = pixel_centres_px(Camera(1, 7, 4, 0, 0))
     assert centres.shape == (4, 7, 2)
     assert centres[0, 0].tolist() == [0.5, 0.5] and centres[3, 6].tolist() == [6.5, 3.5]
 
 
 def test_pose_signs() -> None:
-    assert (pose_to_rotation(30, 0, 0) @ NOSE)[0] > 0.4  # to the picture's right
+    assert (pose_to_rotation(30, 0, 0) @ NOSE)[0] > 0.4  # to the image's right
     assert (pose_to_rotation(0, 30, 0) @ NOSE)[1] < -0.4  # down
     up = pose_to_rotation(0, 0, 30) @ torch.tensor([0.0, 1, 0])
-    assert up[0] < -0.4  # counter-clockwise: the crown goes to the picture's left
+    assert up[0] < -0.4  # counter-clockwise: the crown goes to the image's left
 
 
 POSES = [(0, 0, 0), (10, 20, 30), (-170, 60, 5), (45, -89, -170), (30, 90, 0), (30, -90, 0)]

@@ -10,7 +10,7 @@ WIDE = Camera(focal_px=40.0, width_px=37, height_px=22, cx_px=17.3, cy_px=11.9) 
 
 
 def triangle_soup(count: int, seed: int, spread_m: float = 0.8) -> tuple[Tensor, Tensor]:
-    """Triangles of all sizes that pierce each other and leave the picture, float64."""
+    """Triangles of all sizes that pierce each other and leave the image, float64."""
     generator = torch.Generator().manual_seed(seed)
     centre = torch.randn(count, 1, 3, generator=generator).double() * torch.tensor([0.4, 0.3, 0.2])
     size = spread_m * 10 ** (-1.5 * torch.rand(count, 1, 1, generator=generator, dtype=torch.float64))

@@ -164,7 +164,7 @@ def test_a_slanted_plane_does_not_hide_itself() -> None:
     assert visible.min() > 0.5
 
 
-def test_what_lies_outside_the_image_is_unseen() -> None:
+def test_texels_outside_the_image_are_invisible() -> None:
     narrow = Camera(900.0, 80, 220, 40.0, 104.0)
     vertices = head()
     _, visible = unwrap(torch.ones(1, 220, 80), vertices, TRIANGLES, narrow, 128)
@@ -175,7 +175,7 @@ def test_what_lies_outside_the_image_is_unseen() -> None:
     assert behind.max() == 0
 
 
-def test_unwrap_refuses_a_image_of_another_size() -> None:
+def test_unwrap_refuses_an_image_of_another_size() -> None:
     with pytest.raises(ValueError, match="220, 300"):
         unwrap(torch.ones(3, 300, 220), head(), TRIANGLES, CAMERA, 32)
 
