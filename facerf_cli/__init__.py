@@ -1,3 +1,40 @@
-"""facerf: one photo of a face to its reflectance field."""
+"""facerf: one photo of a face to its reflectance field. The Python API; `docs/python.md` shows its use.
+
+    import facerf_cli as facerf
+
+Names are loaded from `facerf_cli.api` at their first use, so that the command line starts without torch.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from facerf_cli.api import (
+        Light,
+        estimate_light,
+        fit_photo,
+        load_models,
+        predict_olat,
+        read_image,
+        relight,
+        write_image,
+    )
 
 __version__ = "0.1.0"
+__all__ = [
+    "Light",
+    "estimate_light",
+    "fit_photo",
+    "load_models",
+    "predict_olat",
+    "read_image",
+    "relight",
+    "write_image",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from facerf_cli import api
+
+    return getattr(api, name)

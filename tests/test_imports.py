@@ -10,7 +10,7 @@ LEVELS = (
     ("__main__", "manpages"),
     ("main",),
     ("cli",),
-    ("evaluation", "training"),
+    ("evaluation", "training", "api"),
     ("dataset",),
     ("synth", "capture"),
     ("pipeline",),

@@ -18,6 +18,7 @@ _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
     "photos": ("joint",),
     "light_features": ("joint", "reflectance"),
+    "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),
     "mean_face": ("joint", "reflectance"),
     "views": _TEXTURE_STAGES,
@@ -50,6 +51,7 @@ class TrainOptions:
 
     output: Path
     preset: Preset
+    form: str
     stage: Stage
     training: TrainSettings
     resume: bool
@@ -81,12 +83,21 @@ def train(
             "checkpoint; paper: those of the paper; tiny: small networks, for trials."
         ),
     ] = "default",
+    form: Annotated[
+        str | None,
+        _run(
+            metavar="NAME",
+            help="Train this form of the Reflectance Network: default, paper, or a form of your own "
+            "(docs/design.md).",
+            show_default="paper with --preset paper, else default",
+        ),
+    ] = None,
     stage: Annotated[
         Stage | None,
         _run(
             help="Train the networks of a stage. reflectance: the Reflectance Network, on textures; "
-            "geometry: "
-            "the Geometry Network, on rendered heads; joint: both, through the rasterizer; light-features: "
+            "geometry: the Geometry Network, on rendered heads; joint: both, through the rasterizer; "
+            "light-features: "
             "the network of --light-features; diffuse-sh: the network of that baseline.",
             show_default="joint with --preset paper, else reflectance",
         ),
@@ -251,6 +262,7 @@ def train(
         TrainOptions(
             output=output,
             preset=preset,
+            form=form or ("paper" if preset == "paper" else "default"),
             stage=stage,
             training=training,
             resume=resume,
@@ -291,6 +303,8 @@ def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
         raise UsageError("--texture-size: applies to a dataset; give --dataset, too")
     if {"mean_face", "dataset"} <= given and stage == "reflectance":
         raise UsageError("--mean-face: the dataset is fitted already; give --stage joint, or synthetic heads")
+    if {"form", "start_from"} <= given:
+        raise UsageError("--form: --start-from fixes the form; give one of them")
     if {"without_normals", "start_from"} <= given:
         raise UsageError("--without-normals: --start-from fixes the networks' inputs; give one of them")
 

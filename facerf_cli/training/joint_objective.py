@@ -25,7 +25,6 @@ from facerf_cli.face.topology import (
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import resize
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
 from facerf_cli.raster.camera import Camera, crop_camera
 from facerf_cli.training.losses import (
     MaskedPair,
@@ -114,9 +113,10 @@ class JointObjective(Objective):
         self._train = open_pairs(dataset, "train", settings.crop_px)
         self._held_out = open_pairs(dataset, "validation", settings.crop_px)
         self._validation: dict[str, list[CropPairs]] | None = None
-        if isinstance(reflectance, DefaultReflectanceNetwork) and not reflectance.mean_normals.any():
-            rig_lights = reflectance.settings.rig_lights
-            reflectance.set_mean_face(*DatasetTextures(dataset, model, 0, {}, {}, rig_lights).mean_face())
+        network: Any = reflectance  # of any form (`network/reflectance.py`)
+        if network.rig_lights and not network.has_mean_face:
+            textures = DatasetTextures(dataset, model, 0, {}, {}, network.rig_lights)
+            network.set_mean_face(*textures.mean_face())
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compile the networks alone; shapes in the rasterizer depend on what the camera sees."""

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.feature_networks import LightNetwork, feature_distance
-from facerf_cli.network.inputs import from_root, to_root
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
+from facerf_cli.network.inputs import from_root
+from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
@@ -52,13 +52,13 @@ class TextureObjective(Objective):
     def __init__(
         self,
         source: SampleSource,
-        network: nn.Module | None = None,
+        network: Any = None,
         light: LightNetwork | None = None,
         settings: TextureObjectiveSettings = TextureObjectiveSettings(),
     ) -> None:
         super().__init__()
-        network = network or DefaultReflectanceNetwork()
-        if isinstance(network, DefaultReflectanceNetwork):
+        network = network or make_reflectance_network()
+        if network.rig_lights:
             _set_mean_face(network, source)
         self.networks = nn.ModuleDict({"reflectance": network})
         self.chooses_by = "si_mse"
@@ -84,7 +84,7 @@ class TextureObjective(Objective):
         network, sample = self._network(), batch.sample
         with self.mixed_precision():
             encoded = network.encode(sample.source, sample.normals_source, sample.visible)
-            root = _root(network, encoded, sample).float()
+            root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
         # The network measures the exposure on seen texels alone, and divides by it.
         target = sample.target / encoded.exposure[:, None]
         terms = {"root": root_loss(root, target, sample.weight)}
@@ -132,19 +132,11 @@ class TextureObjective(Objective):
         return self.networks["reflectance"]
 
 
-def _set_mean_face(network: DefaultReflectanceNetwork, source: SampleSource) -> None:
+def _set_mean_face(network: Any, source: SampleSource) -> None:
     try:
         network.set_mean_face(*source.mean_face())
     except ValueError as error:
         raise InputError(f"{error}, as the heads were baked; give another --bank or --start-from") from None
-
-
-def _root(network: Any, encoded: Any, sample: Sample) -> Tensor:
-    """Predicted roots [B, L, 3, T, T] at the network's exposure, for both forms of the network."""
-    if isinstance(network, DefaultReflectanceNetwork):
-        return network.decode_root(encoded, sample.normals_target, sample.lights)
-    linear: Tensor = network.decode(encoded, sample.normals_target, sample.lights)
-    return to_root(linear.float() / encoded.exposure[:, None])
 
 
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:

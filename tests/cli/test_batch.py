@@ -182,7 +182,7 @@ def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: py
 def test_an_output_folder_that_cannot_be(photos: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "out"):
-        with pytest.raises(UsageError, match=f"-o {folder}: cannot write .*; give another"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; give another"):
             run([photos], folder)
 
 

@@ -125,7 +125,7 @@ def test_another_rig(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "line, complaint",
     [
-        (["--to", "usdz"], "there are latlong, json"),
+        (["--to", "usdz"], "give one of latlong, json"),
         (["--to", "latlong", "--width", "33"], "even number"),
         (["--to", "dpr", "--width", "64"], "--width is for --to latlong, blender, mitsuba"),
         (["--to", "dpr", "--to", "latlong", "--order", "3"], "--order is for --to json, sh"),

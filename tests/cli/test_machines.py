@@ -58,7 +58,7 @@ def test_they_reach_the_settings(call: Call) -> None:
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
 def test_a_wrong_share(call: Call, text: str) -> None:
-    with pytest.raises(UsageError, match=r"--shard .*: give K/N with K from 1 to N"):
+    with pytest.raises(UsageError, match=r"--shard .*: not a share; give K/N with K from 1 to N"):
         call(f"--shard={text}")
 
 
@@ -120,6 +120,6 @@ def test_the_last_shard_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture) -
     for item in items:
         assert not sums_up(items, outputs_of, options, shard)
         outputs_of(item)[0].touch()
-    assert "nothing is summed up" in capsys.readouterr().err
+    assert "there is no summary" in capsys.readouterr().err
     assert sums_up(items, outputs_of, options, shard)
     assert not sums_up(items, outputs_of, BatchOptions(tmp_path, overwrite=True), shard)

@@ -8,11 +8,10 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-import facerf_cli.baselines.field
-import facerf_cli.pipeline
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
@@ -71,16 +70,15 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     predicted = []
-    predict = facerf_cli.pipeline.predict_olat
-    for module in (facerf_cli.pipeline, facerf_cli.baselines.field):
-        monkeypatch.setattr(
-            module,
-            "predict_olat",
-            lambda *given, **named: predicted.append("quotient" in named) or predict(*given, **named),
-        )
+    olats = Field.olats
+    monkeypatch.setattr(
+        Field,
+        "olats",
+        lambda self, *given: predicted.append(self.quotient is not None) or olats(self, *given),
+    )
     line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0", "--ball"]
     assert relight(given, tmp_path, *line) == 0
-    assert predicted == [False, True]  # to estimate the photo's own light, and for all that is asked
+    assert predicted == [False, True]  # for the photo's own light, and for all setups
     names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
     names.append("astronaut_light_40_10+-40_0_1_0_0")
     images = sorted(name + suffix for name in names for suffix in (".exr", ".png"))

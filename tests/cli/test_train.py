@@ -49,6 +49,20 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
     assert not (tmp_path / "run").exists()
 
 
+def test_an_unknown_form_is_named_before_baking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", "-o", str(tmp_path / "run"), "--form", "cubist"]) == 2
+    assert "form cubist: no such Reflectance Network; give default or paper" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
+    write_small_dataset(tmp_path / "data", counts=(1, 1, 1), lights=30, crop_px=64)
+    line = ["--dataset", str(tmp_path / "data"), "--texture-size", "32", "--steps", "1"]
+    assert main(["train", "-o", str(tmp_path / "run"), "--preset", "tiny", "--form", "paper", *line]) == 0
+    networks, metadata = load_networks(tmp_path / "run/last.safetensors", LAYOUT_VERSION)
+    assert metadata["networks"]["reflectance"]["form"] == "paper" and "reflectance" in networks
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -25,8 +25,7 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
-from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
+from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
 from facerf_cli.synth.face_crops import RenderedFaces
 from facerf_cli.synth.head_images import add_head_images
@@ -47,6 +46,16 @@ from facerf_cli.training.texture_objective import TextureObjective, TextureObjec
 _WORKERS_ON_GPU = 4
 _TINY_WIDTHS = (8, 12, 16)
 _TINY_LIGHTS = 20  # of the rig that the preset `tiny` bakes heads under
+_TINY_FORMS: dict[str, dict[str, Any]] = {  # settings of the forms with the preset `tiny`
+    "default": {
+        "side": 32,
+        "encoder_widths": _TINY_WIDTHS,
+        "decoder_widths": _TINY_WIDTHS,
+        "template_channels": 2,
+        "rig_lights": _TINY_LIGHTS,
+    },
+    "paper": {"side": 32, "widths": _TINY_WIDTHS, "features": 8},
+}
 
 Networks = dict[str, nn.Module]  # by name; of --start-from
 
@@ -189,15 +198,10 @@ def _photos(options: TrainOptions, side: int) -> Photos | None:
     return open_photos(paths, options.output / "photos", side, options.jobs)
 
 
-def _reflectance_network(options: TrainOptions) -> nn.Module:
-    normals = not options.without_normals
-    if options.preset == "paper":
-        return PaperReflectanceNetwork(PaperReflectanceSettings(normals=normals))
-    if options.preset == "tiny":
-        return DefaultReflectanceNetwork(
-            DefaultReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 2, _TINY_LIGHTS, normals)
-        )
-    return DefaultReflectanceNetwork(DefaultReflectanceSettings(normals=normals))
+def _reflectance_network(options: TrainOptions) -> Any:
+    settings = _TINY_FORMS.get(options.form, {}) if options.preset == "tiny" else {}
+    ablation = {"normals": False} if options.without_normals else {}
+    return make_reflectance_network(options.form, **settings, **ablation)
 
 
 def _geometry_network(options: TrainOptions, mean_translation_m: tuple[float, float, float]) -> nn.Module:

@@ -1,0 +1,169 @@
+"""The Python API: what a notebook calls (docs/python.md). numpy in, numpy out; the pipeline does the work.
+
+Images are scene-linear Rec.709, float32 [H, W, 3]; angles in degrees; the units of light are those of the
+command line (docs/design.md).
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from facerf_cli import pipeline
+from facerf_cli.baselines import Kind
+from facerf_cli.composite import Target
+from facerf_cli.errors import UsageError
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import Head
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.files import images
+from facerf_cli.light.envmap import check_envmap, envmap_weights
+from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.models import Models
+from facerf_cli.models import load_models as load
+from facerf_cli.raster.camera import pose_to_rotation
+
+Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Single lights that shine together: unit directions toward them [L, 3], rgb weights [L, 3].
+
+    Directions are in camera space. Lights add: `Light.single(40, 20) + Light.single(-90, 0, (1, 0, 0))`.
+    """
+
+    directions: np.ndarray
+    weights: np.ndarray
+
+    @staticmethod
+    def single(
+        azimuth_deg: float, elevation_deg: float, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ) -> "Light":
+        """One light; azimuth > 0 is the image's right, elevation > 0 above."""
+        direction = azel_to_direction(azimuth_deg, elevation_deg)
+        return Light(direction.numpy()[None], np.array([rgb], np.float32))
+
+    @staticmethod
+    def from_envmap(envmap: np.ndarray, rotate_deg: float = 0.0, lights: int = 150) -> "Light":
+        """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
+
+        Raises InputError for an array that is not such a map.
+        """
+        linear = torch.from_numpy(np.ascontiguousarray(envmap, np.float32))
+        check_envmap(linear)
+        directions = rig_directions(lights)
+        return Light(directions.numpy(), envmap_weights(linear, directions, rotate_deg).numpy())
+
+    def to_envmap(self, height: int = 256) -> np.ndarray:
+        """A lat-long map [height, 2 height, 3] with these lights."""
+        return rig_to_latlong(self._rig(), height).numpy()
+
+    def __add__(self, other: "Light") -> "Light":
+        directions = np.concatenate([self.directions, other.directions])
+        return Light(directions, np.concatenate([self.weights, other.weights]))
+
+    def _rig(self) -> RigLight:
+        directions, weights = (
+            torch.from_numpy(np.ascontiguousarray(values, np.float32))
+            for values in (self.directions, self.weights)
+        )
+        if directions.ndim != 2 or directions.shape != weights.shape or directions.shape[1] != 3:
+            shapes = f"{list(directions.shape)} and {list(weights.shape)}"
+            raise ValueError(f"directions and weights have shapes {shapes}, not [L, 3]")
+        return RigLight(directions, weights)
+
+
+def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:
+    """Read an image or a map as scene-linear Rec.709 [H, W, 3]; `colourspace` overrides the file's."""
+    return images.read_image(Path(path), colourspace).pixels
+
+
+def write_image(path: str | Path, pixels: np.ndarray, exposure: float | Literal["auto"] = 0.0) -> None:
+    """Write [H, W, 3] or [H, W, 4] as EXR, or at an exposure in EV as 8-bit PNG or JPEG, by the suffix."""
+    path, colour = Path(path), np.ascontiguousarray(pixels[..., :3], np.float32)
+    alpha = pixels[..., 3] if pixels.shape[-1] == 4 else None
+    if path.suffix.lower() == ".exr":
+        images.write_exr(path, colour, alpha)
+    else:
+        images.write_display(path, colour, exposure, alpha)
+
+
+def load_models(
+    checkpoint: str | Path | None = None, face_model: str | Path = "builtin", device: str = "cpu"
+) -> Models:
+    """Load networks (None: the shipped checkpoint) and a face model; `device` is cpu, cuda or mps."""
+    return load(None if checkpoint is None else Path(checkpoint), face_model, torch.device(device))
+
+
+def fit_photo(
+    models: Models, photo: np.ndarray, landmarks_px: np.ndarray | None = None, texture_side: int = 256
+) -> Head:
+    """Fit the face model to the largest face of a photo, or to given landmarks [68, 2] in its pixels.
+
+    Raises InputError where no face is found or the fit fails.
+    """
+    photo = np.ascontiguousarray(photo, np.float32)
+    if photo.ndim != 3 or photo.shape[2] != 3:
+        raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
+    if landmarks_px is None:
+        landmarks_px = find_faces(photo, "photo")[0].landmarks_px
+    return pipeline.fit_photo(models, photo, landmarks_px, texture_side)
+
+
+def relight(
+    models: Models,
+    photo: np.ndarray,
+    head: Head,
+    light: Light,
+    pose: Pose | None = None,
+    alone: bool = False,
+    reflectance: Kind = "field",
+    network_alone: bool = False,
+) -> np.ndarray:
+    """Relight a photo's head: the photo [H, W, 3] with it, or with `alone` the face with alpha [H, W, 4].
+
+    `pose` turns the head, which shows the face alone. `network_alone` leaves out the correction by the photo.
+    """
+    if network_alone and reflectance != "field":
+        raise UsageError("network_alone: is for the field; leave it out, or use reflectance='field'")
+    fit = _posed(head.fit, pose)
+    target = Target(fit, "face" if alone or pose is not None else "photo")
+    photo = np.ascontiguousarray(photo, np.float32)
+    with torch.no_grad():
+        of_head = pipeline.reflectance_of(models, head, reflectance, network_alone)
+        image = pipeline.relight(models, photo, head, light._rig(), target, of_head)
+    return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])
+
+
+def predict_olat(
+    models: Models,
+    head: Head,
+    lights: int | np.ndarray = 150,
+    pose: Pose | None = None,
+    network_alone: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Predict one light at a time: directions [L, 3] and UV textures [L, T, T, 3].
+
+    `lights` is the size of a uniform rig, or unit directions [L, 3] in camera space.
+    """
+    directions = rig_directions(lights) if isinstance(lights, int) else torch.from_numpy(lights).float()
+    fit = _posed(head.fit, pose)
+    rotation = None if fit is None else fit.rotation
+    batches = pipeline.predict_olat(models, head, directions, rotation, network_alone)
+    olats = torch.cat(list(batches)).permute(0, 2, 3, 1).contiguous()
+    return directions.numpy(), olats.numpy()
+
+
+def estimate_light(models: Models, head: Head, lights: int = 150, reflectance: Kind = "field") -> Light:
+    """Estimate the light of a head's photo over a rig; raises InputError where too little is visible."""
+    with torch.no_grad():
+        light = pipeline.estimate_light(models, head, reflectance, rig_directions(lights)).light
+    return Light(light.directions.numpy(), light.weights.numpy())
+
+
+def _posed(fit: FaceFit, pose: Pose | None) -> FaceFit | None:
+    return None if pose is None else replace(fit, rotation=pose_to_rotation(*pose))

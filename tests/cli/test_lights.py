@@ -1,0 +1,233 @@
+"""What `relight` is asked for: maps, rotations and lamps, and the names of what comes out."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.cli.batch import Item
+from facerf_cli.cli.items.lights import readable, weights_over_rig, weights_over_stack, write_balls
+from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations, split_frame
+from facerf_cli.cli.values import parse_lights
+from facerf_cli.errors import UsageError
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.light.sh import CONVENTION
+from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
+from facerf_cli.main import main, repeat_options
+
+HEIGHT_PX = 16
+
+
+def write_map(path: Path, bright_uv: tuple[float, float] | None = None) -> Path:
+    """A dim map, or one whose single bright texel lights a white surface that faces it with radiance 1."""
+    envmap = np.full((HEIGHT_PX, 2 * HEIGHT_PX, 3), 0.0 if bright_uv else 0.2, np.float32)
+    if bright_uv:
+        row, column = int(bright_uv[1] * HEIGHT_PX), int(bright_uv[0] * 2 * HEIGHT_PX)
+        envmap[row, column] = math.pi / latlong_solid_angles(HEIGHT_PX, 2 * HEIGHT_PX)[row, column]
+    write_exr(path, envmap)
+    return path
+
+
+def test_maps_may_be_files_folders_and_patterns(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_map(tmp_path / f"{name}.exr")
+    for given in ([str(tmp_path)], [str(tmp_path / "*.exr")], [str(tmp_path / f"{n}.exr") for n in "cab"]):
+        setups = collect_setups(given, None, [], tmp_path / "out")
+        assert [setup.name for setup in setups] == ["a", "b", "c"]
+
+
+def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rig, nothing = rig_directions(60), torch.zeros(0, 3)
+    lamp = (rig @ azel_to_direction(60, 30)).clamp_min(0)[:, None] ** 20
+    weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
+    write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
+    harmonics = Harmonics(torch.ones(9, 3), CONVENTION)
+    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=harmonics))
+    (tmp_path / "c.json").write_text("{}")
+    given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
+    setups = readable(collect_setups(given, "90", [], tmp_path / "out"))
+    assert [setup.name for setup in setups] == ["a_light_rot90", "b_rot90"]
+    assert "c.json: not a light" in caplog.text
+    (setup,) = collect_setups(given[:1], None, [], tmp_path / "out")
+    found = weights_over_stack((setup,), rig, "cell")[0]
+    assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
+    with pytest.raises(UsageError, match="no inputs"):  # a folder is walked for maps alone
+        collect_setups([str(tmp_path)], None, [], tmp_path / "out")
+
+
+def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
+    for place in ("day/sky.exr", "night/sky.exr", "night/moon.exr"):
+        write_map(tmp_path / place)
+    setups = collect_setups([str(tmp_path)], None, [], tmp_path / "out")
+    assert [setup.name for setup in setups] == ["day_sky", "moon", "night_sky"]
+
+
+def test_a_pattern_that_the_shell_expanded_stays_with_its_option() -> None:
+    line = ["relight", "a.jpg", "--envmap", "x.exr", "y.EXR", "z.hdr", "-o", "out", "stack.exr"]
+    expected = ["relight", "a.jpg", *(p for n in ("x.exr", "y.EXR", "z.hdr") for p in ("--envmap", n))]
+    expected += ["-o", "out", "stack.exr"]
+    assert repeat_options(line) == expected
+    assert repeat_options(["relight", "--envmap", "x.exr", "a.jpg", "b.exr"])[2:] == [
+        "x.exr",
+        "a.jpg",
+        "b.exr",
+    ]
+
+
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        (None, [("", "", 0.0)]),
+        ("-90", [("_rot-90", "", -90.0)]),
+        ("0:360:3", [("", ".0000", 0.0), ("", ".0001", 120.0), ("", ".0002", 240.0)]),
+        ("10:20:1", [("", ".0000", 10.0)]),
+    ],
+)
+def test_rotations(text: str | None, expected: list[tuple[str, str, float]]) -> None:
+    assert parse_rotations(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", "left", "nan", "0:360", "0:360:0", "0:360:2.5", "0:360:nan", "0:1:2:3", "::"]
+)
+def test_wrong_rotations(text: str) -> None:
+    with pytest.raises(UsageError, match="--rotate"):
+        parse_rotations(text)
+
+
+@pytest.mark.parametrize("text", ["", ";", "1", "1,2,3", "a,b", "1,2,3,4,5,6", "1,inf", "0,91", "0,0,1,-1,0"])
+def test_wrong_lamps(text: str) -> None:
+    with pytest.raises(UsageError, match="--light"):
+        collect_setups([], None, [text], Path("out"))
+
+
+def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,R,G,B, numbers separated by commas"):
+        collect_setups([], None, ["60"], Path("out"))
+    with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
+        parse_rotations("left")
+    (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
+    with pytest.raises(UsageError, match=r"rig\.txt: '0,100': an elevation is from -90"):
+        parse_lights(str(tmp_path / "rig.txt"))
+
+
+def test_no_light_and_the_same_light_twice() -> None:
+    with pytest.raises(UsageError, match="add --envmap, --light"):
+        collect_setups([], None, [], Path("out"))
+    with pytest.raises(UsageError, match="once"):
+        collect_setups([], None, ["1,2", "1.0,2"], Path("out"))
+
+
+def test_frame_numbers_stay_at_the_end() -> None:
+    assert split_frame("sky.0012") == ("sky", ".0012")
+    assert split_frame("v2.final") == ("v2.final", "")
+    still = Item(Path("a.jpg"), Path("out/a"), "a")
+    moving = Item(Path("setup.0007.jpg"), Path("out/b/setup.0007"), "b/setup.0007")
+    turned = LightSetup("sky", ".0001")
+    assert turned.output(still, "", ".exr") == Path("out/a_sky.0001.exr")
+    assert LightSetup("sky").output(moving, "_face0", ".png") == Path("out/b/setup_face0_sky.0007.png")
+    assert turned.output(moving, "", ".exr") == Path("out/b/shot_sky.0001.0007.exr")
+
+
+def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_map(tmp_path / "good.exr")
+    write_exr(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
+    (tmp_path / "text.exr").write_text("not a picture")
+    given = [str(tmp_path), str(tmp_path / "missing.exr")]
+    setups = readable(collect_setups(given, "0:360:2", ["0,0"], tmp_path / "out"))
+    assert [setup.name + setup.frame for setup in setups] == ["good.0000", "good.0001", "light_0_0"]
+
+
+@pytest.mark.parametrize("azimuth_deg", [90.0, 11.25, -45.0])
+def test_a_lamp_and_a_one_texel_map_agree(tmp_path: Path, azimuth_deg: float) -> None:
+    """Conventions: azimuth a is u = 0.5 - a / 360, and a lamp of 1 is a texel that gives radiance 1."""
+    elevation_deg = 90 / HEIGHT_PX  # a row's centre
+    u = 0.5 - azimuth_deg / 360 + 1e-4
+    envmap = write_map(tmp_path / "one.exr", (u, 0.5 - elevation_deg / 180))
+    texel_deg = 360 / (2 * HEIGHT_PX)
+    centre_deg = 180 - (math.floor(u * 2 * HEIGHT_PX) + 0.5) * texel_deg
+    setups = collect_setups([str(envmap)], None, [f"{centre_deg},{elevation_deg}"], tmp_path / "out")
+    directions, weights = weights_over_rig(setups, "600", "cell")
+    mean = torch.einsum("lc,ld->cd", weights[0], directions)
+    lamp = torch.einsum("lc,ld->cd", weights[1], directions)
+    torch.testing.assert_close(weights.sum(1), torch.ones(2, 3), rtol=2e-3, atol=0)
+    assert float((mean / mean.norm(dim=-1, keepdim=True) * lamp).sum(-1).min()) > math.cos(math.radians(3))
+    assert (float(lamp[0, 0]) > 0) == (azimuth_deg > 0)  # + is the picture's right, +x
+
+
+def test_rotation_adds_to_the_azimuth(tmp_path: Path) -> None:
+    envmap = write_map(tmp_path / "one.exr", (0.5, 0.49))
+    setups = collect_setups([str(envmap)], "40", [], tmp_path / "out")
+    directions, weights = weights_over_rig(setups, "600", "cell")
+    azimuth = torch.atan2(*(weights[0, :, 0] @ directions)[[0, 2]].split(1))
+    assert math.degrees(float(azimuth)) == pytest.approx(40 - 360 / (4 * HEIGHT_PX), abs=3)
+
+
+def test_lamps_shine_together_with_their_colours() -> None:
+    setups = collect_setups([], None, ["90,0,1,0,0;-90,0,0,0,2", "0,0"], Path("out"))
+    directions, weights = weights_over_rig(setups, "150", "cell")
+    assert directions.shape == (3, 3)  # the rig is not needed
+    torch.testing.assert_close(directions[0], torch.tensor([1.0, 0, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(weights[0], torch.tensor([[1.0, 0, 0], [0, 0, 2], [0, 0, 0]]))
+    torch.testing.assert_close(weights[1, 2], torch.ones(3))
+
+
+def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
+    directions = rig_directions(50)
+    setups = collect_setups([], None, ["30,20,1,2,3"], Path("out"))
+    weights = weights_over_stack(setups, directions, "cell")
+    nearest = int((directions - azel_to_direction(30.0, 20.0)).norm(dim=-1).argmin())
+    torch.testing.assert_close(weights[0, nearest], torch.tensor([1.0, 2, 3]))
+    assert int((weights != 0).any(-1).sum()) == 1
+
+
+def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None) -> None:
+    """Write the balls of the setups with a map, named as `relight --ball` names them."""
+    maps = [setup for setup in setups if setup.envmap is not None]
+    write_balls(maps, [output / "balls" / f"{setup.name}{setup.frame}.exr" for setup in maps], exposure_ev)
+
+
+def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
+    envmap = write_map(tmp_path / "one.exr", (0.25, 0.49))
+    setups = collect_setups([str(envmap)], None, ["0,0"], tmp_path / "out")
+    balls(setups, tmp_path / "out", None)
+    ball = read_image(tmp_path / "out/balls/one.exr").pixels
+    diffuse = ball[:, ball.shape[1] // 2 :, 0]
+    half = diffuse.shape[1] // 2
+    assert diffuse[:, half:].sum() > 5 * diffuse[:, :half].sum()
+    assert sorted(path.name for path in (tmp_path / "out/balls").iterdir()) == ["one.exr", "one.png"]
+
+
+def test_the_ball_of_an_estimated_light_names_its_face_model(tmp_path: Path) -> None:
+    marks = {"facerf:face_model": "mine", "facerf:face_model_licence": "MIT"}
+    write_exr(tmp_path / "a.exr", np.ones((16, 32, 3), np.float32), metadata=marks)
+    light = LightRecord(rig_directions()[:3], torch.ones(3, 3), "three", None, marks)
+    write_light(tmp_path / "b.json", light)
+    setups = collect_setups(
+        [str(tmp_path / name) for name in ("a.exr", "b.json")], None, [], tmp_path / "out"
+    )
+    balls(setups, tmp_path / "out", 0.0)
+    for name in ("a.exr", "b.exr"):
+        assert read_image(tmp_path / "out/balls" / name).metadata.items() >= marks.items()
+
+
+def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
+    assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
+    files = collect_setups([str(tmp_path)], "0:360:2", [], tmp_path / "out")
+    drawn = collect_setups(["procedural:2"], "0:360:2", [], tmp_path / "out", seed=3)
+    assert [(setup.name, setup.frame) for setup in drawn] == [(setup.name, setup.frame) for setup in files]
+    assert readable(drawn) == drawn
+    rigs = [weights_over_rig(setups, "12", "cell")[1] for setups in (files, drawn)]
+    np.testing.assert_allclose(rigs[0], rigs[1], rtol=2e-3, atol=1e-4)
+    balls(drawn[:1], tmp_path / "out", None)
+    assert (tmp_path / f"out/balls/{drawn[0].name}.0000.png").exists()
+
+
+@pytest.mark.parametrize("word", ["procedural:", "procedural:x", "procedural:10000"])
+def test_a_bad_number_of_procedural_maps_is_refused(word: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="procedural"):
+        collect_setups([word], None, [], tmp_path)

@@ -1,0 +1,73 @@
+"""The Python API: the page in the docs runs, and it gives what the command line gives."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import facerf_cli as facerf
+from facerf_cli.errors import InputError
+from facerf_cli.main import main
+
+ROOT = Path(__file__).parents[1]
+PHOTO = ROOT / "examples/astronaut.jpg"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The names that the code of docs/python.md leaves, run from top to bottom."""
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "examples").symlink_to(ROOT / "examples")
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(), re.S)
+    assert len(blocks) >= 6
+    names: dict[str, Any] = {"folder": folder}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for block in blocks:
+            exec(compile(block, "docs/python.md", "exec"), names)
+    return names
+
+
+def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
+    photo = page["photo"]
+    assert page["image"].shape == photo.shape and np.isfinite(page["image"]).all()
+    assert page["envmap"].shape == (256, 512, 3)
+    assert page["olats"].shape == (24, 256, 256, 3) and page["directions"].shape == (24, 3)
+    assert page["turned"].shape == page["alone"].shape == (*photo.shape[:2], 4)
+    assert sorted(path.name for path in page["folder"].glob("relit.*")) == ["relit.exr", "relit.png"]
+
+
+def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Path) -> None:
+    assert main(["relight", str(PHOTO), "--light", "60,30", "-o", str(tmp_path)]) == 0
+    written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
+    np.testing.assert_array_equal(written, page["image"].astype(np.float16).astype(np.float32))
+
+
+def test_sums_of_lights(page: dict[str, Any]) -> None:
+    first, second = facerf.Light.single(60, 30), facerf.Light.single(-70, 0, (1, 0.1, 0.1))
+    models, photo, head = page["models"], page["photo"], page["head"]
+    apart = sum(facerf.relight(models, photo, head, light) for light in (first, second))
+    both = facerf.relight(models, photo, head, page["two"])
+    np.testing.assert_allclose(apart, both, atol=1e-3 * both.mean(), rtol=1e-3)
+
+
+def test_what_cannot_be_used_is_said(page: dict[str, Any]) -> None:
+    models = page["models"]
+    with pytest.raises(InputError, match="no face found"):
+        facerf.fit_photo(models, np.full((200, 300, 3), 0.3, np.float32))
+    with pytest.raises(ValueError, match="200, 300"):
+        facerf.fit_photo(models, np.zeros((200, 300), np.float32))
+    with pytest.raises(InputError):
+        facerf.Light.from_envmap(np.ones((30, 40, 3), np.float32))
+    with pytest.raises(ValueError, match="not \\[L, 3\\]"):
+        facerf.relight(models, page["photo"], page["head"], facerf.Light(np.ones((2, 3)), np.ones((3, 3))))
+
+
+def test_importing_it_loads_nothing_heavy() -> None:
+    code = "import sys, facerf_cli; print('torch' in sys.modules, 'numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert done.stdout.split() == ["False", "False"], done.stderr
