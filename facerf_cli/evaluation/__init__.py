@@ -5,5 +5,5 @@ from pathlib import Path
 
 
 def folder_name(folder: Path) -> str:
-    """The folder's own name as its method's; '.' has the name of the folder that it stands for."""
+    """The name of a folder of predictions, and of its method; '.' is resolved, a link is not."""
     return Path(os.path.abspath(folder)).name

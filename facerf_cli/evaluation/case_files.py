@@ -1,4 +1,4 @@
-"""An item's figures on disk, so that an evaluation can be cut off and go on; and all pictures' as CSV."""
+"""An item's figures as a file, so that an interrupted evaluation can continue; and all images' as CSV."""
 
 import csv
 import io
@@ -32,9 +32,9 @@ class KeptStrip:
 
 @dataclass(frozen=True)
 class ItemFigures:
-    """What an item left: the key of how it was evaluated, its rows, its strips.
+    """The figures of a finished item: the key of how it was evaluated, its rows and its strips.
 
-    `pictures` are images kept for other methods. Paths start from the evaluation's folder.
+    `pictures` are images kept for other methods. Paths are relative to the evaluation's folder.
     """
 
     key: str
@@ -44,19 +44,19 @@ class ItemFigures:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """All that was kept beside the figures."""
+        """All other files that the item wrote."""
         return (*(strip.file for strip in self.strips), *self.pictures)
 
 
 def write_figures(path: Path, figures: ItemFigures) -> None:
-    """Write an item's figures as one line of JSON, whole or not at all; NaN and infinity become null."""
+    """Write an item's figures as one line of JSON, atomically; NaN and infinity become null."""
     content = {"format": FORMAT, **asdict(figures)}
     with atomic_path(path) as temporary:
         temporary.write_text(json_line(content) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def read_figures(path: Path) -> ItemFigures:
-    """Read them back; null is NaN."""
+    """Read an item's figures; null becomes NaN. Raises InputError for any other file."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
@@ -65,8 +65,9 @@ def read_figures(path: Path) -> ItemFigures:
         strips = tuple(_strip(entry) for entry in content["strips"])
         return ItemFigures(content["key"], rows, strips, tuple(map(str, content["pictures"])))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        advice = "remove it, or give --overwrite"
-        raise InputError(f"{path}: no figures of an evaluation ({error}); {advice}") from None
+        raise InputError(
+            f"{path}: no figures of an evaluation ({error}); remove it, or give --overwrite"
+        ) from None
 
 
 def _row(entry: Mapping[str, Any]) -> Row:
@@ -80,7 +81,7 @@ def _strip(entry: Mapping[str, Any]) -> KeptStrip:
 
 
 def images_csv(rows: Sequence[Row]) -> str:
-    """A line a picture and method: its names, its facts, its figures; empty where there is none."""
+    """Format a line for each image and method: its names, facts and figures; a missing figure is empty."""
     facts = dict.fromkeys(name for row in rows for name in row.facts)
     values = dict.fromkeys(name for row in rows for name in row.values)
     stream = io.StringIO()

@@ -1,9 +1,4 @@
-"""The figures of the paper's Tables 1 to 4 (paper, 'Results'): shown beside ours, measured on other data.
-
-From a run's rows to its tables: each method overall and by every fact, and against the first method.
-
-An evaluation's tables on the terminal: plain text when piped.
-"""
+"""The tables of a run from its rows: each method over all images and by every fact, and against the first."""
 
 import math
 import re
@@ -18,119 +13,52 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.evaluation.measure import METRICS, Metric, Row
+from facerf_cli.evaluation.published import PublishedFigure
 from facerf_cli.logs import counted
 from facerf_cli.metrics import Interval, mean_interval
 
-
-@dataclass(frozen=True)
-class Published:
-    """A published figure: mean and standard deviation over pictures of one metric of one method.
-
-    `group` names the fact and value of ours that it stands beside ('pose', 'same pose'); None is all
-    pictures. `source` and `data` say where it stands and what it was measured on.
-    """
-
-    method: str
-    metric: str
-    mean: float
-    sd: float | None = None
-    group: tuple[str, str] | None = None
-    source: str = "the paper"
-    data: str = "other data than ours"
-    digits: int | None = None  # after the point, as published; None: as ours are shown
-
-    def shown(self, digits: int) -> tuple[str, str]:
-        """Mean and standard deviation as text, with no more digits than were published."""
-        digits = digits if self.digits is None else self.digits
-        return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
-
-
-_LIGHT_STAGE = "people in a light stage; other data than ours"
-_CELEBA = "130 pictures of CelebA-HQ; other data than ours"
-_TEST_SET = "86 light-stage pictures in natural light; other data than ours"
-_METHODS = ("the paper's", "Smith et al.", "Schneider et al.", "Tewari et al.")
-
-TABLE_1 = (
-    Published("the paper's", "si_mse", 0.00070, 0.00059, ("pose", "same pose"), "Table 1", _LIGHT_STAGE),
-    Published("the paper's", "si_mse", 0.00084, 0.00088, ("pose", "different pose"), "Table 1", _LIGHT_STAGE),
-)
-
-
-def _table_2(metric: str, data: str, figures: tuple[tuple[float, float], ...]) -> tuple[Published, ...]:
-    """A row of Table 2, in the order of `_METHODS`."""
-    return tuple(
-        Published(method, metric, mean, sd, None, "Table 2", data, 3)
-        for method, (mean, sd) in zip(_METHODS, figures, strict=True)
-    )
-
-
-TABLE_2_RECONSTRUCTION = (
-    *_table_2("si_mse", _CELEBA, ((0.004, 0.002), (0.017, 0.015), (0.010, 0.008), (0.007, 0.003))),
-    *_table_2("face_distance", _CELEBA, ((0.550, 0.080), (0.650, 0.076), (0.685, 0.067), (0.762, 0.075))),
-)
-TABLE_2_TRANSFER = (
-    *_table_2("si_mse", _TEST_SET, ((0.002, 0.001), (0.018, 0.011), (0.007, 0.005), (0.003, 0.001))),
-    *_table_2("face_distance", _TEST_SET, ((0.482, 0.084), (0.605, 0.092), (0.644, 0.077), (0.689, 0.076))),
-)
-TABLE_3 = (
-    Published("without normals", "si_mse", 0.00113, 0.00093, ("pose", "same pose"), "Table 3", _LIGHT_STAGE),
-    Published(
-        "without normals", "si_mse", 0.00126, 0.00116, ("pose", "different pose"), "Table 3", _LIGHT_STAGE
-    ),
-)
-TABLE_4 = (
-    Published("all components", "si_mse", 0.004, 0.002, None, "Table 4", _CELEBA, 3),
-    Published("mean face", "si_mse", 0.011, 0.005, None, "Table 4", _CELEBA, 3),
-    Published("all components", "face_distance", 0.550, 0.080, None, "Table 4", _CELEBA, 3),
-    Published("mean face", "face_distance", 0.550, 0.073, None, "Table 4", _CELEBA, 3),
-)
-
-ALL = "all pictures"
+ALL = "all images"
+_PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What a protocol's tables hold.
+    """The contents of a protocol's tables.
 
-    `name` is the protocol's on the command line, `title` what it is called in print. Of `metrics` the first
-    decides what is best and worst; `by` are the facts, text, that break the tables down. `notes` are said
-    beside the figures.
+    `name` is the protocol's on the command line, `title` the heading. The first of `metrics` decides which
+    images are the best and the worst. `by` names the facts, as text, that break the tables down. `notes` are
+    printed below the figures.
     """
 
     name: str
     title: str
     metrics: tuple[str, ...] = ("si_mse",)
     by: tuple[str, ...] = ()
-    published: tuple[Published, ...] = ()
+    published: tuple[PublishedFigure, ...] = ()
     notes: tuple[str, ...] = ()
-
-
-def shown_as(metric: str) -> Metric:
-    """How a metric is shown; one that a protocol made up is shown by its name."""
-    return METRICS.get(metric) or Metric(metric.replace("_", " "), digits=4)
 
 
 @dataclass(frozen=True)
 class Paired:
-    """A method against the first one, on the pictures that both have."""
+    """A method against the first one, on the images that both have."""
 
     difference: Interval  # this method's value less the first one's
-    won: float  # share of pictures on which this method is the better one; a tie counts half
+    won: float  # share of images on which this method is better; a tie counts half
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One metric of one method over a group of pictures."""
+    """One metric of one method over a group of images."""
 
     values: tuple[float, ...]  # sorted
     interval: Interval
-    left_out: int  # pictures whose value is no finite number
-    paired: Paired | None  # None for the first method, and where no picture has both
+    left_out: int  # images whose value is not finite
+    paired: Paired | None  # None for the first method, and where no image has both
 
 
 @dataclass(frozen=True)
 class Group:
-    """The pictures whose `fact` is `value`; all of them where the fact is ''."""
+    """The images whose `fact` is `value`; all images if the fact is ''."""
 
     fact: str
     value: str
@@ -148,13 +76,13 @@ class Summary:
 
     layout: Layout
     methods: tuple[str, ...]
-    metrics: tuple[str, ...]  # the layout's first, then what else was measured
-    groups: tuple[Group, ...]  # the first is of all pictures
+    metrics: tuple[str, ...]  # the layout's first, then all others that were measured
+    groups: tuple[Group, ...]  # the first is of all images
     images: int
     persons: int
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return all tables for JSON."""
         return {
             "protocol": self.layout.name,
             "title": self.layout.title,
@@ -184,16 +112,16 @@ def _cell_as_dict(cell: Cell) -> dict[str, Any]:
 
 
 def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
-    """The tables of a run's rows, at least one. Facts break down the layout's metrics only.
+    """Sum up a run's rows, at least one. Only the layout's metrics are broken down by facts.
 
-    Raises `ValueError` where a picture and a method stand in two rows.
+    Raises ValueError where an image and a method have two rows.
     """
     keys = {(row.case, row.method) for row in rows}
     if len(keys) < len(rows):
-        raise ValueError(f"{len(rows) - len(keys)} pictures were measured twice")
-    measured = _in_order(name for row in rows for name in row.values)
-    metrics = tuple(_in_order([*(name for name in layout.metrics if name in measured), *measured]))
-    methods = tuple(_in_order(row.method for row in rows))
+        raise ValueError(f"{len(rows) - len(keys)} images were measured twice")
+    measured = _unique(name for row in rows for name in row.values)
+    metrics = tuple(_unique([*(name for name in layout.metrics if name in measured), *measured]))
+    methods = tuple(_unique(row.method for row in rows))
     groups = [Group("", "", _cells(rows, methods, metrics))]
     narrow = tuple(name for name in layout.metrics if name in measured)
     for fact in layout.by:
@@ -204,8 +132,13 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     return Summary(layout, methods, metrics, tuple(groups), len(cases), len(persons))
 
 
-def published_beside(summary: Summary, group: Group, metric: str) -> list[Published]:
-    """The published figures that stand beside ours of a group."""
+def metric_named(name: str) -> Metric:
+    """A metric's title and digits; a metric of a single protocol has its name as title."""
+    return METRICS.get(name) or Metric(name.replace("_", " "), digits=4)
+
+
+def published_for(summary: Summary, group: Group, metric: str) -> list[PublishedFigure]:
+    """The published figures of a group and a metric."""
     return [
         figure
         for figure in summary.layout.published
@@ -214,12 +147,13 @@ def published_beside(summary: Summary, group: Group, metric: str) -> list[Publis
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:
-    """A key that sorts '5°' before '10°'."""
+    """A sort key that puts '5°' before '10°'."""
     parts = re.split(r"(\d+(?:\.\d+)?)", text)
     return [(0, float(part), "") if index % 2 else (1, 0.0, part) for index, part in enumerate(parts)]
 
 
-def _in_order(names: Iterable[str]) -> list[str]:
+def _unique(names: Iterable[str]) -> list[str]:
+    """The names without repetitions, in their order."""
     return list(dict.fromkeys(names))
 
 
@@ -237,7 +171,7 @@ def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) 
 
 
 def _cell(metric: str, ours: Mapping[str, Row], firsts: Mapping[str, Row]) -> Cell | None:
-    """The figures of one method's rows by case; None where none is a number."""
+    """The figures of one method's rows by case; None if no value is finite."""
     values = {case: row.values[metric] for case, row in ours.items()}
     finite = {case: value for case, value in values.items() if math.isfinite(value)}
     interval = mean_interval((ours[case].person, value) for case, value in finite.items())
@@ -248,7 +182,7 @@ def _cell(metric: str, ours: Mapping[str, Row], firsts: Mapping[str, Row]) -> Ce
 
 
 def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -> Paired | None:
-    better = -1.0 if shown_as(metric).lower_is_better else 1.0
+    better = -1.0 if metric_named(metric).lower_is_better else 1.0
     differences = {
         case: (firsts[case].person, value - firsts[case].values[metric])
         for case, value in ours.items()
@@ -261,15 +195,12 @@ def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -
     return Paired(interval, sum(won) / len(won))
 
 
-_PIPED_WIDTH = 100
-
-
-def print_tables(summary: "Summary") -> None:
-    """Print the tables of the layout's metrics to standard output."""
+def print_tables(summary: Summary) -> None:
+    """Print a table for each of the layout's metrics to standard output; plain text if it is piped."""
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     layout = summary.layout
-    images, persons = counted(summary.images, "picture"), counted(summary.persons, "person")
+    images, persons = counted(summary.images, "image"), counted(summary.persons, "person")
     console.print(Text(f"{layout.title}: {images} of {persons}", style="bold"))
     first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
     console.print(_table(summary, first, summary.groups, plain=not terminal))
@@ -282,9 +213,8 @@ def print_tables(summary: "Summary") -> None:
         console.print(Text(note))
 
 
-def _table(summary: "Summary", metric: str, groups: "Sequence[Group]", plain: bool) -> Table:
-
-    how = shown_as(metric)
+def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) -> Table:
+    how = metric_named(metric)
     better = "less" if how.lower_is_better else "more"
     table = Table(
         title=Text(f"\n{how.title} ({better} is better)"),
@@ -294,41 +224,36 @@ def _table(summary: "Summary", metric: str, groups: "Sequence[Group]", plain: bo
         padding=(0, 1, 0, 0),
         expand=False,
     )
-    table.add_column("pictures", overflow="fold", min_width=20, max_width=26)
+    table.add_column("images", overflow="fold", min_width=20, max_width=26)
     table.add_column("method", overflow="fold", max_width=20)
     for name in ("n", "mean", "sd", "median", "95 % interval", "vs first", "won"):
         table.add_column(name, justify="right", no_wrap=True)
-    several = len(summary.methods) > 1
     for group in groups:
-        for row in _rows(summary, group, metric):
+        for row in _table_rows(summary, group, metric):
             table.add_row(*(Text(entry) for entry in row))
-    if not several:
+    if len(summary.methods) == 1:  # nothing to compare with
         for _ in range(2):
             table.columns.pop()
     return table
 
 
-def _rows(summary: "Summary", group: "Group", metric: str) -> Iterator[list[str]]:
-    """The group's rows: a method each, then what others published beside it."""
-    digits = shown_as(metric).digits
-    cells = group.cells.get(metric, {})
+def _table_rows(summary: Summary, group: Group, metric: str) -> Iterator[list[str]]:
+    """A group's rows: one for each method, then the published figures."""
+    digits = metric_named(metric).digits
     title = group.title
-    for method, cell in cells.items():
+    for method, cell in group.cells.get(metric, {}).items():
         yield [title, method, *_figures(cell, digits)]
         title = ""
-    for figure in published_beside(summary, group, metric):
+    for figure in published_for(summary, group, metric):
         yield [f"published, {figure.source}", figure.method, "", *figure.shown(digits), *[""] * 4]
 
 
-def _figures(cell: "Cell", digits: int) -> list[str]:
+def _figures(cell: Cell, digits: int) -> list[str]:
     interval, paired = cell.interval, cell.paired
-    known = interval.low == interval.low  # NaN with one person
-    figures = [str(interval.images), *(f"{value:.{digits}f}" for value in _middle(cell))]
-    figures.append(f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person")
+    middle = (f"{value:.{digits}f}" for value in (interval.mean, interval.sd, interval.median))
+    known = not math.isnan(interval.low)  # NaN with one person
+    between = f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person"
+    figures = [str(interval.images), *middle, between]
     if paired is None:
         return [*figures, "", ""]
     return [*figures, f"{paired.difference.mean:+.{digits}f}", f"{100 * paired.won:.0f} %"]
-
-
-def _middle(cell: "Cell") -> tuple[float, float, float]:
-    return cell.interval.mean, cell.interval.sd, cell.interval.median

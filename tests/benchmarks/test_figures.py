@@ -20,7 +20,8 @@ from synthetic import table as held_out_table
 from yale_table import COLUMNS, results, table
 
 from facerf_cli.evaluation.measure import Row
-from facerf_cli.evaluation.summary import TABLE_1, Layout, summarise
+from facerf_cli.evaluation.published import TABLE_1
+from facerf_cli.evaluation.summary import Layout, summarise
 from facerf_cli.metrics import average, mean_interval, tone_of
 
 

@@ -19,7 +19,7 @@ LANDMARKS = np.random.default_rng(5).uniform(5, 20, (68, 2))
 
 @pytest.fixture
 def comparison() -> Comparison:
-    """Two methods on a picture [20, 26, 3] that goes beyond white."""
+    """Two methods on an image [20, 26, 3] that goes beyond white."""
     random = np.random.default_rng(0)
     truth = random.gamma(1.0, 0.5, (20, 26, 3)).astype(np.float32)
     near = (truth * 0.9 + 0.02 * random.normal(size=truth.shape)).astype(np.float32)
@@ -31,7 +31,7 @@ def comparison() -> Comparison:
 
 @pytest.fixture
 def descriptors(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """The pictures that the face recogniser was shown; its answer is their mean colour."""
+    """The images given to the face recogniser; its answer is their mean colour."""
     seen: list[np.ndarray] = []
 
     def describe(image: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:

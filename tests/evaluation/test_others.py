@@ -1,4 +1,4 @@
-"""Other methods' predictions: found by case, and never quietly absent."""
+"""Other methods' predictions are found by case; a missing one is an error."""
 
 from pathlib import Path
 
@@ -39,18 +39,18 @@ def test_a_wrong_size_and_two_files_of_a_case(folder: Path) -> None:
     with pytest.raises(InputError, match="9 x 6 pixels, the truth has 6 x 9"):
         Others((folder,)).predictions("a/00", (9, 6, 3))
     write_exr(folder / "a/02.exr", np.zeros(SHAPE, np.float32))
-    with pytest.raises(InputError, match=r"02.exr and 02.npy; leave one"):
+    with pytest.raises(InputError, match=r"02.exr and 02.npy; remove all but one"):
         Others((folder,)).predictions("a/02", SHAPE)
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (np.zeros(SHAPE, np.uint8), "PNG is for bytes"),
-        (np.zeros((2, 3, 4)), "a picture is"),
+        (np.zeros(SHAPE, np.uint8), "give floats of linear light"),
+        (np.zeros((2, 3, 4)), r"give .height, width, 3."),
         (np.full(SHAPE, np.nan), "NaN"),
         (np.array([{"a": 1}], dtype=object), "not an array"),
-        (np.zeros((0, 3, 3)), "a picture is"),
+        (np.zeros((0, 3, 3)), r"give .height, width, 3."),
     ],
 )
 def test_arrays_that_are_no_images(tmp_path: Path, content: np.ndarray, words: str) -> None:

@@ -1,4 +1,4 @@
-"""The report: whole in one file, nothing of a name or a command becomes markup, worst cases first."""
+"""The report: one file, nothing of a name or a command becomes markup, worst cases first."""
 
 import base64
 import io
@@ -12,19 +12,17 @@ import pytest
 from PIL import Image
 
 from facerf_cli.evaluation.case_files import KeptStrip
-from facerf_cli.evaluation.measure import Row, measure
+from facerf_cli.evaluation.measure import Measures, Row, measure
 from facerf_cli.evaluation.report_html import (
     BEST,
-    ERROR_COLOURS,
-    ERROR_HIGHEST,
     TYPICAL,
     WORST,
     About,
     Chosen,
     choose,
     page,
-    strip_of,
 )
+from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST, strip_of
 from facerf_cli.evaluation.summary import Summary, summarise
 from tests.evaluation.toy_protocol import LAYOUT, NOISE, comparison, evaluate
 
@@ -111,7 +109,7 @@ def test_one_file_that_needs_nothing_else(report: Path) -> None:
 def test_what_is_said_is_there(report: Path) -> None:
     words = " ".join(read(report.read_text()).texts)
     for said in (
-        "Toy <pictures> & more", "12 pictures of 3 people", "A note with a <b>tag</b>.", "By pose",
+        "Toy <images> & more", "12 images of 3 people", "A note with a <b>tag</b>.", "By pose",
         "the paper's, published (Table 1)", "other data than ours", "0.00070", "95 % interval", "By angle",
     ):  # fmt: skip
         assert said in words, said
@@ -192,15 +190,9 @@ def test_error_colours_rise_in_lightness_and_reach_their_end() -> None:
 
 def test_strips_agree_with_the_figures_about_the_scale() -> None:
     own = comparison("anna", 1)
-    (good, _) = measure(own, _measures())
+    (good, _) = measure(own, Measures())
     strip = strip_of(own, scaled=True)
     inside = own.mask > 0
     apart = strip.scales[0] * own.predictions["good"] - own.truth
     assert good.values["si_mse"] == pytest.approx(float((apart[inside] ** 2).mean()), rel=1e-4)
     assert strip.methods == tuple(NOISE)
-
-
-def _measures():
-    from facerf_cli.evaluation.measure import Measures
-
-    return Measures()

@@ -1,4 +1,4 @@
-"""The report opened in headless Chromium: nothing complains, all pictures decode, nothing sticks out.
+"""The report opened in headless Chromium: nothing complains, all images decode, nothing is cut off.
 
 Skipped where there is no such browser (`apt-get install chromium`).
 """
@@ -27,7 +27,7 @@ SCRIPT = """<script>addEventListener("load", () => {
     overflow: root.scrollWidth - innerWidth, width: innerWidth,
     tables: [...document.querySelectorAll("table")].map(t => t.rows.length),
     cells: [...document.querySelectorAll("main table")][0].innerText,
-    drawn: [...document.querySelectorAll("td.chart svg")].map(s => s.getBoundingClientRect().width) };
+    drawn: [...document.querySelectorAll("td.plot svg")].map(s => s.getBoundingClientRect().width) };
   const output = document.createElement("output");
   output.textContent = JSON.stringify(facts);
   document.body.append(output);

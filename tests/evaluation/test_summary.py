@@ -6,17 +6,14 @@ import numpy as np
 import pytest
 
 from facerf_cli.evaluation.measure import METRICS, Row
-from facerf_cli.evaluation.summary import (
+from facerf_cli.evaluation.published import (
     TABLE_1,
     TABLE_2_RECONSTRUCTION,
     TABLE_2_TRANSFER,
     TABLE_3,
     TABLE_4,
-    Layout,
-    natural,
-    published_beside,
-    summarise,
 )
+from facerf_cli.evaluation.summary import Layout, natural, published_for, summarise
 
 LAYOUT = Layout("toy", "Toy", ("si_mse", "psnr"), ("pose",), TABLE_1)
 ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}
@@ -76,9 +73,9 @@ def test_a_image_measured_twice_is_our_bug() -> None:
         summarise(LAYOUT, [*rows(), rows()[0]])
 
 
-def test_published_figures_stand_beside_their_group() -> None:
+def test_published_figures_are_those_of_their_group() -> None:
     summary = summarise(LAYOUT, rows())
-    beside = [[figure.mean for figure in published_beside(summary, g, "si_mse")] for g in summary.groups]
+    beside = [[figure.mean for figure in published_for(summary, g, "si_mse")] for g in summary.groups]
     assert beside == [[], [0.00084], [0.0007]]
 
 

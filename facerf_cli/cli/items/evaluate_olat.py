@@ -22,7 +22,8 @@ from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Comparison
 from facerf_cli.evaluation.people import Person, evenly
 from facerf_cli.evaluation.protocols.olat import compare_olats
-from facerf_cli.evaluation.summary import TABLE_1, TABLE_3, Layout
+from facerf_cli.evaluation.published import TABLE_1, TABLE_3
+from facerf_cli.evaluation.summary import Layout
 
 _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 160, 3900, 8100  # paper, 'Quantitative Evaluations'
 

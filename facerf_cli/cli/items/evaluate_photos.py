@@ -26,7 +26,8 @@ from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person
 from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, Form, compare_geometries
 from facerf_cli.evaluation.protocols.reconstruction import reconstruct, reconstruct_person
-from facerf_cli.evaluation.summary import TABLE_2_RECONSTRUCTION, TABLE_4, Layout
+from facerf_cli.evaluation.published import TABLE_2_RECONSTRUCTION, TABLE_4
+from facerf_cli.evaluation.summary import Layout
 from facerf_cli.models import load_models
 
 _PAPER_PHOTOS = 130  # of CelebA-HQ (paper, Tables 2 and 4)

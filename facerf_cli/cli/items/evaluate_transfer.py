@@ -24,7 +24,8 @@ from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.case import Case, Comparison
 from facerf_cli.evaluation.people import Person, evenly
 from facerf_cli.evaluation.protocols.transfer import Side, couples_of, transfer, transfer_person
-from facerf_cli.evaluation.summary import TABLE_2_TRANSFER, Layout
+from facerf_cli.evaluation.published import TABLE_2_TRANSFER
+from facerf_cli.evaluation.summary import Layout
 
 _PAPER_IMAGES = 86  # paper, Table 2
 

@@ -29,7 +29,8 @@ from facerf_cli.evaluation.case_files import (
     write_figures,
 )
 from facerf_cli.evaluation.measure import Measures, Row, measure
-from facerf_cli.evaluation.report_html import About, Strip, StripKeeper, choose, page, strip_of
+from facerf_cli.evaluation.report_html import About, choose, page
+from facerf_cli.evaluation.strips import Strip, StripKeeper, strip_of
 from facerf_cli.evaluation.summary import Layout, Summary, print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.image_metadata import embed_xmp

@@ -1,9 +1,11 @@
-"""Folders of predictions against a folder of truths, matched by name: anybody's pictures can be measured.
+"""Folders of predictions against a folder of truths, matched by name; any images can be measured.
 
 Trees are mirrored; a name is the path without its suffix, so a truth .exr may have a .png prediction. Every
-picture of every folder must have its counterparts, of one size: leaving out what went wrong improves a mean.
+image of every folder must have its counterparts, of the same size: without failed ones a mean improves.
 """
 
+import csv
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,19 +16,22 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.evaluation import folder_name
-from facerf_cli.evaluation.case import Case, Comparison, Facts, read_array, read_facts
+from facerf_cli.evaluation.case import Case, Comparison, read_array
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import LinearImage, read_image
 
 SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".npy"}
 )
-_NAMED_AT_MOST = 3
+_NAMED_AT_MOST = 3  # names of files in an error
+_LARGEST_BYTES = 64 * 2**20  # of a CSV file
+_TURNED = 5  # from this Exif orientation on, width and height are exchanged
+_CSV_ADVICE = "begin with a header such as name,person,..."
 
 
 @dataclass(frozen=True)
 class ImagePair:
-    """A truth and its predictions by method, on disk, and what is known of the picture."""
+    """The files of a truth and of its predictions by method, with the person and the facts of the image."""
 
     name: str
     truth: Path
@@ -36,14 +41,22 @@ class ImagePair:
     facts: Mapping[str, str | float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Facts:
+    """An image's person ('' if not given), and its other facts by column."""
+
+    person: str = ""
+    values: Mapping[str, str | float] = field(default_factory=dict)
+
+
 def collect_pairs(
     predictions: Sequence[Path], truths: Path, masks: Path | None = None, facts: Path | None = None
 ) -> list[ImagePair]:
-    """The pairs of folders, sorted by name; a folder of predictions is a method of its name.
+    """Match the images of folders, sorted by name; a folder of predictions is a method with its name.
 
-    `masks` mirrors the truths; `facts` is a CSV file (`facts_file.read_facts`). Where it names no person,
-    that is the truth's topmost folder, or in a flat tree each picture its own. Raises UsageError for folders
-    that are none, InputError for names or sizes that do not match: the first few are named, and all counted.
+    `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). If it names no person, that is the
+    truth's topmost folder, or in a flat tree each image is a person. Raises UsageError for folders that
+    cannot be used, InputError for names or sizes that do not match: it names the first few and counts all.
     """
     others = [*predictions, *([] if masks is None else [masks])]
     _check_folders(predictions, [truths, *others])
@@ -54,7 +67,7 @@ def collect_pairs(
     complaints = [_mismatch(found, by_method[folder_name(folder)], str(folder)) for folder in predictions]
     complaints += [_mismatch(found, mask_files, str(masks))] if masks is not None else []
     complaints += [_mismatch(found, described, str(facts))] if facts is not None else []
-    _refuse(complaints, f"names must be those of {truths}, folders alike; suffixes may differ")
+    _refuse(complaints, f"give the names of {truths}, with its subfolders; suffixes may differ")
     pairs = [
         _pair(name, found[name], {m: files[name] for m, files in by_method.items()}, mask_files, described)
         for name in sorted(found)
@@ -64,11 +77,11 @@ def collect_pairs(
 
 
 def compare_pair(pair: ImagePair, find_landmarks: bool = False) -> Comparison:
-    """Read a pair. EXR, HDR and .npy are scene-linear, other pictures are decoded by what they say.
+    """Read a pair. EXR, HDR and .npy are scene-linear, other images are decoded by their colour space.
 
-    The mask is the mask's picture (its values as they are, the mean of its channels), else the truth's
-    alpha, else everything. `find_landmarks` looks for the truth's face, for Face dis, and raises InputError
-    where there is none.
+    The mask is the mask's image (its values as they are, the mean of its channels), else the truth's alpha,
+    else everything. `find_landmarks` detects the truth's face, for Face dis, and raises InputError where
+    there is none.
     """
     truth = _read(pair.truth)
     mask = truth.alpha
@@ -88,21 +101,22 @@ def compare_pair(pair: ImagePair, find_landmarks: bool = False) -> Comparison:
 
 def _check_folders(predictions: Sequence[Path], folders: Sequence[Path]) -> None:
     if not predictions:
-        raise UsageError("no folder of predictions given")
+        raise UsageError("pairs: no folder of predictions; give at least one")
     for folder in folders:
         if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder")
+            raise UsageError(f"{folder}: no such folder; check the path")
     names = [folder_name(folder) for folder in predictions]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UsageError(
-            f"two folders of predictions are called {twice[0]!r}; rename one, it names the method"
+            f"two folders of predictions have the name {twice[0]!r}, which names the method; rename one"
         )
-    if len({folder.resolve() for folder in folders}) < len(folders):
-        raise UsageError("a folder is given twice; predictions, truths and masks are to lie apart")
+    resolved = [folder.resolve() for folder in folders]
+    if again := [folder for folder in folders if resolved.count(folder.resolve()) > 1]:
+        raise UsageError(f"{again[0]}: given twice; give separate folders of predictions, truths and masks")
 
 
 def _images_in(folder: Path, leave_out: Sequence[Path]) -> dict[str, Path]:
-    """Pictures by name, hidden ones and those of folders to be left out not among them."""
+    """The images of a folder by name, without hidden ones and without those of the folders `leave_out`."""
     elsewhere = {other.resolve() for other in leave_out}
     found: dict[str, Path] = {}
     for here, folders, files in os.walk(folder):
@@ -113,15 +127,15 @@ def _images_in(folder: Path, leave_out: Sequence[Path]) -> dict[str, Path]:
                 continue
             name = path.relative_to(folder).with_suffix("").as_posix()
             if name in found:
-                raise InputError(f"{folder}: {name} stands in {found[name].name} and {file}; leave one")
+                raise InputError(f"{folder}: {name} has the files {found[name].name} and {file}; remove one")
             found[name] = path
     if not found:
-        raise UsageError(f"{folder}: no pictures there (looked for {' '.join(sorted(SUFFIXES))})")
+        raise UsageError(f"{folder}: no images; give a folder of {' '.join(sorted(SUFFIXES))}")
     return found
 
 
 def _mismatch(truths: Mapping[str, Path], others: Mapping[str, object], where: str) -> str | None:
-    """What is amiss with names, in words; None where nothing is."""
+    """Describe names that do not match the truths'; None if all do."""
     missing, strangers = sorted(truths.keys() - others.keys()), sorted(others.keys() - truths.keys())
     parts = [f"{len(missing)} of {len(truths)} missing ({_few(missing)})"] if missing else []
     parts += [f"{len(strangers)} without a truth ({_few(strangers)})"] if strangers else []
@@ -133,9 +147,9 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _refuse(complaints: Sequence[str | None], advice: str) -> None:
-    """Raise all complaints in one line, if there are any."""
-    if said := [complaint for complaint in complaints if complaint]:
-        raise InputError(f"{'; '.join(said)}: {advice}")
+    """Raise InputError with all complaints in one line, if there are any."""
+    if found := [complaint for complaint in complaints if complaint]:
+        raise InputError(f"{'; '.join(found)}; {advice}")
 
 
 def _pair(
@@ -151,7 +165,7 @@ def _pair(
 
 
 def _check_sizes(pairs: Sequence[ImagePair]) -> None:
-    """Refuse pictures of other sizes than their truths; only headers are read."""
+    """Raise InputError for images of other sizes than their truths; reads headers only."""
     wrong: dict[str, list[str]] = {}
     for pair in pairs:
         wanted = _size_px(pair.truth)
@@ -164,22 +178,22 @@ def _check_sizes(pairs: Sequence[ImagePair]) -> None:
         f"{method}: {len(names)} of {len(pairs)} have another size ({_few(names)})"
         for method, names in wrong.items()
     ]
-    _refuse(complaints, "pictures are to have their truth's frame")
+    _refuse(complaints, "give images in their truth's frame")
 
 
 def _size_px(path: Path) -> tuple[int, int]:
-    """Width and height of a picture on disk, upright."""
+    """Width and height of an image file, upright."""
     if path.suffix.lower() == ".npy":
         height, width = read_array(path).shape[:2]
         return width, height
     stream = oiio.ImageInput.open(str(path))
     if stream is None:
-        oiio.geterror()  # or it prints its own words at exit
-        read_image(path)  # says what is the matter
-        raise FacerfError(f"{path}: cannot be read")
+        oiio.geterror()  # clears the message, which would be printed at exit
+        read_image(path)  # raises an error that names the cause
+        raise FacerfError(f"{path}: cannot be read; check the file")
     spec = stream.spec()
     stream.close()
-    turned = spec.get_int_attribute("Orientation", 1) >= 5
+    turned = spec.get_int_attribute("Orientation", 1) >= _TURNED
     return (spec.full_height, spec.full_width) if turned else (spec.full_width, spec.full_height)
 
 
@@ -187,3 +201,56 @@ def _read(path: Path, colourspace: str | None = None) -> LinearImage:
     if path.suffix.lower() == ".npy":
         return LinearImage(read_array(path))
     return read_image(path, colourspace)
+
+
+def read_facts(path: Path) -> dict[str, Facts]:
+    """Read facts by the image's name from a CSV with a header: `name`, optionally `person`, other columns.
+
+    A column whose cells are all numbers holds numbers; an empty cell is no fact.
+    """
+    header, rows = _read_rows(path)
+    if "name" not in header:
+        raise InputError(f"{path}: no column 'name'; {_CSV_ADVICE}")
+    others = [column for column in header if column not in ("name", "person")]
+    numbers = {column for column in others if all(_is_number(row[column]) for row in rows if row[column])}
+    found: dict[str, Facts] = {}
+    for row in rows:
+        if row["name"] in found:
+            raise InputError(f"{path}: {row['name']} has two lines; remove one")
+        values: dict[str, str | float] = {
+            column: float(row[column]) if column in numbers else row[column]
+            for column in others
+            if row[column]
+        }
+        found[row["name"]] = Facts(row.get("person", ""), values)
+    return found
+
+
+def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Read the header and the rows, cells stripped."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; check the path")
+    if path.stat().st_size > _LARGEST_BYTES:
+        raise InputError(f"{path}: larger than {_LARGEST_BYTES / 2**20:.0f} MiB; give a list of images")
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            lines = [[cell.strip() for cell in line] for line in csv.reader(stream) if any(line)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not CSV in UTF-8 ({error}); save it in that format") from None
+    if not lines:
+        raise InputError(f"{path}: empty; {_CSV_ADVICE}")
+    header, *body = lines
+    if len(set(header)) < len(header) or not all(header):
+        raise InputError(f"{path}: columns without a name or of the same name; change {', '.join(header)}")
+    if ragged := [line for line in body if len(line) != len(header)]:
+        raise InputError(
+            f"{path}: {len(ragged)} lines do not have {len(header)} cells; correct {','.join(ragged[0])}"
+        )
+    return header, [dict(zip(header, line, strict=True)) for line in body]
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        return math.isfinite(float(cell))
+    except ValueError:
+        return False

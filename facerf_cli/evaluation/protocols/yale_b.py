@@ -25,7 +25,8 @@ from facerf_cli.evaluation.protocols.yale_b_cases import (
     Sitter,
     face_mask,
 )
-from facerf_cli.evaluation.summary import Layout, Published
+from facerf_cli.evaluation.published import PublishedFigure
+from facerf_cli.evaluation.summary import Layout
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.pipeline import fit_photo
@@ -40,7 +41,7 @@ KNOWS_MORE = (  # learn from other subjects under the same flashes
 )
 PUBLISHED_SUBJECTS = 21
 _SOURCE = "Yale B"
-_SAME = f"same pictures, {PUBLISHED_SUBJECTS} people"
+_SAME = f"same images, {PUBLISHED_SUBJECTS} people"
 _MORE = _SAME + ", given more data"
 
 # (Si-MSE, SSIM) by column, then Si-MSE by angle.
@@ -104,13 +105,13 @@ def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool) -> Ite
         yield f"Settings were chosen on {', '.join(chosen)}."
 
 
-def published() -> tuple[Published, ...]:
+def published() -> tuple[PublishedFigure, ...]:
     """The published rows for the tables."""
-    rows: list[Published] = []
+    rows: list[PublishedFigure] = []
 
     def add(method: str, metric: str, mean: float, group: tuple[str, str], digits: int) -> None:
         data = _MORE if method in KNOWS_MORE else _SAME
-        rows.append(Published(method, metric, mean, None, group, _SOURCE, data, digits))
+        rows.append(PublishedFigure(method, metric, mean, None, group, _SOURCE, data, digits))
 
     for method in SHOWN:
         by_column, by_angle = FIGURES[method]

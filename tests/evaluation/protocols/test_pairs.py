@@ -17,7 +17,7 @@ SHAPE = (6, 9, 3)
 
 
 def image(name: str) -> np.ndarray:
-    """A picture that is the name's own, exact in half floats and in 8 bits of linear light."""
+    """An image of a name, exact in half floats and in 8 bits of linear light."""
     return np.random.default_rng(len(name) + ord(name[0])).integers(0, 256, SHAPE).astype(np.float32) / 256
 
 
@@ -93,7 +93,7 @@ def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: 
 
 def test_two_images_of_one_name_are_refused(truths: Path, ours: Path) -> None:
     save(ours / "anna/one.exr", image("a"))
-    with pytest.raises(InputError, match=r"anna/one stands in one\.exr and one\.npy"):
+    with pytest.raises(InputError, match=r"anna/one has the files one\.exr and one\.npy"):
         collect_pairs([ours], truths)
 
 
@@ -152,9 +152,9 @@ def test_facts_of_a_list(truths: Path, ours: Path) -> None:
         ("person\nA\n", "no column 'name'"),
         ("", "empty"),
         ("name,person\nanna/one,A\n", "2 of 3 missing .anna/two, bert/one"),
-        ("name\nanna/one\nanna/one\n", "anna/one stands there twice"),
-        ("name,name\na,b\n", "two of one name"),
-        ("name,pose\nanna/one\n", "have not 2 cells"),
+        ("name\nanna/one\nanna/one\n", "anna/one has two lines"),
+        ("name,name\na,b\n", "of the same name"),
+        ("name,pose\nanna/one\n", "do not have 2 cells"),
         ("name\nanna/one\0\n", "1 without a truth|not CSV"),
     ],
 )
@@ -173,12 +173,12 @@ def test_folders_that_are_none(truths: Path, ours: Path, trouble: str) -> None:
         predictions = [elsewhere]
     elif trouble == "empty":
         elsewhere.mkdir()
-        predictions, words = [elsewhere], "no pictures there"
+        predictions, words = [elsewhere], "no images"
     elif trouble == "twice":
         predictions, words = [truths], "given twice"
     elif trouble == "same name":
         save(elsewhere / "ours/anna/one.npy", image("a"))
-        predictions, words = [ours, elsewhere / "ours"], "two folders of predictions are called 'ours'"
+        predictions, words = [ours, elsewhere / "ours"], "two folders of predictions have the name 'ours'"
     else:
         predictions, words = [], "no folder of predictions"
     with pytest.raises(UsageError, match=words):
