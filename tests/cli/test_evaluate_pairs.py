@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import typer
 
-from facerf_cli.cli.evaluate import PROTOCOLS
+from facerf_cli.cli.evaluate import _PROTOCOLS
 from facerf_cli.cli.evaluation_options import EvaluateOptions, with_shared_options
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr
@@ -96,10 +96,10 @@ def test_bad_lines(folders: Path, capsys: Said) -> None:
     for line, words in (
         (["pairs", good, "-o", out], "--truth"),
         (["pairs", str(folders / "none"), "--truth", truth, "-o", out], "no such folder"),
-        (["pairs", good, "--truth", truth, "-o", truth], "give another one"),
-        (["pairs", good, "--truth", truth, "-o", f"{truth}/here"], "lies in it"),
-        (["pairs", good, "--truth", truth, "-o", f"{good}/here"], "lies in it"),
-        (["olat", "x", "-o", f"{good}/here", "--compare", good], "lies in it"),
+        (["pairs", good, "--truth", truth, "-o", truth], "give another folder"),
+        (["pairs", good, "--truth", truth, "-o", f"{truth}/here"], f"lies in {truth}, which is read"),
+        (["pairs", good, "--truth", truth, "-o", f"{good}/here"], f"lies in {good}, which is read"),
+        (["olat", "x", "-o", f"{good}/here", "--compare", good], f"lies in {good}, which is read"),
         (["pairs", good, "--truth", truth, "-o", out, "--lpips", "y"], "--vgg-weights"),
         (["pairs", good, "--truth", truth, "-o", out, "--preset", "paper"], "--preset"),
         (["olat", "x", "-o", out, "--reflectance", "phong"], "give field, diffuse-sh"),
@@ -109,7 +109,7 @@ def test_bad_lines(folders: Path, capsys: Said) -> None:
         assert words in said and len(said.splitlines()) == 1, said
 
 
-@pytest.mark.parametrize(("function", "left_out"), PROTOCOLS, ids=lambda x: getattr(x, "__name__", ""))
+@pytest.mark.parametrize(("function", "left_out"), _PROTOCOLS, ids=lambda x: getattr(x, "__name__", ""))
 def test_every_protocol_has_help_and_the_shared_options(
     function: Callable[..., int], left_out: tuple[str, ...], capsys: Said
 ) -> None:

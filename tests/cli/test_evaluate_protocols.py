@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.cli import evaluate_geometry, evaluate_reconstruction, evaluate_transfer
 from facerf_cli.cli.batch import Item
-from facerf_cli.cli.evaluation_items import MethodOptions, portraits
+from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
+from facerf_cli.cli.items.evaluation import MethodOptions, portraits
+from facerf_cli.cli.items.photo import load_models_once
 from facerf_cli.cli.options import Settings
-from facerf_cli.cli.photo_options import PhotoOptions, face_model, load_models_once
+from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.files.images import write_exr
@@ -40,7 +41,7 @@ def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(options: MethodOptions) -> list[Double]:
         return [Double("field", models=load_models_once(options.photo))]
 
-    for module in (evaluate_reconstruction, evaluate_transfer, evaluate_geometry):
+    for module in (evaluate_photos, evaluate_transfer):
         monkeypatch.setattr(module, "load_methods", load)
 
 
@@ -88,10 +89,10 @@ def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
     line = refused(capsys, "olat", folder, *out, "--preset", "paper")
     assert "3 maps" in line and "160" in line and "relight-dataset" in line and "--per-subject" in line
     assert "12 sources" in refused(capsys, "reconstruction", folder, *out, "--preset", "paper")
-    assert "pictures in couples" in refused(capsys, "transfer", folder, *out, "--preset", "paper")
+    assert "images in couples" in refused(capsys, "transfer", folder, *out, "--preset", "paper")
     assert "exclude" in refused(capsys, "olat", folder, *out, "--preset", "paper", "--every", "2")
     assert "validation" in refused(capsys, "olat", folder, *out, "--split", "validation")
-    assert "one dataset alone" in refused(capsys, "geometry", folder, PHOTO, *out)
+    assert "one dataset among several inputs" in refused(capsys, "geometry", folder, PHOTO, *out)
     assert "--photos" in refused(capsys, "transfer", PHOTO, *out)
     assert "two of each person" in refused(capsys, "transfer", "--photos", PHOTO, *out)
     assert "1 photos" in refused(capsys, "reconstruction", PHOTO, *out, "--preset", "paper")
@@ -148,8 +149,8 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(
     left, right = column < 215, column > 225
     assert whole.view.mask[:, left].max() == 1 and half.view.mask[:, left].max() == 0
     np.testing.assert_allclose(half.view.mask[:, right], whole.view.mask[:, right], atol=0.01)
-    assert half.face.visible.sum() < 0.8 * whole.face.visible.sum()
-    assert half.fitted_with(face_model(options)).view.mask[:, left].max() == 0
+    assert half.head.face.visible.sum() < 0.8 * whole.head.face.visible.sum()
+    assert half.fitted_by(load_models_once(options)).view.mask[:, left].max() == 0
     Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
     assert run("reconstruction", path, "-o", tmp_path / "out") == 1
     assert f"{path}: " in capsys.readouterr().err

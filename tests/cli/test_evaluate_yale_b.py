@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.yale_b import Flash, read_yale_b
-from facerf_cli.cli import evaluate_yale_b
-from facerf_cli.cli.evaluation_items import MethodOptions
+from facerf_cli.cli.items import evaluate_images
+from facerf_cli.cli.items.evaluation import MethodOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.evaluation.protocols import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
 from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
-from tests.evaluation.toy_sitters import Lambert, Networks, someone
+from tests.evaluation.method_doubles import FaceModelOnly
+from tests.evaluation.toy_sitters import Lambert, someone
 
 Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
@@ -31,9 +32,9 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A face in every picture, and methods without networks."""
-    models: Any = Networks(load_face_model("builtin"))
-    monkeypatch.setattr(evaluate_yale_b, "load_methods", lambda _: (Lambert("field", models),))
+    """A face in every image, and methods without networks."""
+    models: Any = FaceModelOnly(load_face_model("builtin"))
+    monkeypatch.setattr(evaluate_images, "load_methods", lambda _: (Lambert("field", models),))
     monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
 
 
@@ -42,7 +43,7 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
     out = tmp_path / "out"
     assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--pictures"]) == 0
     said = capsys.readouterr().out
-    assert "of 2 people" in said and "published, Yale B" in said and "without --shifts" in said
+    assert "of 2 people" in said and "published, Yale B" in said and "no --shifts" in said
     with (out / "images.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     # yaleB05 lacks one flash, which is known to be damaged: from the front, and from four soft lights
@@ -89,7 +90,7 @@ def test_no_table_without_a_subject(folder: Path, tmp_path: Path, capsys: Said) 
         (["nowhere"], 1, "no such folder"),
         (["."], 1, "no folders yaleB01"),
         (["yale", "--subjects", "yaleB07,yaleB99"], 2, "--subjects yaleB99: not in"),
-        (["yale", "--shifts", "shifts.csv"], 1, "no such file of shifts"),
+        (["yale", "--shifts", "shifts.csv"], 1, "shifts.csv: no such file"),
         (["yale", "--compare", "nowhere"], 2, "no such folder"),
         (["yale", "--keep-eyes"], 2, "no such option"),
         (["yale", "--preset", "paper"], 2, "no such option"),
@@ -118,6 +119,6 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
     methods = MethodOptions(PhotoOptions(Settings()), ("field", "prt"), ())
-    sent = pickle.loads(pickle.dumps(evaluate_yale_b._YaleB(methods, read_yale_b(folder), False)))
+    sent = pickle.loads(pickle.dumps(evaluate_images._YaleB(methods, read_yale_b(folder), False)))
     assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

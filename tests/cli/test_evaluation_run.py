@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli import evaluation_run
 from facerf_cli.cli.batch import Item
-from facerf_cli.cli.evaluate_transfer import _OfPhotos
-from facerf_cli.cli.evaluation_items import MethodOptions
 from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.evaluation_run import evaluation_key, item_key
+from facerf_cli.cli.items import evaluation_run
+from facerf_cli.cli.items.evaluate_transfer import _Couple, _TransferPhotos
+from facerf_cli.cli.items.evaluation import MethodOptions
+from facerf_cli.cli.items.evaluation_key import evaluation_key, item_key
+from facerf_cli.cli.items.evaluation_run import keep_images
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
@@ -35,7 +36,7 @@ def _log() -> None:
 def test_tables_csv_and_page(tmp_path: Path, capsys: Said) -> None:
     assert evaluate(tmp_path) == 0
     out = capsys.readouterr().out
-    assert "12 pictures of 3 people" in out and "published, Table 1" in out and "\x1b" not in out
+    assert "12 images of 3 people" in out and "published, Table 1" in out and "\x1b" not in out
     assert all(len(line) <= 100 for line in out.splitlines())
     summary = json.loads((tmp_path / "summary.json").read_text())
     with (tmp_path / "images.csv").open() as stream:
@@ -98,10 +99,11 @@ def test_a_key_is_of_what_a_path_leads_to(tmp_path: Path, monkeypatch: pytest.Mo
 
     def key(folder: str) -> str:
         photo = PhotoOptions(Settings(), face_model=f"{folder}/a.npz", landmarks=Path(folder))
-        couples = {Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a"): "ann"}
+        item = Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a")
+        couples = {item: _Couple("ann", item, item)}
         methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),))
         options = EvaluateOptions(Path("out"), (), compare=(Path(folder),))
-        return evaluation_key("toy", _OfPhotos(methods, couples, False, False), options, Settings())
+        return evaluation_key("toy", _TransferPhotos(methods, couples, False, False), options, Settings())
 
     first = key("theirs")
     assert first == key(str(tmp_path / "theirs")) == key("theirs/../theirs")
@@ -145,7 +147,7 @@ def test_a_method_that_lacks_a_image_is_an_error(tmp_path: Path, capsys: Said) -
 
 
 def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -> None:
-    assert evaluate(tmp_path, images=True) == 0
+    assert evaluate(tmp_path, pictures=True) == 0
     kinds = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert kinds == {"source", "truth", "mask", *NOISE}
     own = comparison("bea", 2)
@@ -160,7 +162,7 @@ def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -
 
 
 def test_images_and_summary_name_the_face_model(tmp_path: Path) -> None:
-    assert evaluate(tmp_path, photo=PhotoOptions(Settings()), images=True) == 0
+    assert evaluate(tmp_path, photo=PhotoOptions(Settings()), pictures=True) == 0
     licence = load_face_model().licence
     guess = read_image(tmp_path / "pictures/good/bea/02.exr").metadata
     assert (guess["facerf:face_model"], guess["facerf:face_model_licence"]) == ("builtin", licence)
@@ -183,29 +185,27 @@ def test_strips_are_few_and_whole(tmp_path: Path) -> None:
 def test_what_was_kept_and_is_gone_is_made_anew(tmp_path: Path, lost: str) -> None:
     notes, out = tmp_path / "notes", tmp_path / "out"
     notes.mkdir()
-    assert evaluate(out, Toy(notes=notes), images=True) == 0
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
     for note in notes.iterdir():
         note.unlink()
     before = (out / lost).read_bytes()
     (out / lost).unlink()
-    assert evaluate(out, Toy(notes=notes), images=True) == 0
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
     assert [note.name for note in notes.iterdir()] == ["bea.asked"]
     assert len((out / lost).read_bytes()) == len(before)
-    assert evaluate(out, Toy(notes=notes), images=True) == 0
+    assert evaluate(out, Toy(notes=notes), pictures=True) == 0
 
 
 def test_names_that_lead_out_of_the_folder(tmp_path: Path) -> None:
-    from facerf_cli.cli.evaluation_run import keep_images
-
     own = comparison("bea", 0)
     for name in ("../x", "/etc/x", ""):
-        with pytest.raises(InputError, match="no name for a picture"):
+        with pytest.raises(InputError, match="not a name for an image in a folder"):
             keep_images(replace(own, case=replace(own.case, name=name)), tmp_path, Settings(), {})
 
 
 def test_two_methods_of_one_name(tmp_path: Path) -> None:
     options = EvaluateOptions(tmp_path, against=(tmp_path / "field.safetensors",))
-    with pytest.raises(UsageError, match="two methods are called 'field'"):
+    with pytest.raises(UsageError, match="two methods have the name 'field'"):
         options.check()
     with pytest.raises(UsageError, match="nothing to evaluate"):
         evaluation_run.run_protocol(LAYOUT, [], Toy(), EvaluateOptions(tmp_path, reflectance=()), Settings())

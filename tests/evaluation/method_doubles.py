@@ -1,18 +1,23 @@
-"""Methods that answer at once, and what the protocols asked of them."""
+"""Methods without networks that record what the protocols ask of them, and a person of known albedo."""
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
+from facerf_cli.composite import Target
+from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person
-from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import FaceTexture, Head
+from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import FaceTexture
+from facerf_cli.pipeline import relight
 
 LIGHTS = torch.eye(3)
 BRIGHTEST = torch.tensor([0.0, 0.0, 1.0])
@@ -20,7 +25,7 @@ BRIGHTEST = torch.tensor([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class Unlit:
-    """A reflectance that gives the photo's texture back under any light, times `gain`."""
+    """A reflectance that returns the photo's texture under any light, times `gain`."""
 
     face: FaceTexture
     gain: float = 1.0
@@ -32,34 +37,64 @@ class Unlit:
 
 
 @dataclass(frozen=True, eq=False)
-class Double:
-    """A method whose reflectance is `Unlit`; its light is brighter with each photo, to tell them apart."""
+class FaceModelOnly:
+    """Models without a network: the landmarks alone are fitted, and images are rendered."""
+
+    face: MorphableModel
+    geometry: None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Double(Method):
+    """A method whose reflectance is `Unlit`; its light is brighter with each photo, to tell them apart.
+
+    Images are rendered as the product renders them, by `models.face`.
+    """
 
     name: str
+    kind: Kind = "field"
     models: Any = None
-    kind: str = "field"
     gain: float = 1.0
     made: list[Explained] = field(default_factory=list)
 
-    def reflectance(self, fit: FaceFit, face: FaceTexture, held_to_photo: bool) -> Unlit:
-        return Unlit(face, self.gain)
-
-    def explained(self, fit: FaceFit, face: FaceTexture, held_to_photo: bool = False) -> Explained:
+    def explained(self, head: Head, network_alone: bool = True) -> Explained:
         weights = torch.tensor([0.1, 0.2, 1.0])[:, None].expand(3, 3) * (1 + len(self.made))
-        self.made.append(Explained(Unlit(face, self.gain), RigLight(LIGHTS, weights)))
+        self.made.append(Explained(Unlit(head.face, self.gain), RigLight(LIGHTS, weights)))
         return self.made[-1]
+
+    def images(
+        self,
+        photo: np.ndarray | None,
+        head: Head,
+        directions: Tensor,
+        weights: Tensor,
+        target: Target,
+        network_alone: bool,
+    ) -> Iterator[np.ndarray]:
+        reflectance = Unlit(head.face, self.gain)
+        for row in weights:
+            light = RigLight(directions, row)
+            yield relight(self.models, photo, head, light, target, reflectance).pixels
 
 
 @dataclass(frozen=True, eq=False)
 class PersonOfAlbedo(Person):
-    """A person whose sources are pictures of the albedo, as the stack under one front light tells it."""
+    """A person whose sources are images of the albedo, computed from the stack's frontal light."""
 
-    def source(self, pair: Any) -> tuple[np.ndarray, FaceTexture]:
-        shot = self.shot(pair.source_camera)
+    def source(self, pair: Any) -> np.ndarray:
         path = self.dataset.stack_path(self.name, pair.source_camera)
-        front = int(shot.header.directions[:, 2].argmax())
+        front, cosine = self._frontal(pair.source_camera)
         lit = read_olats(path, slice(front, front + 1))[0].float().permute(1, 2, 0).numpy()
-        cosine = shot.header.normals @ shot.header.directions[front]
         albedo = np.where(cosine[..., None] > 0.02, lit / np.maximum(cosine, 0.02)[..., None], 0)
-        seen = replace(shot.view, seen=shot.view.seen * (cosine > 0.02)).texture_of(albedo.astype(np.float32))
-        return albedo.astype(np.float32), seen
+        return albedo.astype(np.float32)
+
+    def head(self, pair: Any, image: np.ndarray) -> Head:
+        seen = self.crop(pair.source_camera).header.seen
+        lit = self._frontal(pair.source_camera)[1] > 0.02
+        return super().head(pair, image).without(self.model, seen * lit)
+
+    def _frontal(self, camera: str) -> tuple[int, np.ndarray]:
+        """The light nearest to the camera's axis, and its cosine to each pixel's normal."""
+        header = self.crop(camera).header
+        front = int(header.directions[:, 2].argmax())
+        return front, header.normals @ header.directions[front]

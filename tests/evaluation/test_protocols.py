@@ -1,4 +1,4 @@
-"""The protocols' geometry and bookkeeping on a tiny dataset whose truth is known in closed form."""
+"""The protocols on a tiny dataset whose truth is known in closed form."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Case
-from facerf_cli.evaluation.methods import View, angle_class, angle_of, turn_class
+from facerf_cli.evaluation.crop_view import CropView, angle_class, angle_of, turn_class
 from facerf_cli.evaluation.people import Person, evenly
 from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, Form, compare_geometries
 from facerf_cli.evaluation.protocols.olat import LAMBERT, compare_olats
@@ -24,7 +24,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.metrics import si_mse, si_mse_channels
 from facerf_cli.raster.camera import pose_to_rotation
 from tests.dataset.dataset_fixture import write_small_dataset
-from tests.evaluation.method_doubles import BRIGHTEST, Double, PersonOfAlbedo
+from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +41,20 @@ def pair(index: int, source: str, target: str, light: int, envmap: str = "a") ->
     return Pair("0000", index, "test", source, envmap, 0.0, 0, target, light)
 
 
+def unlit(person: Person, gain: float = 1.0) -> Double:
+    return Double("unlit", models=FaceModelOnly(person.model), gain=gain)
+
+
 def side_light(person: Person, camera: str) -> int:
     """A light from the side that the camera sees."""
-    directions = person.shot(camera).header.directions
+    directions = person.crop(camera).header.directions
     return int(np.abs(directions @ np.array([0.7, 0.1, 0.7]) - 1).argmin())
 
 
 @pytest.mark.parametrize("target", ["C0", "C1"])
 def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, target: str) -> None:
     asked = pair(3, "C0", target, side_light(person, target))
-    (found,) = compare_olats(person, [asked], [Double("unlit")], held_to_photo=True)
+    (found,) = compare_olats(person, [asked], [unlit(person)], network_alone=False)
     truth, mask = found.truth, found.mask
     right = si_mse(found.predictions[LAMBERT], truth, mask)
     wrong = si_mse(found.predictions["unlit"], truth, mask)
@@ -67,9 +71,9 @@ def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, ta
 def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, dataset: Dataset) -> None:
     traits = {"ita_deg": 30.0, "melanin": 0.05, "haemoglobin": 0.02, "random_texture": False}
     known = PersonOfAlbedo(person.model, replace(dataset, traits={"0000": traits}), "0000")
-    front = int(known.shot("C0").header.directions[:, 2].argmax())
+    front = int(known.crop("C0").header.directions[:, 2].argmax())
     asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
-    near, aside = compare_olats(known, asked, [Double("unlit")], held_to_photo=False)
+    near, aside = compare_olats(known, asked, [unlit(known)], network_alone=True)
     assert near.case.facts["tone"] == "intermediate"
     assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
     assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
@@ -79,35 +83,34 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, d
 
 
 def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) -> None:
-    image, face = person.source(pair(0, "C0", "C0", 0))
+    asked = pair(0, "C0", "C0", 0)
+    image = person.source(asked)
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
-    view = person.shot("C0").view
-    found = reconstruct(Case("a", "0000"), view, image, face, [Double("unlit", gain=0.5)], truth)
+    view = person.crop("C0").view
+    found = reconstruct(Case("a", "0000"), view, person.head(asked, image), [unlit(person, 0.5)], truth)
     error = si_mse(found.predictions["unlit"], image, found.mask)
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
     assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
-    np.testing.assert_allclose(found.landmarks_px, person.shot("C0").view.fit.landmarks_px)
+    np.testing.assert_allclose(found.landmarks_px, person.crop("C0").view.fit.landmarks_px)
 
 
 def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
-    method = Double("unlit")
+    method = unlit(person)
     sides = []
     for camera in ("C0", "C1"):
-        image, face = person.source(pair(0, camera, camera, 0))
-        sides.append(Side(Case(f"by {camera}", "0000"), person.shot(camera).view, image, face))
+        asked = pair(0, camera, camera, 0)
+        head = person.head(asked, person.source(asked))
+        sides.append(Side(Case(f"by {camera}", "0000"), person.crop(camera).view, head))
     first, second = transfer((sides[0], sides[1]), [method])
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
     assert torch.equal(light_of_a[0], a.light.weights)
     fits = [side.view.fit for side in sides]
     torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
-    assert first.truth is sides[0].image and first.source is sides[1].image
+    assert first.truth is sides[0].head.cropped and first.source is sides[1].head.cropped
     assert second.case.facts["turn"] == "30 to 60 deg"
-    for found in (
-        first,
-        second,
-    ):  # the same face in another picture, so its texture fits but for what is hidden
+    for found in (first, second):  # the same face in another image: its texture fits where it is visible
         energy = np.square(found.truth[found.mask > 0.5]).mean()
         assert si_mse(found.predictions["unlit"], found.truth, found.mask) < 0.05 * energy
 
@@ -120,37 +123,35 @@ def test_a_scale_a_channel_forgives_colour_alone() -> None:
 
 def test_the_mean_face_is_compared_where_both_see_the_face(person: Person) -> None:
     model = person.model
-    people = {FULL: replace(person, refit=True, _shots={})}
-    people[MEAN] = replace(people[FULL], model=model.pose_only(), _shots={})
+    people = {FULL: replace(person, refit=True, _crops={})}
+    people[MEAN] = replace(people[FULL], model=model.pose_only(), _crops={})
     asked = pair(0, "C1", "C1", 0)
-    image, _ = person.source(asked)
-    forms = {
-        name: Form(p.shot("C1").view, p.shot("C1").view.texture_of(image), [Double("unlit")])
-        for name, p in people.items()
-    }
+    image = person.source(asked)
+    forms = {name: Form(p.crop("C1").view, p.head(asked, image), [unlit(p)]) for name, p in people.items()}
     assert not forms[MEAN].view.fit.alpha.any() and forms[FULL].view.fit.alpha.any()
     found = compare_geometries(Case("a", "0000"), image, forms)
     assert list(found.predictions) == [FULL, MEAN]
     assert (found.mask <= forms[MEAN].view.mask).all() and (found.mask <= forms[FULL].view.mask).all()
     two: dict[str, Any] = {
-        name: replace(form, methods=[Double("x"), Double("y")]) for name, form in forms.items()
+        name: replace(form, methods=[replace(form.methods[0], name=method) for method in "xy"])
+        for name, form in forms.items()
     }
     names = list(compare_geometries(Case("a", "0000"), image, two).predictions)
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: Person) -> None:
-    shot = person.shot("C0")
-    kept = View.of(person.model, shot.view.fit, shot.header.seen, keep_eyes=True)
-    eyes = shot.view.region("eyes") > 0.9
-    assert eyes.sum() > 10 and shot.view.mask[eyes].max() < 0.11
-    assert kept.mask[eyes].min() > 0.5 and (kept.mask >= shot.view.mask).all()
+    crop = person.crop("C0")
+    kept = CropView.of(person.model, crop.view.fit, crop.header.seen, keep_eyes=True)
+    eyes = crop.view.region("eyes") > 0.9
+    assert eyes.sum() > 10 and crop.view.mask[eyes].max() < 0.11
+    assert kept.mask[eyes].min() > 0.5 and (kept.mask >= crop.view.mask).all()
 
 
 def test_a_face_of_which_nothing_is_seen_is_named(person: Person) -> None:
-    shot = person.shot("C0")
+    crop = person.crop("C0")
     with pytest.raises(InputError, match="nothing of the fitted face"):
-        View.of(person.model, shot.view.fit, 0 * shot.header.seen)
+        CropView.of(person.model, crop.view.fit, 0 * crop.header.seen)
 
 
 def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> None:
@@ -193,9 +194,9 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     weights_path(dataset).unlink()
     np.testing.assert_array_equal(person.light(second)[1], weights)
     assert not weights_path(dataset).exists()
-    written, _ = person.source(first)
+    written = person.source(first)
     image_path(dataset, *first.key).unlink()
-    np.testing.assert_array_equal(person.source(first)[0], written)
+    np.testing.assert_array_equal(person.source(first), written)
 
 
 def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, tmp_path: Path) -> None:

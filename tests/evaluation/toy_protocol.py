@@ -1,4 +1,4 @@
-"""A protocol of a few made-up pictures, to drive the evaluation without networks or faces."""
+"""A protocol of a few made-up images, to drive the evaluation without networks or faces."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,17 +8,18 @@ import numpy as np
 
 from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.evaluation_run import run_protocol
+from facerf_cli.cli.items.evaluation_run import run_protocol
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.summary import TABLE_1, Layout
+from facerf_cli.evaluation.published import TABLE_1
+from facerf_cli.evaluation.summary import Layout
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(
     "toy",
-    "Toy <pictures> & more",
+    "Toy <images> & more",
     ("si_mse", "psnr", "light_error_deg"),
     ("pose", "angle"),
     TABLE_1,
@@ -30,7 +31,7 @@ NOISE = {"good": 0.02, "bad <i>": 0.1}
 
 @dataclass(frozen=True)
 class Toy:
-    """Each item is a person with `cases` pictures: a blob under a light, and two noisy guesses at it.
+    """Each item is a person with `cases` images: a blob under a light, and two noisy guesses at it.
 
     A folder of `notes` gets a file for each item asked for; an item fails while NAME.broken is there.
     """

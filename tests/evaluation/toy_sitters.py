@@ -1,39 +1,47 @@
-"""Stand-ins for what relights the people of Extended Yale B: anybody's face, a method of no cost."""
+"""A face and a method without networks, for the people of Extended Yale B."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
+from facerf_cli.composite import Target
+from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.light.sphere import RigLight
+from facerf_cli.pipeline import relight
 from facerf_cli.raster.camera import Camera, project
 
 
 @dataclass(frozen=True, eq=False)
 class Lambert:
-    """A method whose face is white and without shape: the cosine of the light to the camera."""
+    """A method whose face is white and flat: the cosine of the light to the camera's axis."""
 
     name: str
     models: Any
 
-    def reflectance(self, fit: Any, face: Any, held_to_photo: bool) -> "Lambert":
-        assert held_to_photo and face.texture.shape == (3, 256, 256)
-        return self
+    def images(
+        self,
+        photo: np.ndarray,
+        head: Head,
+        directions: Tensor,
+        weights: Tensor,
+        target: Target,
+        network_alone: bool,
+    ) -> Iterator[np.ndarray]:
+        assert not network_alone and head.face.texture.shape == (3, 256, 256)
+        for row in weights:
+            light = RigLight(directions, row)
+            yield relight(self.models, photo, head, light, target, reflectance=self).pixels
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))
         return cosines[..., None, None].expand(-1, -1, 256, 256)
-
-
-@dataclass(frozen=True, eq=False)
-class Networks:
-    """Models without a network: the landmarks alone are fitted."""
-
-    face: Any
-    geometry: None = None
 
 
 def someone() -> Face:

@@ -1,4 +1,4 @@
-"""Extended Yale B as a protocol: its cases, lights and pictures, against the benchmark that defines them."""
+"""Extended Yale B as a protocol: its cases, lights and images are those of the benchmark."""
 
 import csv
 import importlib.util
@@ -18,13 +18,23 @@ from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Others
 from facerf_cli.evaluation.measure import Measures, measure
+from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.protocols import yale_b
-from facerf_cli.evaluation.protocols.yale_b import FIGURES, compare_sitter, fill_uncovered, layout, published
-from facerf_cli.evaluation.protocols.yale_b_cases import Sitter, environment_weights, face_mask
+from facerf_cli.evaluation.protocols.yale_b import FIGURES, compare_sitter, layout, published
+from facerf_cli.evaluation.protocols.yale_b_cases import (
+    Question,
+    Sitter,
+    environment_weights,
+    face_mask,
+)
 from facerf_cli.face.morphable import load_face_model
-from tests.capture.yale_fixture import FLASHES, write_yale_b
+from facerf_cli.light.sphere import RigLight
+from facerf_cli.models import load_models
+from facerf_cli.pipeline import fit_photo, relight
+from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
-from tests.evaluation.toy_sitters import Lambert, Networks, someone
+from tests.evaluation.method_doubles import FaceModelOnly
+from tests.evaluation.toy_sitters import Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
 
@@ -121,7 +131,7 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
     assert sorted([*sum(columns, ()), *angles] for columns, angles in FIGURES.values()) == sorted(figures)
     quotient = [row for row in published() if row.method == "quotient image"]
     assert len(published()) == 11 * 4 and len(quotient) == 11
-    assert all(row.data == "same pictures, 21 people, told more" for row in quotient)
+    assert all(row.data == "same images, 21 people, given more data" for row in quotient)
 
 
 @pytest.fixture
@@ -132,12 +142,14 @@ def small(tmp_path: Path) -> YaleB:
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
     monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
-    monkeypatch.setattr(yale_b, "see_head", lambda *_: fits.update(["seen"]))
-    models = Networks(load_face_model("builtin"))
+    monkeypatch.setattr(yale_b, "fit_photo", lambda *given: fits.update(["fitted"]) or fit_photo(*given))
+    flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
+    write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
+    models = FaceModelOnly(load_face_model("builtin"))
     methods: Any = [Lambert("a", models), Lambert("b", models)]
     comparisons = list(compare_sitter(small, "yaleB07", methods))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
-    assert columns == {"frontal": 6, "soft": 4 * 7, "environment": 8} and fits["seen"] == 5  # one a source
+    assert columns == {"frontal": 6, "soft": 4 * 7, "environment": 8} and fits["fitted"] == 5  # one a source
     for comparison in comparisons:
         assert set(comparison.predictions) == {"a", "b"}
         assert comparison.truth.shape == comparison.predictions["a"].shape == (192, 168, 3)
@@ -159,7 +171,7 @@ def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:
 def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
-    with pytest.raises(InputError, match=r"yaleB07: no sound image under A\+000E\+00"):
+    with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
         list(compare_sitter(read_yale_b(folder), "yaleB07", []))
 
 
@@ -173,24 +185,31 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
     assert environment_weights("dome", flashes).sum() == pytest.approx(1)
 
 
-def test_the_photo_goes_on_beyond_the_mesh() -> None:
-    covered = torch.zeros(8, 6)
-    covered[2:6, 1:5] = 1
-    photo = torch.rand(8, 6)
-    relit = 0.5 * (photo + 0.02) - 0.02  # half the light
-    filled = fill_uncovered(relit[None], photo * covered, photo, covered)[0]
-    torch.testing.assert_close(filled, torch.where(covered > 0, relit, relit.clamp_min(0)), atol=1e-5, rtol=0)
+def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    models = load_models(None, "builtin", torch.device("cpu"))
+    sitter = Sitter(small, "yaleB07")
+    photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
+    head = fit_photo(models, photo, someone().landmarks_px)
+    directions = torch.from_numpy(np.stack([flash.direction for flash in sitter.flashes])).float()
+    for name, light in (("soft", "A-070E+00"), ("environment", "env_two_side")):
+        questions = [Question(name, "win_left", light)]
+        monkeypatch.setattr(Sitter, "questions", lambda self, asked=questions: iter(asked))
+        (comparison,) = compare_sitter(small, "yaleB07", [Method("field", "field", models)])
+        weights = torch.from_numpy(sitter.weights(light)).float()[:, None].expand(-1, 3)
+        expected = relight(models, photo, head, RigLight(directions, weights)).pixels.mean(-1).clip(0)
+        np.testing.assert_allclose(comparison.predictions["field"][..., 1], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_what_is_said_beside_the_figures(small: YaleB, tmp_path: Path) -> None:
+def test_notes_below_the_figures(small: YaleB, tmp_path: Path) -> None:
     plain = layout(small, ["yaleB05"])
-    assert any("without --shifts" in note for note in plain.notes)
+    assert any("no --shifts" in note for note in plain.notes)
     assert any("chosen on yaleB05" in note for note in plain.notes)
     assert any("1 known to be" in note for note in plain.notes)
     with (tmp_path / "shifts.csv").open("w", newline="") as stream:
         csv.writer(stream).writerows([("subject", "light", "dy", "dx"), ("yaleB07", "A+000E+00", 1, 0)])
     moved = read_yale_b(small.folder, read_shifts(tmp_path / "shifts.csv"))
-    assert not any("without --shifts" in note for note in layout(moved, ["yaleB07"]).notes)
+    assert not any("no --shifts" in note for note in layout(moved, ["yaleB07"]).notes)
     assert moved.shifts == {("yaleB07", Flash(0, 0)): (1, 0)}
 
 
