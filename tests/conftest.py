@@ -1,6 +1,7 @@
 """What tests share. The data of `../shared` is not in the repository; tests that need it skip without it."""
 
 import os
+import signal
 import tarfile
 from pathlib import Path
 
@@ -8,10 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
+from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
+
+# A shell that starts the tests in the background ignores SIGINT, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "shared"))
 

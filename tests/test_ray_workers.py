@@ -19,6 +19,7 @@ from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import configure_logging
 from facerf_cli.ray_workers import connect
 from tests.cli.toy_batch import run
+from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
@@ -101,22 +102,20 @@ def test_a_worker_is_killed_while_it_works(
 
 
 def kill_the_victim(notes: Path) -> None:
-    deadline_s = time.monotonic() + 60
-    while not (notes / "victim").exists() and time.monotonic() < deadline_s:
+    while not (notes / "victim").exists():
         time.sleep(0.05)
-    time.sleep(0.2)
+    time.sleep(0.2)  # most likely in the middle of its work
     os.kill(int((notes / "victim").read_text()), signal.SIGKILL)
 
 
 def ends(process: int) -> bool:
-    """Whether a process that nobody waits for is gone in a while."""
-    for _ in range(300):
+    """Wait for the end of a process that is not a child; a process that never ends hangs here."""
+    while True:
         try:
             os.kill(process, 0)
         except ProcessLookupError:
             return True
         time.sleep(0.1)
-    return False
 
 
 @needs_ray
@@ -145,10 +144,9 @@ def test_an_item_that_always_kills_its_worker_is_given_up(
 def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, two_workers: None) -> None:
     (photos / "x" / "b.png").write_bytes(b"stop")
     (photos / "x" / "c.png").write_bytes(b"wait")
-    start_s = time.monotonic()
     with pytest.raises(FacerfError, match=r"^the checkpoint is broken$"):
         run(photos, tmp_path / "out", ray="local", jobs=2)
-    assert time.monotonic() - start_s < 30 and not list((tmp_path / "out").rglob(".*"))
+    assert not list((tmp_path / "out").rglob(".*")) and not (tmp_path / "out/x/c_copy.bin").exists()
 
 
 @needs_ray
@@ -157,11 +155,9 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
     root = Path(__file__).parents[1]
     command = [sys.executable, "-m", "tests.cli.toy_batch", str(photos), str(tmp_path / "out")]
     process = subprocess.Popen(command, cwd=root, start_new_session=True, stderr=subprocess.PIPE, text=True)
-    deadline_s = time.monotonic() + 60
-    while not (tmp_path / "victim").exists() and time.monotonic() < deadline_s:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
-    assert process.communicate(timeout=40)[1].rstrip().endswith("KeyboardInterrupt")
+    wait_until((tmp_path / "victim").exists, process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    assert process.communicate()[1].rstrip().endswith("KeyboardInterrupt")
     assert process.returncode != 0 and not list((tmp_path / "out").rglob(".*"))
     assert ends(int((tmp_path / "victim").read_text()))
 
@@ -171,7 +167,7 @@ def test_what_answers_need_not_be_ray(tmp_path: Path) -> None:
     code = "from facerf_cli.ray_workers import connect\nimport sys\nconnect(sys.argv[1])"
     with socket.create_server(("127.0.0.1", 0)) as server:
         command = [sys.executable, "-c", code, f"127.0.0.1:{server.getsockname()[1]}"]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=90)
+        result = subprocess.run(command, capture_output=True, text=True)
     assert "UsageError: --ray 127.0.0.1:" in result.stderr.splitlines()[-1]
 
 

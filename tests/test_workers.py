@@ -62,10 +62,8 @@ def test_who_stops_listening_ends_the_workers(tmp_path: Path) -> None:
     assert next(results) == "A"
     while not (tmp_path / "b").exists():
         time.sleep(0.01)
-    start_s = time.monotonic()
     results.close()
-    assert not (tmp_path / "b").exists(), "SIGTERM unwinds"
-    assert time.monotonic() - start_s < 8
+    assert not (tmp_path / "b").exists(), "SIGTERM unwinds; SIGKILL would leave it"
 
 
 def _refuse(pipe: object, level: int, threads: int) -> None:

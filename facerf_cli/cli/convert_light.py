@@ -126,11 +126,10 @@ def convert_light(
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
 ) -> None:
-    """Convert lights: maps, rigs' weights, spherical harmonics; in the axes of other programs.
+    """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
 
-    Maps are OpenEXR lat-long, scene-linear; every file that can says which convention it is in. From a map
-    or a rig to spherical harmonics what is finer than their order is lost; the weights of a rig are taken
-    from a map as `relight` takes them.
+    Maps are OpenEXR lat-long, scene-linear; files name their convention where they can. Spherical harmonics
+    lose what is finer than their order; the weights of a rig are integrated from a map as `relight` does.
     """
     if unknown := [form for form in to if form not in get_args(Form)]:
         raise UsageError(f"--to {unknown[0]}: no such form; give one of {', '.join(_ENDINGS)}")

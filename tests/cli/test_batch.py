@@ -1,4 +1,4 @@
-"""The contract of every verb that walks folders (DESIGN), with a verb that only copies bytes."""
+"""The contract of every verb that walks folders (docs/design.md), with a verb that only copies bytes."""
 
 import io
 import json
@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,6 +15,7 @@ from facerf_cli.cli.options import Settings
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import configure_logging
+from tests.processes import wait_until
 
 
 def outputs_of(item: Item) -> list[Path]:
@@ -234,11 +234,9 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path, jobs: int)
     out = tmp_path / "out"
     command = [sys.executable, str(tmp_path / "slow_verb.py"), str(photos), str(out), str(jobs)]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL, env=ENVIRONMENT)
-    deadline_s = time.monotonic() + 60
-    while not (out / "started").exists() and time.monotonic() < deadline_s:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)  # what a terminal does
-    process.wait(timeout=30)
+    wait_until((out / "started").exists, process)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+    process.wait()
     assert process.returncode != 0
     left = sorted(path.name for path in out.rglob("*") if path.is_file())
     assert left == ["report.jsonl", "started"]

@@ -152,7 +152,7 @@ def test_bad_lights_are_a_line_each_and_the_others_go_on(tmp_path: Path, capsys:
     lines = capsys.readouterr().err.splitlines()
     for words in (
         "twice as wide",
-        "8 numbers; a light is 9 or 27",
+        "8 numbers; a light has 9 or 27",
         "another convention",
         "cannot be read as JSON",
     ):

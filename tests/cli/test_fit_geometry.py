@@ -120,7 +120,7 @@ def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
         ("[]", "landmarks"),
         ("{", "landmarks"),
         (json.dumps([[5, 5]] * 68), "one spot"),
-        (json.dumps(outside), "outside the picture"),
+        (json.dumps(outside), "outside the image"),
     ):
         if content is not None:
             (marks / "astronaut.json").write_text(content)

@@ -126,9 +126,9 @@ def test_all_faces_get_a_number_and_finished_ones_are_skipped(given: Path, tmp_p
 
 
 @pytest.mark.parametrize(("line", "code", "message"), [
-    (["--lights", "0"], 2, "from 1 to"), (["--lights", "99999"], 2, "from 1 to"),
-    (["--lights", "few"], 2, "give a number"), (["--lights", "1,2;3"], 2, "numbers with commas"),
-    (["--lights", "1,nan"], 2, "numbers with commas"), (["--lights", "-3"], 2, "give a number"),
+    (["--lights", "0"], 2, "give 1 to 4096"), (["--lights", "99999"], 2, "give 1 to 4096"),
+    (["--lights", "few"], 2, "give a number"), (["--lights", "1,2;3"], 2, "numbers separated by commas"),
+    (["--lights", "1,nan"], 2, "numbers separated by commas"), (["--lights", "-3"], 2, "give a number"),
     (["--pose", "10,20"], 2, "--pose"), (["--pose", "a,b,c"], 2, "--pose"),
     (["--pose", "inf,0,0"], 2, "--pose"),
     (["--texture-size", "300"], 2, "multiple of 256"), (["--texture-size", "0"], 2, "multiple of 256"),

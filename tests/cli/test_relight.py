@@ -146,7 +146,7 @@ def test_pose_gives_the_face_alone(given: Path, tmp_path: Path) -> None:
 def test_a_matte_of_another_size(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_exr(tmp_path / "matte.exr", np.ones((20, 30, 3), np.float32))
     assert relight(given, tmp_path / "out", "--light", "0,0", "--matte", str(tmp_path / "matte.exr")) == 1
-    assert "matte.exr: the matte is 30 x 20, the photo 512 x 512" in capsys.readouterr().err
+    assert "matte.exr: the matte has 30 x 20 pixels, the photo 512 x 512" in capsys.readouterr().err
     assert relight(given, tmp_path / "out", "--light", "0,0", "--matte", str(tmp_path / "none.exr")) == 2
     assert "--matte " in capsys.readouterr().err
 

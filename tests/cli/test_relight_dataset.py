@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import pytest
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.processes import wait_until
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2]), "OMP_NUM_THREADS": "1"}
 
@@ -81,9 +81,7 @@ def test_killed_at_any_moment_the_same_line_ends_in_the_same_tree(
     killed = Path(shutil.copytree(small, tmp_path / "killed"))
     command = [sys.executable, "-m", "facerf_cli", *line(killed, images=images)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=ENVIRONMENT, start_new_session=True)
-    deadline_s = time.monotonic() + 120
-    while len(list((killed / "relit").glob("*/*.exr"))) < 5 and time.monotonic() < deadline_s:
-        time.sleep(0.002)
+    wait_until(lambda: len(list((killed / "relit").glob("*/*.exr"))) >= 5, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert 5 <= len(list((killed / "relit").glob("*/*.exr"))) < 3 * images

@@ -3,7 +3,6 @@
 import os
 import pickle
 import struct
-import time
 from collections import OrderedDict
 from pathlib import Path
 from typing import Any
@@ -165,11 +164,9 @@ def test_damage_is_one_line(tmp_path: Path, case: str) -> None:
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)
 
 
-def test_deep_nests_neither_recurse_nor_take_long(tmp_path: Path) -> None:
-    begin = time.perf_counter()
+def test_deep_nests_do_not_recurse(tmp_path: Path) -> None:
     for data in (b"]" * 60_000 + b"a" * 59_999 + b".", b")" + b"\x85" * 60_000 + b"."):
         read_inert_pickle(written(tmp_path / "a.pkl", b"\x80\x02" + data))
-    assert time.perf_counter() - begin < 5
 
 
 def test_the_work_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,7 +51,7 @@ def find_landmarks(mean: np.ndarray, triangles: np.ndarray, known: dict[int, np.
     With fewer than four known landmarks the foremost point is taken for the tip of the nose. Raises
     InputError where no face is found.
     """
-    mesh = trimesh.Trimesh(mean, triangles, process=False)
+    mesh = trimesh.Trimesh(mean, _outward(mean, triangles), process=False)
     rotation, translation = _start(mean[np.unique(triangles)], known)
     alpha = np.zeros(_sparse_face().basis.shape[-1])
     inner = _inner(mesh)
@@ -65,6 +65,18 @@ def find_landmarks(mean: np.ndarray, triangles: np.ndarray, known: dict[int, np.
     for index, point in known.items():
         found[index] = point
     return found
+
+
+def _outward(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return triangles [F, 3] that are counter-clockwise from outside, whichever way they were wound.
+
+    A point nearest to an edge is equally near to two faces, and rounding, which depends on the order of the
+    corners, chooses one of their normals. Over all rounds this moves a landmark by up to 0.05 mm.
+    """
+    centred = points - points[np.unique(triangles)].mean(0)
+    a, b, c = centred[triangles].swapaxes(0, 1)
+    six_volumes = np.einsum("fc,fc->", a, np.cross(b, c))
+    return triangles if six_volumes >= 0 else triangles[:, [0, 2, 1]]
 
 
 @cache
