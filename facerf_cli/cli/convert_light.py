@@ -58,7 +58,7 @@ class ConvertLight:
 
     def __call__(self, item: Item) -> Outcome:
         """Read the light and write it."""
-        from facerf_cli.cli.items.convert_light import write_forms
+        from facerf_cli.cli.items.convert_lights import write_forms
 
         return Outcome(self.outputs_of(item), {"light": write_forms(item, self)})
 

@@ -26,7 +26,7 @@ def doctor(
     """
     facts = _installation()
     if MISSING not in facts["packages"].values():  # the rest needs all packages
-        from facerf_cli.cli.items.doctor import examine
+        from facerf_cli.cli.items.doctor_facts import examine
 
         facts |= examine(settings_of(context))
     print(json_line(facts) if as_json else as_screen(facts))

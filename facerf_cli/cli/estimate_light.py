@@ -40,13 +40,13 @@ class EstimateLight:
 
     def prepare(self) -> None:
         """Load the models, before the first photo."""
-        from facerf_cli.cli.items.estimate_light import prepare_light
+        from facerf_cli.cli.items.photo_lights import prepare_light
 
         prepare_light(self.options)
 
     def __call__(self, item: Item) -> Outcome:
         """Estimate the light of every chosen face."""
-        from facerf_cli.cli.items.estimate_light import write_lights
+        from facerf_cli.cli.items.photo_lights import write_lights
 
         tags, facts = write_lights(item, self.options, self.width_px, self.sh_order)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

@@ -43,13 +43,13 @@ class FitGeometry:
 
     def prepare(self) -> None:
         """Load the models, before the first photo."""
-        from facerf_cli.cli.items.photo import prepare_photos
+        from facerf_cli.cli.items.photos import prepare_photos
 
         prepare_photos(self.photo)
 
     def __call__(self, item: Item) -> Outcome:
         """Fit every chosen face."""
-        from facerf_cli.cli.items.fit_geometry import write_fits
+        from facerf_cli.cli.items.fit_photos import write_fits
 
         tags, facts = write_fits(item, self.photo)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

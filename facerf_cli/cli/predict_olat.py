@@ -47,13 +47,13 @@ class PredictOlat:
 
     def prepare(self) -> None:
         """Load the models, before the first photo."""
-        from facerf_cli.cli.items.photo import prepare_photos
+        from facerf_cli.cli.items.photos import prepare_photos
 
         prepare_photos(self.photo)
 
     def __call__(self, item: Item) -> Outcome:
         """Predict every chosen face."""
-        from facerf_cli.cli.items.predict_olat import write_stacks
+        from facerf_cli.cli.items.olat_stacks import write_stacks
 
         return Outcome(*write_stacks(item, self))
 

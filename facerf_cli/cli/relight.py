@@ -62,8 +62,8 @@ class Relight:
 
     def readable(self) -> "Relight":
         """Load the models, and keep the setups whose maps can be read."""
-        from facerf_cli.cli.items.lights import readable
-        from facerf_cli.cli.items.photo import prepare_photos
+        from facerf_cli.cli.items.light_weights import readable
+        from facerf_cli.cli.items.photos import prepare_photos
 
         prepare_photos(self.photo)
         setups = readable(self.setups)
@@ -73,7 +73,7 @@ class Relight:
 
     def __call__(self, item: Item) -> Outcome:
         """Relight a photo or a stack."""
-        from facerf_cli.cli.items.relight import relight_item
+        from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self)
         outputs = [path.with_suffix(suffix) for path in written for suffix in (".exr", ".png")]
@@ -252,6 +252,6 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
         and (options.overwrite or not path.with_suffix(".png").exists())
     }
     if missing:
-        from facerf_cli.cli.items.lights import write_balls
+        from facerf_cli.cli.items.light_weights import write_balls
 
         write_balls(list(missing), list(missing.values()), work.exposure_ev)

@@ -74,7 +74,7 @@ def relight_dataset(
     """
     if not math.isfinite(memory):
         raise UsageError(f"--memory {memory}: not a size; give a number of GB")
-    from facerf_cli.cli.items.relight_dataset import relight_subjects
+    from facerf_cli.cli.items.relight_pairs import relight_subjects
 
     settings, memory_bytes = settings_of(context), int(memory * 2**30)
     work = RelightDataset(

@@ -67,7 +67,7 @@ def synth_stage(
     """
     if transport and renderer != "bake":
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
-    from facerf_cli.cli.items.synth_stage import photograph_people
+    from facerf_cli.cli.items.synth_subjects import photograph_people
 
     batch = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)

@@ -256,7 +256,7 @@ def train(
         validate_every=validate_every or training.validate_every,
         bf16=training.bf16 if bf16 is None else bf16,
     )
-    from facerf_cli.cli.items.train import run_training
+    from facerf_cli.cli.items.train_run import run_training
 
     run_training(
         TrainOptions(

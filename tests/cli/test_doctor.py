@@ -8,7 +8,7 @@ from safetensors.numpy import save_file
 
 from facerf_cli import __version__
 from facerf_cli.cli.doctor import MISSING
-from facerf_cli.cli.items import doctor
+from facerf_cli.cli.items import doctor_facts as doctor
 from facerf_cli.main import main
 
 

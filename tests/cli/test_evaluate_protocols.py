@@ -13,7 +13,7 @@ from PIL import Image
 from facerf_cli.cli.batch import Item
 from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
 from facerf_cli.cli.items.evaluation import MethodOptions, portraits
-from facerf_cli.cli.items.photo import load_models_once
+from facerf_cli.cli.items.photos import load_models_once
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset

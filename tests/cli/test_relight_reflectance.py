@@ -11,7 +11,7 @@ from facerf_cli.baselines import prt
 from facerf_cli.baselines.diffuse_sh import CHECKPOINT
 from facerf_cli.baselines.prt import TransferSettings
 from facerf_cli.baselines.synthesis import DETAIL
-from facerf_cli.cli.items.estimate_light import LIGHT_FEATURES
+from facerf_cli.cli.items.photo_lights import LIGHT_FEATURES
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main

@@ -10,8 +10,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from facerf_cli.cli.items.estimate_light import light_of_photo
-from facerf_cli.cli.items.photo import directions_of, face_model
+from facerf_cli.cli.items.photo_lights import light_of_photo
+from facerf_cli.cli.items.photos import directions_of, face_model
 from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import write_display, write_exr

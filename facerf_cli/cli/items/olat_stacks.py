@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from facerf_cli.cli.batch import Item
-from facerf_cli.cli.items.photo import (
+from facerf_cli.cli.items.photos import (
     FittedFace,
     directions_of,
     facts_of,

@@ -7,7 +7,7 @@ from typing import Any
 
 from facerf_cli.cli.batch import Item
 from facerf_cli.cli.items.light_image import draw_estimate
-from facerf_cli.cli.items.photo import (
+from facerf_cli.cli.items.photos import (
     FittedFace,
     directions_of,
     fit_faces,

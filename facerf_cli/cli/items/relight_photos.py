@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.cli.batch import Item
-from facerf_cli.cli.items.lights import weights_over_rig, weights_over_stack
-from facerf_cli.cli.items.photo import (
+from facerf_cli.cli.items.light_weights import weights_over_rig, weights_over_stack
+from facerf_cli.cli.items.photos import (
     FittedFace,
     face_model,
     facts_of,
