@@ -71,7 +71,7 @@ class ColourSpace:
 
     @property
     def is_linear(self) -> bool:
-        """Whether values are known to be proportional to light."""
+        """True if values are known to be proportional to light."""
         return self.chromaticities is not None and self.decode is None
 
 

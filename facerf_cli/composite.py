@@ -48,7 +48,7 @@ _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and be
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a relit head is shown as.
+    """The pose and the surroundings in which a relit head is shown.
 
     `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its face
     relit, or the rendered face alone. In the photo, hair and background follow the light on the face, unless
@@ -234,7 +234,7 @@ class Surround:
 
 
 def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:
-    """Where each pixel of the photo lies in the surround's square, for grid_sample [1, H, W, 2]."""
+    """The place of each photo pixel in the surround's square, for grid_sample [1, H, W, 2]."""
     x = ((torch.arange(width_px) + PIXEL_CENTRE - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
     y = ((torch.arange(height_px) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
     return torch.stack([x.expand(height_px, -1), y[:, None].expand(-1, width_px)], -1)[None].float()

@@ -78,7 +78,7 @@ class Field:
 
 
 def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
-    """What the network's field lacks of the face's own photo, as a quotient image.
+    """Compute the quotient image by which the network's field is corrected to its own photo.
 
     The photo's light is estimated over a coarse rig, on small textures.
     """

@@ -179,7 +179,7 @@ def _cancel(ray: Any, running: list[Any]) -> None:
 
 @dataclass(frozen=True)
 class _Site:
-    """What a task must know of the process that sent it."""
+    """Facts of the process that sent a task."""
 
     folder: str
     version: str
@@ -215,7 +215,7 @@ class _Answer:
 
 
 def _task(work: Callable[[Any], Any], item: Any, site: _Site) -> _Answer:
-    """What Ray's workers run."""
+    """Run one item in a worker of Ray."""
     site.enter()
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     log_to_queue(records, site.level)

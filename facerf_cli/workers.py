@@ -153,7 +153,7 @@ class _Wire:
 
 @dataclass(frozen=True)
 class Workers:
-    """Where items are processed: `jobs` processes of this machine, or tasks of Ray.
+    """The choice of workers: `jobs` processes of this machine, or tasks of Ray.
 
     With Ray, `jobs` tasks run at a time (0: as many as Ray has processors), each with `gpus` GPUs.
     """

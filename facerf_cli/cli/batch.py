@@ -227,7 +227,7 @@ def all_finished(
     options: BatchOptions,
     settings: Settings,
 ) -> bool:
-    """Whether this process's share of the items is finished, so that nothing needs to be loaded."""
+    """True if this process's share of the items is finished, so that nothing needs to be loaded."""
     share = settings.shard.share(items)
     return not options.overwrite and all(_is_finished(outputs_of(item)) for item in share)
 

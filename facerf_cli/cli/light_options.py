@@ -15,7 +15,7 @@ MOST_LIGHTS = 1024  # in the least squares; with more, non-negative ones take mi
 
 @dataclass(frozen=True)
 class LightOptions:
-    """How the light of a photo is estimated; settings only, so that they can be sent to other processes."""
+    """Settings of estimating the light of a photo, which can be sent to other processes."""
 
     photo: PhotoOptions
     reflectance: Kind = "field"

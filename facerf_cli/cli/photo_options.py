@@ -35,7 +35,7 @@ TextureSizeOption = Annotated[
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photos are read and fitted; settings only, so that they can be sent to other processes."""
+    """Settings of reading and fitting photos, which can be sent to other processes."""
 
     settings: Settings
     colourspace: str | None = None

@@ -1,4 +1,4 @@
-"""Where a fitted face is compared: the masks of its crop, and the classes of angles that tables use."""
+"""The masks in which a fitted face is compared, and the classes of angles that tables use."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -49,7 +49,7 @@ class CropView:
         return CropView(fit, uv, inside)
 
     def region(self, name: str) -> np.ndarray:
-        """Where the crop shows a named region of the face [S, S], 0..1 (`face/topology.py`)."""
+        """The mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
         return sample_texture(region_mask(name, _MASK_SIDE)[None], self.uv)[..., 0].numpy()
 
 

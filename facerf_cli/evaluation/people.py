@@ -160,6 +160,6 @@ class Portrait:
 
 
 def _shown(crop: Crop, photo: LinearImage) -> np.ndarray:
-    """How much of the photo each pixel of its crop shows [S, S], in 0..1."""
+    """The share of the photo in each pixel of its crop [S, S], in 0..1."""
     inside = crop.valid(*photo.pixels.shape[:2]).astype(np.float32)
     return inside if photo.alpha is None else inside * crop.apply(photo.alpha[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""What the protocols of `facerf evaluate` measure: people of a dataset or photos, and the methods."""
+"""The data and methods of `facerf evaluate`: people of a dataset, or photos, and reflectance models."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence

@@ -45,7 +45,7 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 
 
 class Composer(Protocol):
-    """What composes images: a `Composition`, or for a stack of images `_RenderedStack`."""
+    """A composer of images: `Composition`, or for a stack of rendered images `_RenderedStack`."""
 
     def image(self, light: RigLight, relit: Relit) -> RelitImage:
         """The image of a head under a light, as relit by it."""
@@ -59,7 +59,7 @@ class Composer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A head relit by M setups, rgb weights [M, L, 3] of lights [L, 3], and what composes it."""
+    """A head relit by M setups, rgb weights [M, L, 3] of lights [L, 3], and its composer."""
 
     composer: Composer
     directions: Tensor
@@ -137,7 +137,7 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 
 
 def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Composer, dict[str, Any]]:
-    """What composes a stack's images in the crop's own frame, and facts of the fit in it."""
+    """The composer of a stack's images in the frame of its crop, and facts of its fit."""
     header = stack.header
     if header.kind == "image":
         return _RenderedStack(header.seen, header.normals), {}
