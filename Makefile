@@ -25,14 +25,9 @@ lint: $(STAMP)
 test: lint
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
-# Those that want a bank, a dataset, a run or a command, and what scripts share.
-NOT_ALONE := ablations align_motion baselines capture_checks capture_copy capture_faults closed_loop \
-	diffuse_sh geometry_network loss_curve model_card planted_faults resume synth_stage synthetic \
-	training_speed workers yale_table
-ALONE = $(filter-out $(NOT_ALONE:%=benchmarks/%.py), $(wildcard benchmarks/*.py))
-
+# A benchmark that lacks its data says so in one line and succeeds.
 bench: $(STAMP)
-	set -e; for script in $(ALONE); do echo "== $$script"; $(VENV)/bin/python $$script; done
+	set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(VENV)/bin/python $$script; done
 
 man: $(STAMP)
 	$(VENV)/bin/python -m facerf_cli.manpages man

@@ -1,137 +1,140 @@
-"""The reflectance models of the comparison on people of a prepared dataset, each picture against its truth.
+"""Si-MSE of the reflectance models of the comparison on people of a prepared dataset, in four steps.
 
-    python benchmarks/baselines.py --dataset DATASET --split validation --reflectance prt [--detail 0.4]
+    python benchmarks/baselines.py --dataset DATASET --split test [--reflectance prt]
 
-Of a source under one map: Si-MSE of its reconstruction (in the light that the model finds), of the
-reflectance in the source's true light, and in that of another map, in the source's pose and in another. The
-truths are weighed of the dataset's lights. This is what the baselines' settings were chosen by.
+A source image under one map is reconstructed in the light that the model estimates, then relit by its true
+light, by that of another map, and by that of another map in another pose. The truths are sums of the
+dataset's OLATs. The settings of the baselines were chosen by these figures on the validation people.
+
+Peer: the field, without the photo's quotient. Naive twins of `diffuse-sh`: its albedo at the network's
+resolution (`low-pass`), and the network's light as it is (`unrefined`).
 """
 
-import argparse
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import cast, get_args
 
 import numpy as np
 import torch
-from facerf_cli.baselines.explain import explain
+from _common import arguments, interval_text, print_header, print_row, required
 from torch import Tensor
 
-from facerf_cli.baselines import Kind, prt, specular_sh
-from facerf_cli.baselines.synthesis import DETAIL
+from facerf_cli.baselines import Kind
+from facerf_cli.baselines.base import Explained
+from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
+from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
+from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.weights import load_pairs
-from facerf_cli.evaluation.methods import View
-from facerf_cli.face.fit import fit_from_arrays
-from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.evaluation.crop_view import CropView
+from facerf_cli.evaluation.people import Person
+from facerf_cli.face.head import Head
+from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.light.sphere import RigLight
 from facerf_cli.metrics import mean_interval, si_mse
-from facerf_cli.pipeline import FaceTexture, Models, load_models, turn_to
+from facerf_cli.models import Models, load_models
+from facerf_cli.pipeline import explain, relight
 
-KINDS: tuple[Kind, ...] = ("field", "diffuse-sh", "specular-sh", "prt")
+METHODS = ("field", "diffuse-sh", "diffuse-sh low-pass", "diffuse-sh unrefined", "specular-sh", "prt")
+STEPS = ("reconstruction", "in the source's true light", "under another map", "and in another pose")
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """A person seen by a camera: the lights' directions [L, 3] in its crop, their pictures [L, 3, S, S]."""
+class CapturedView:
+    """A camera's crop of a person: its view, the lights' directions [L, 3], their images [L, 3, S, S]."""
 
-    view: View
+    view: CropView
     directions: Tensor
     olats: Tensor
 
-    def under(self, weights: Tensor) -> np.ndarray:
-        """The true picture [S, S, 3] under weights [L, 3]."""
+    def truth(self, weights: Tensor) -> np.ndarray:
+        """The true image [S, S, 3] under weights [L, 3]."""
         return torch.einsum("lchw,lc->hwc", self.olats, weights).numpy()
 
 
-def seen_by(models: Models, dataset: Dataset, subject: str, camera: str) -> Seen:
-    """A stack of the dataset."""
-    path = dataset.stack_path(subject, camera)
-    header = read_olat_header(path)
-    view = View.of(models.face, fit_from_arrays(header.fit), header.seen)
-    return Seen(view, torch.from_numpy(header.directions).float(), read_olats(path).float())
+@dataclass(frozen=True, eq=False)
+class BaselineCase:
+    """A pair, the camera of the other pose, and weights [L, 3] of the source's map and of another."""
 
-
-def cases(dataset: Dataset, split: str, per_person: int) -> Iterator[tuple[str, str, str, Tensor, Tensor]]:
-    """Person, camera of the source and another, weights [L, 3] of the source's map and of another."""
-    for subject in dataset.splits[split]:
-        pairs, weights = load_pairs(dataset)[subject]
-        rows = np.linspace(0, len(pairs) - 1, 2 * per_person).astype(int)
-        for first, second in zip(rows[:per_person], rows[per_person:], strict=True):
-            own, other = (torch.from_numpy(np.array(weights[row])) for row in (first, second))
-            yield subject, pairs[first].source_camera, pairs[second].source_camera, own, other
-
-
-def measure(
-    models: Models, how: Any, source: Seen, target: Seen, own: Tensor, other: Tensor
-) -> dict[str, float]:
-    """The errors of one case, and the processor's seconds to explain it."""
-    photo = source.under(own)
-    face: FaceTexture = source.view.texture_of(photo)
-    started = time.process_time()
-    explained = how(models, source.view.fit, face)
-    seconds = time.process_time() - started
-    relit, light = explained.reflectance.relit, explained.light
-    turn = turn_to(source.view.fit, target.view.fit.rotation)
-    under_both = relit(source.directions, torch.stack([own, other]))
-    textures = {
-        "reconstruction": (source, relit(light.directions, light.weights[None])[0], photo),
-        "true light": (source, under_both[0], photo),
-        "another map": (source, under_both[1], source.under(other)),
-        "and pose": (target, relit(target.directions, other[None], turn)[0], target.under(other)),
-    }
-    errors = {
-        name: float(si_mse(seen.view.image(texture), truth, seen.view.mask))
-        for name, (seen, texture, truth) in textures.items()
-    }
-    return errors | {"CPU s": seconds}
-
-
-def method(given: argparse.Namespace, kind: Kind) -> Any:
-    """The model of that kind, with the settings that were given in place of its own."""
-    if kind == "specular-sh" and (given.detail is not None or given.evidence is not None):
-        return partial(specular_sh.explain_by_specular_sh, **_changed(given, specular_sh))
-    if kind == "prt" and (given.detail is not None or given.evidence is not None):
-        return partial(prt.explain_by_prt, **_changed(given, prt))
-    return partial(explain, kind)
-
-
-def _changed(given: argparse.Namespace, module: Any) -> dict[str, Any]:
-    evidence = module.SETTINGS.evidence if given.evidence is None else given.evidence
-    detail = DETAIL if given.detail is None else given.detail
-    return {"settings": replace(module.SETTINGS, evidence=evidence), "detail": detail}
+    pair: Pair
+    other_camera: str
+    own: Tensor
+    other: Tensor
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add = parser.add_argument
-    add("--dataset", type=Path, required=True, help="of prepare-dataset and relight-dataset")
-    add("--split", default="test", choices=SPLITS)
-    add("--per-person", type=int, default=2)
-    add("--reflectance", choices=KINDS, action="append", help="default: all but the field, which is slow")
-    add("--detail", type=float, help="share of what the prior on skin lacks of the photo")
-    add("--evidence", type=float, help="see baselines/synthesis.py")
+    parser = arguments(__doc__)
+    parser.add_argument("--dataset", type=Path, help="of prepare-dataset and relight-dataset")
+    parser.add_argument("--split", default="test", choices=SPLITS)
+    parser.add_argument("--per-person", type=int, default=2, help="images of each person")
+    parser.add_argument("--reflectance", choices=METHODS, nargs="+", default=METHODS)
     given = parser.parse_args()
     torch.set_num_threads(1)
-    dataset, models = read_dataset(given.dataset), load_models(None, "builtin", torch.device("cpu"))
-    found: dict[str, list[tuple[str, dict[str, float]]]] = defaultdict(list)
-    for subject, camera, other_camera, own, other in cases(dataset, given.split, given.per_person):
-        source, target = (seen_by(models, dataset, subject, c) for c in (camera, other_camera))
-        for kind in given.reflectance or KINDS[1:]:
-            how = method(given, kind)
-            found[kind].append((subject, measure(models, how, source, target, own, other)))
-    for kind, rows in found.items():
-        print(f"{kind}, {len(rows)} pictures of {given.split} people")
-        for name in rows[0][1]:
-            interval = mean_interval((subject, row[name]) for subject, row in rows)
-            assert interval is not None
-            low, high = interval.low, interval.high
-            print(f"  {name:16}{interval.mean:9.5f}  median {interval.median:.5f}  [{low:.5f}, {high:.5f}]")
+    dataset = read_dataset(required(given.dataset, "a prepared dataset", "--dataset"))
+    models = load_models(None, "builtin", torch.device("cpu"))
+    errors: dict[str, list[tuple[str, list[float], float]]] = defaultdict(list)
+    for subject in dataset.splits[given.split]:
+        person = Person(models.face, dataset, subject)
+        for case in cases(dataset, subject, given.per_person):
+            for method in given.reflectance:
+                errors[method].append((subject, *measure(models, person, case, method)))
+    print(f"{given.split} people of {given.dataset}, {given.per_person} images each")
+    print_header("", *STEPS, "s of one core")
+    for method, rows in errors.items():
+        by_step = zip(*(found for _, found, _ in rows), strict=True)
+        subjects = [subject for subject, *_ in rows]
+        intervals = (mean_interval(zip(subjects, column, strict=True)) for column in by_step)
+        cells = [interval_text(interval, ".4f") for interval in intervals]
+        print_row(f"`{method}`", *cells, f"{np.median([seconds for *_, seconds in rows]):.1f}")
+
+
+def cases(dataset: Dataset, subject: str, per_person: int) -> Iterator[BaselineCase]:
+    """Yield cases spread over a subject's pairs."""
+    pairs, weights = load_pairs(dataset)[subject]
+    rows = np.linspace(0, len(pairs) - 1, 2 * per_person).astype(int)
+    for first, second in zip(rows[:per_person], rows[per_person:], strict=True):
+        own, other = (torch.from_numpy(np.array(weights[row])) for row in (first, second))
+        yield BaselineCase(pairs[first], pairs[second].source_camera, own, other)
+
+
+def measure(models: Models, person: Person, case: BaselineCase, method: str) -> tuple[list[float], float]:
+    """Si-MSE of each of STEPS, and the processor's seconds to explain the photo."""
+    source, target = (captured(person, camera) for camera in (case.pair.source_camera, case.other_camera))
+    photo = source.truth(case.own)
+    head = person.head(case.pair, photo)
+    started_s = time.process_time()
+    explained = explain_by(models, head, method)
+    seconds = time.process_time() - started_s
+    steps = (
+        (source, explained.light, photo),
+        (source, RigLight(source.directions, case.own), photo),
+        (source, RigLight(source.directions, case.other), source.truth(case.other)),
+        (target, RigLight(target.directions, case.other), target.truth(case.other)),
+    )
+    errors = []
+    for view, light, truth in steps:
+        shown = Target(view.view.fit, "face")
+        image = relight(models, None, head, light, shown, explained.reflectance).pixels
+        errors.append(si_mse(image, truth, view.view.mask))
+    return errors, seconds
+
+
+def captured(person: Person, camera: str) -> CapturedView:
+    """Read a camera's stack of a person."""
+    crop = person.crop(camera)
+    olats = read_olats(person.dataset.stack_path(person.name, camera)).float()
+    return CapturedView(crop.view, torch.from_numpy(crop.header.directions).float(), olats)
+
+
+def explain_by(models: Models, head: Head, method: str) -> Explained:
+    """Explain a photo by one of METHODS."""
+    if method in get_args(Kind):
+        return explain(models, head, cast(Kind, method))
+    fine, refit = "low-pass" not in method, "unrefined" not in method
+    return explain_texture(load_diffuse_network(CHECKPOINT), head.face, fine, refit)
 
 
 if __name__ == "__main__":

@@ -1,38 +1,145 @@
-"""The faults that `planted_faults.py` plants in copies of a capture, each at several strengths."""
+"""Faults planted in a sound capture, one at a time: which do the checks find, and what does `--align` undo?
 
+    facerf synth-stage -o CAPTURE --subjects 8
+    python benchmarks/capture_faults.py --capture CAPTURE [--subjects 2] [--only gamma]
+
+A subject's frames of one camera (of more where cameras are at fault) are copied, the fault is planted, and
+the copy is checked. A row is a fault and its strength: how many of the faulty frames are found (or whether
+the subject is), by which check, and what else is reported. The naive twin is the sound copy: whatever is
+reported in it is a false alarm.
+
+Then all frames are moved along a smooth path of the head, with jitter of each frame, and aligned. Shifts
+count from their mean, since nobody knows where the head should be.
+"""
+
+import json
 import shutil
-from collections.abc import Callable, Sequence
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from capture_copy import Copy
+import OpenImageIO as oiio
+from _common import arguments, print_header, print_row, required
 from scipy import ndimage
+
+from facerf_cli.capture.capture import Capture
+from facerf_cli.capture.checks.align import with_alignment
+from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.stage_json import STAGE_FILE
+from facerf_cli.files.images import read_image
+
+_IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults
+_PLACE = 3  # of the faulty light among those in front
+_JITTER_PX = 0.3  # of each frame, added to the path
+_SMOOTH = 20  # frames over which the path bends
+_KINDS = (("all", -2.0, 2.0), ("front", 0.3, 1.1), ("side", -0.3, 0.3), ("behind", -1.1, -0.3))  # cosines
+
+
+class Copy:
+    """A subject's frames of the first cameras of a capture, copied with their description."""
+
+    def __init__(self, source: Path, folder: Path, subject: str, cameras: int) -> None:
+        text = json.loads((source / STAGE_FILE).read_text())
+        text |= {"cameras": text["cameras"][:cameras], "subjects": {subject: {}}}
+        self.folder, self.subject = folder, subject
+        self.description: dict[str, Any] = text
+        self.cameras = [camera["id"] for camera in text["cameras"]]
+        self.ids = [light["id"] for light in text["lights"]]
+        self.save()
+        capture = read_capture(source)
+        self._source_path = capture.frame_path
+        turn = capture.cameras[self.cameras[0]].rotation.numpy()
+        self.directions = capture.directions_world @ turn.T  # [L, 3], of the first camera
+        for camera in self.cameras:
+            for light in self.ids:
+                to = self.path(light, camera)
+                to.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(self._source_path(subject, camera, light), to)
+
+    def save(self) -> None:
+        """Write the description as it is now."""
+        (self.folder / STAGE_FILE).write_text(json.dumps(self.description))
+
+    def path(self, light: str, camera: str = "") -> Path:
+        """A frame of the copy, by default of the first camera."""
+        names = {"subject": self.subject, "camera": camera or self.cameras[0], "light": light}
+        return self.folder / str(self.description["pattern"]).format(**names)
+
+    def read(self, light: str) -> np.ndarray:
+        """The sound frame [H, W, 3] of the first camera."""
+        return read_image(self._source_path(self.subject, self.cameras[0], light), "linear").pixels
+
+    def write(self, light: str, pixels: np.ndarray) -> None:
+        """Write a half float EXR whatever it holds; `write_exr` refuses NaN."""
+        buffer = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
+        buffer.set_write_format("half")
+        buffer.write(str(self.path(light)))
+
+    def in_front(self) -> list[str]:
+        """Lights in front of the first camera, the most frontal first."""
+        order = np.argsort(-self.directions[:, 2])
+        return [self.ids[row] for row in order if self.directions[row, 2] > _IN_FRONT]
+
+    @property
+    def faulty(self) -> str:
+        """The light whose frame gets a fault."""
+        return self.in_front()[_PLACE]
+
+    def far(self, light: str) -> str:
+        """The light in front that is furthest from another."""
+        return min(self.in_front(), key=lambda other: self._cosine(light, other))
+
+    def near(self, light: str) -> str:
+        """The light nearest to another."""
+        others = [other for other in self.ids if other != light]
+        return max(others, key=lambda other: self._cosine(light, other))
+
+    def _cosine(self, light: str, other: str) -> float:
+        first, second = (self.directions[self.ids.index(name)] for name in (light, other))
+        return float(first @ second)
+
+    def findings(self) -> list[Finding]:
+        """Check the copy."""
+        self.save()
+        return check_subject(read_capture(self.folder), self.subject)
+
+
+Plant = Callable[[Copy], Sequence[str]]
+Change = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What is planted, which gives the lights whose frames it touches: none if it is of the whole subject."""
+    """A fault, and the checks that may find it.
+
+    `plant` returns the lights with faulty frames; none where the whole subject is faulty.
+    """
 
     name: str
     strength: str
-    checks: tuple[str, ...]  # under which it may be found
-    plant: Callable[[Copy], Sequence[str]]
+    checks: tuple[str, ...]
+    plant: Plant
     cameras: int = 1
 
 
-def one(change: Callable[[np.ndarray], np.ndarray], place: int = 3) -> Callable[[Copy], Sequence[str]]:
-    """The frame of one light in front is changed."""
+def one(change: Change) -> Plant:
+    """Change one frame."""
 
     def plant(copy: Copy) -> list[str]:
-        light = copy.front()[place]
-        copy.write(light, change(copy.read(light)))
-        return [light]
+        copy.write(copy.faulty, change(copy.read(copy.faulty)))
+        return [copy.faulty]
 
     return plant
 
 
-def every(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Copy], Sequence[str]]:
-    """All frames are changed."""
+def every(change: Change) -> Plant:
+    """Change all frames."""
 
     def plant(copy: Copy) -> list[str]:
         for light in copy.ids:
@@ -43,33 +150,38 @@ def every(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Copy], Sequen
 
 
 def missing(copy: Copy) -> list[str]:
-    light = copy.front()[3]
-    copy.path(light).unlink()
-    return [light]
+    """Remove a frame."""
+    copy.path(copy.faulty).unlink()
+    return [copy.faulty]
 
 
 def extra(copy: Copy) -> list[str]:
-    copy.write("L900", copy.read(copy.front()[3]) * 0.9)
+    """Add a frame of a light that the description does not list."""
+    copy.write("L900", copy.read(copy.faulty) * 0.9)
     return []
 
 
-def truncated(share: float) -> Callable[[Copy], Sequence[str]]:
+def truncated(share: float) -> Plant:
+    """Keep only the beginning of a file."""
+
     def plant(copy: Copy) -> list[str]:
-        path = copy.path(light := copy.front()[3])
+        path = copy.path(copy.faulty)
         whole = path.read_bytes()
         path.write_bytes(whole[: int(share * len(whole))])
-        return [light]
+        return [copy.faulty]
 
     return plant
 
 
 def duplicate(copy: Copy) -> list[str]:
-    light = copy.front()[3]
-    shutil.copyfile(copy.path(copy.far(light)), copy.path(light))
-    return [light]
+    """Write another light's frame in the place of one."""
+    shutil.copyfile(copy.path(copy.far(copy.faulty)), copy.path(copy.faulty))
+    return [copy.faulty]
 
 
-def nans(share: float) -> Callable[[np.ndarray], np.ndarray]:
+def nans(share: float) -> Change:
+    """Set random pixels to NaN."""
+
     def change(pixels: np.ndarray) -> np.ndarray:
         spoiled = np.random.default_rng(0).random(pixels.shape[:2]) < share
         return np.where(spoiled[..., None], np.float32(np.nan), pixels)
@@ -77,12 +189,12 @@ def nans(share: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
-def swapped(apart: str) -> Callable[[Copy], Sequence[str]]:
-    """The frames of two lights under each other's names."""
+def swapped(other_of: Callable[[Copy, str], str]) -> Plant:
+    """Swap the frames of two lights."""
 
     def plant(copy: Copy) -> list[str]:
-        light = copy.front()[3]
-        other = {"near": copy.near, "far": copy.far}[apart](light)
+        light = copy.faulty
+        other = other_of(copy, light)
         first, second = copy.read(light), copy.read(other)
         copy.write(light, second)
         copy.write(other, first)
@@ -91,8 +203,20 @@ def swapped(apart: str) -> Callable[[Copy], Sequence[str]]:
     return plant
 
 
+def woven(other_of: Callable[[Copy, str], str]) -> Plant:
+    """Replace the even rows of a frame by another light's."""
+
+    def plant(copy: Copy) -> list[str]:
+        pixels = copy.read(copy.faulty)
+        pixels[::2] = copy.read(other_of(copy, copy.faulty))[::2]
+        copy.write(copy.faulty, pixels)
+        return [copy.faulty]
+
+    return plant
+
+
 def rolled(copy: Copy) -> list[str]:
-    """Each frame under the name of the next light."""
+    """Give each light the direction of the next one."""
     lights = copy.description["lights"]
     directions = [light["direction"] for light in lights]
     for light, direction in zip(lights, [*directions[1:], directions[0]], strict=True):
@@ -100,7 +224,9 @@ def rolled(copy: Copy) -> list[str]:
     return []
 
 
-def rig(matrix: np.ndarray) -> Callable[[Copy], Sequence[str]]:
+def rig(matrix: np.ndarray) -> Plant:
+    """Transform the directions of all lights."""
+
     def plant(copy: Copy) -> list[str]:
         for light in copy.description["lights"]:
             light["direction"] = (matrix @ np.array(light["direction"])).tolist()
@@ -110,12 +236,13 @@ def rig(matrix: np.ndarray) -> Callable[[Copy], Sequence[str]]:
 
 
 def about_y(angle_deg: float) -> np.ndarray:
+    """A rotation about the vertical axis."""
     cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     return np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
 
 
-def misplaced(angle_deg: float) -> Callable[[Copy], Sequence[str]]:
-    """The second camera's pose is turned about the head."""
+def misplaced(angle_deg: float) -> Plant:
+    """Turn the second camera's pose about the head."""
 
     def plant(copy: Copy) -> list[str]:
         camera = copy.description["cameras"][1]
@@ -128,6 +255,7 @@ def misplaced(angle_deg: float) -> Callable[[Copy], Sequence[str]]:
 
 
 def cameras_swapped(copy: Copy) -> list[str]:
+    """Swap the folders of the first and the last camera."""
     first, second = (copy.path("", camera).parent for camera in (copy.cameras[0], copy.cameras[-1]))
     aside = first.with_name("aside")
     for old, new in ((first, aside), (second, first), (aside, second)):
@@ -135,21 +263,13 @@ def cameras_swapped(copy: Copy) -> list[str]:
     return []
 
 
-def woven(other: str) -> Callable[[Copy], Sequence[str]]:
-    """Even rows of a frame are those of another light."""
-
-    def plant(copy: Copy) -> list[str]:
-        light = copy.front()[3]
-        pixels = copy.read(light)
-        pixels[::2] = copy.read({"near": copy.near, "far": copy.far}[other](light))[::2]
-        copy.write(light, pixels)
-        return [light]
-
-    return plant
+def encoded(exponent: float) -> Change:
+    """Apply a display curve."""
+    return lambda pixels: np.maximum(pixels, 0) ** (1 / exponent)
 
 
-def with_full(exponent: float) -> Callable[[Copy], Sequence[str]]:
-    """A frame of all lamps beside the others, all of them encoded."""
+def with_full(exponent: float) -> Plant:
+    """Encode all frames, and add one under all lights."""
 
     def plant(copy: Copy) -> Sequence[str]:
         copy.write("full", sum(copy.read(light) for light in copy.ids) ** (1 / exponent))
@@ -158,34 +278,33 @@ def with_full(exponent: float) -> Callable[[Copy], Sequence[str]]:
     return plant
 
 
-def encoded(exponent: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda pixels: np.maximum(pixels, 0) ** (1 / exponent)
-
-
-def clipped(share: float) -> Callable[[Copy], Sequence[str]]:
-    """Cut off where the most frontal frame has a share of its pixels above."""
+def clipped(share: float) -> Plant:
+    """Clip all frames where the most frontal one has a share of its pixels above."""
 
     def plant(copy: Copy) -> Sequence[str]:
-        ceiling = np.quantile(copy.read(copy.front()[0]).max(-1), 1 - share)
+        ceiling = np.quantile(copy.read(copy.in_front()[0]).max(-1), 1 - share)
         return every(lambda pixels: np.minimum(pixels, np.float32(ceiling)))(copy)
 
     return plant
 
 
-def moved(by_px: float) -> Callable[[Copy], Sequence[str]]:
-    """A third of the frames, moved in several directions."""
+def moved(by_px: float) -> Plant:
+    """Move a third of the frames in several directions."""
 
     def plant(copy: Copy) -> list[str]:
         for place, light in enumerate(copy.ids[::3]):
             angle = 2.4 * place
-            shift = (by_px * np.sin(angle), by_px * np.cos(angle), 0)
-            copy.write(light, ndimage.shift(copy.read(light), shift, order=3, mode="nearest"))
+            copy.write(light, shifted(copy.read(light), (by_px * np.sin(angle), by_px * np.cos(angle))))
         return []
 
     return plant
 
 
-MIRROR = np.diag([-1.0, 1, 1])
+def shifted(pixels: np.ndarray, by_px: Sequence[float]) -> np.ndarray:
+    """A frame moved down and right."""
+    return ndimage.shift(pixels, (*by_px, *[0] * (pixels.ndim - 2)), order=3, mode="nearest")
+
+
 FAULTS = (
     Fault("missing frame", "1", ("missing",), missing),
     Fault("extra frame", "1", ("extra",), extra),
@@ -200,28 +319,122 @@ FAULTS = (
     Fault("clipped", "0.5 % of a frame", ("clipped",), clipped(0.005)),
     Fault("clipped", "2 %", ("clipped",), clipped(0.02)),
     Fault("clipped", "10 %", ("clipped",), clipped(0.1)),
-    Fault("lamp dim", "at 50 %", ("unlit",), one(lambda pixels: pixels * 0.5)),
-    Fault("lamp dim", "at 20 %", ("unlit",), one(lambda pixels: pixels * 0.2)),
-    Fault("lamp did not fire", "at 2 %", ("unlit", "black"), one(lambda pixels: pixels * 0.02)),
-    Fault("two swapped", "neighbours", ("order",), swapped("near")),
-    Fault("two swapped", "far apart", ("order",), swapped("far")),
+    Fault("light dim", "at 50 %", ("unlit",), one(lambda pixels: pixels * 0.5)),
+    Fault("light dim", "at 20 %", ("unlit",), one(lambda pixels: pixels * 0.2)),
+    Fault("light did not fire", "at 2 %", ("unlit", "black"), one(lambda pixels: pixels * 0.02)),
+    Fault("two swapped", "neighbours", ("order",), swapped(Copy.near)),
+    Fault("two swapped", "far apart", ("order",), swapped(Copy.far)),
     Fault("all shifted by one", "", ("order", "rig"), rolled),
-    Fault("rig mirrored", "", ("rig",), rig(MIRROR)),
-    Fault("rig turned", "10 degrees", ("rig",), rig(about_y(10))),
-    Fault("rig turned", "25 degrees", ("rig",), rig(about_y(25))),
-    Fault("rig turned", "45 degrees", ("rig",), rig(about_y(45))),
-    Fault("camera misplaced", "by 40 degrees, 1 of 3", ("camera",), misplaced(40), 3),
-    Fault("camera misplaced", "by 60 degrees, 1 of 3", ("camera",), misplaced(60), 3),
-    Fault("cameras swapped", "2 of 2", ("camera", "rig"), cameras_swapped, 2),
-    Fault("cameras swapped", "2 of 3", ("camera", "rig"), cameras_swapped, 3),
-    Fault("two fields", "of neighbours", ("fields",), woven("near")),
-    Fault("two fields", "of lamps far apart", ("fields",), woven("far")),
-    Fault("gamma", "1.4", ("gamma",), every(encoded(1.4))),
-    Fault("gamma", "1.8", ("gamma",), every(encoded(1.8))),
-    Fault("gamma", "2.2", ("gamma",), every(encoded(2.2))),
+    Fault("rig mirrored", "", ("rig",), rig(np.diag([-1.0, 1, 1]))),
+    *(Fault("rig turned", f"{deg} degrees", ("rig",), rig(about_y(deg))) for deg in (10, 25, 45)),
+    *(Fault("camera turned", f"{deg} degrees, 1 of 3", ("camera",), misplaced(deg), 3) for deg in (40, 60)),
+    *(Fault("cameras swapped", f"2 of {n}", ("camera", "rig"), cameras_swapped, n) for n in (2, 3)),
+    Fault("two fields", "of neighbours", ("fields",), woven(Copy.near)),
+    Fault("two fields", "of lights far apart", ("fields",), woven(Copy.far)),
+    *(Fault("gamma", f"{exponent}", ("gamma",), every(encoded(exponent))) for exponent in (1.4, 1.8, 2.2)),
     Fault("gamma, with a full-on frame", "1.2", ("gamma",), with_full(1.2)),
-    Fault("head moves in a third", "1 px", ("motion",), moved(1)),
-    Fault("head moves in a third", "2 px", ("motion",), moved(2)),
-    Fault("head moves in a third", "3 px", ("motion",), moved(3)),
-    Fault("head moves in a third", "4 px", ("motion",), moved(4)),
+    *(Fault("head moves in a third", f"{px} px", ("motion",), moved(px)) for px in (1, 2, 3, 4)),
 )
+
+
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--capture", type=Path, help="a sound capture with a stage.json")
+    parser.add_argument("--subjects", type=int, default=2, help="that each fault is planted in")
+    parser.add_argument("--sound", type=int, default=8, help="subjects that are checked without a fault")
+    parser.add_argument("--only", default="", help="only faults with this in their name, or motion")
+    parser.add_argument("--paths", type=float, nargs="+", default=[0, 2, 6], help="furthest points, pixels")
+    given = parser.parse_args()
+    source = required(given.capture, "a sound capture of synth-stage", "--capture")
+    subjects = list(read_capture(source).subjects)
+    report_sound(source, subjects[: given.sound])
+    print_header("fault", "strength", "found", "as", "also reported")
+    for fault in FAULTS:
+        if given.only in fault.name:
+            report_fault(fault, source, subjects[: given.subjects])
+    if given.only in "motion":
+        for seed, subject in enumerate(subjects[: given.subjects]):
+            for furthest_px in given.paths:
+                report_alignment(source, subject, furthest_px, seed)
+
+
+def report_sound(source: Path, subjects: Sequence[str]) -> None:
+    """Print what is found where nothing is planted."""
+    found: list[Finding] = []
+    for subject in subjects:
+        with tempfile.TemporaryDirectory() as name:
+            found += Copy(source, Path(name), subject, 2).findings()
+    print(f"sound, {len(subjects)} subjects, two cameras each: {counted(found)}")
+    for finding in found:
+        print(f"  {finding.place}: {finding.check}: {finding.words}")
+
+
+def counted(findings: Iterable[Finding]) -> str:
+    """The number of findings by check."""
+    counts = Counter(finding.check for finding in findings)
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "-"
+
+
+def report_fault(fault: Fault, source: Path, subjects: Sequence[str]) -> None:
+    """Print a row of the table."""
+    hits, wanted = 0, 0
+    right: list[Finding] = []
+    others: list[Finding] = []
+    for subject in subjects:
+        with tempfile.TemporaryDirectory() as name:
+            copy = Copy(source, Path(name), subject, fault.cameras)
+            faulty = set(fault.plant(copy))
+            found = copy.findings()
+        said = [f for f in found if f.check in fault.checks and (not faulty or f.light in faulty)]
+        others += [f for f in found if f not in said and not (faulty and f.light in faulty)]
+        hits += len({f.light for f in said}) if faulty else bool(said)
+        wanted += max(len(faulty), 1)
+        right += said
+    kinds = ", ".join(sorted({f"{f.check} ({f.severity})" for f in right})) or "-"
+    print_row(fault.name, fault.strength, f"{hits} of {wanted}", kinds, counted(others))
+
+
+def report_alignment(source: Path, subject: str, furthest_px: float, seed: int) -> None:
+    """Print what alignment leaves of a path of the head, and of the frames' differences, by kind of light."""
+    with tempfile.TemporaryDirectory() as name:
+        copy = Copy(source, Path(name), subject, 1)
+        camera, moved_px = copy.cameras[0], path_px(len(copy.ids), furthest_px, seed)
+        still = np.stack(list(frames_of(read_capture(copy.folder), subject, camera)))
+        for light, by_px in zip(copy.ids, moved_px, strict=True):
+            copy.write(light, shifted(copy.read(light), by_px))
+        capture = read_capture(copy.folder)
+        aligned = with_alignment(capture, subject, {})
+        back_px = np.array([aligned.shifts.get((subject, camera, light), (0, 0)) for light in copy.ids])
+        before, after = (np.stack(list(frames_of(of, subject, camera))) for of in (capture, aligned))
+    left_px = moved_px + back_px
+    still = np.stack([shifted(frame, left_px.mean(0)) for frame in still])
+    aligned_frames = int(np.any(back_px, 1).sum())
+    print(f"{subject}, path to {furthest_px:g} px: {aligned_frames} of {len(back_px)} frames aligned")
+    for kind, least, most in _KINDS:
+        rows = (copy.directions[:, 2] >= least) & (copy.directions[:, 2] < most)
+        shifts = [np.sqrt(((px[rows] - px.mean(0)) ** 2).sum(1).mean()) for px in (moved_px, left_px)]
+        off = [np.abs(frames[rows] - still[rows]).mean() / still[rows].mean() for frames in (before, after)]
+        print(
+            f"  {kind}, {rows.sum()} frames: {shifts[0]:.2f} px -> {shifts[1]:.2f} px RMS; "
+            f"frames differ by {off[0]:.1%} -> {off[1]:.1%}",
+            flush=True,
+        )
+
+
+def path_px(frames: int, furthest_px: float, seed: int) -> np.ndarray:
+    """A smooth path [L, 2] of the head, down and right, up to `furthest_px` from its mean, with jitter."""
+    generator = np.random.default_rng(seed)
+    path = ndimage.gaussian_filter1d(generator.normal(size=(frames, 2)), _SMOOTH, axis=0, mode="nearest")
+    path -= path.mean(0)
+    path *= furthest_px / max(float(np.hypot(*path.T).max()), 1e-9)
+    return path + (generator.normal(size=path.shape) * _JITTER_PX if furthest_px else 0)
+
+
+def frames_of(capture: Capture, subject: str, camera: str) -> Iterator[np.ndarray]:
+    """Yield grey frames [H, W]."""
+    for place in range(len(capture.light_ids)):
+        yield capture.frame(subject, camera, place).mean(-1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,239 +1,170 @@
-"""The closed loop: a photo relit by a known light, that light estimated back, both compared.
+"""Light estimated from a relit photo, next to the known light by which it was relit.
 
-    python benchmarks/closed_loop.py [PHOTO|DIR ...] [--maps ../shared/data/hdri] [--way texture picture]
-        [--refine] [--signed] [--json FILE]
+    python benchmarks/closed_loop.py [PHOTO|DIR ...] [--maps ../shared/data/hdri] [--refine]
 
-Lights are maps, each as it is and turned by 120 degrees, and lamps drawn from a seed: a coloured key light
-and a dim one in front. `texture` relights the face in the chart and estimates from that texture. `picture`
-does what a user would: `facerf relight`, its 8-bit PNG into `facerf estimate-light`, which finds and fits the
-face anew; where the detector takes something else for the face the case is said and left out.
+Lights are envmaps, each at two rotations, and single lights drawn from a seed: a coloured key light and a dim
+light in front. The light is estimated from the relit texture, and from an 8-bit PNG of the whole relit photo,
+in which the face is detected and fitted again; where another face is found, the case is left out.
 
-- angle: between the brightest directions (`light/rig_latlong.py`), in degrees.
-- weights: |estimate - truth| / |truth| over the 150 lights' rgb weights. How bright a light is cannot be told
-  from how bright the skin is, so also after the one factor that fits best (scaled). SH: the same of the
-  coefficients up to order 2, which is about what a matt face can tell.
-- `seen` is over lights whose brightest direction lies before the plane of the face (z > 0). What shines from
-  behind it grazes the face's rim or does not reach it at all: there the problem has no one answer.
+- angle: between the brightest directions, in degrees.
+- weights: |estimate - truth| / |truth| over the rgb weights of the 150 lights. Brightness of light and of
+  skin cannot be told apart, so there is a second figure after the best single scale (scaled).
+- SH: the same for the coefficients of spherical harmonics up to order 2, about what a diffuse face shows.
+
+Twin, on the same evidence in the same run: the paper's plain least squares, whose weights may be negative.
 """
 
-import argparse
-import io
-import json
 import tempfile
 from collections.abc import Iterator
-from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from _common import MAPS, arguments, photos, print_header, print_row
 from torch import Tensor
 
-from facerf_cli.cli.batch import Item
-from facerf_cli.cli.light_options import LIGHT_FEATURES
-from facerf_cli.cli.options import Settings
-from facerf_cli.cli.photo_options import PhotoOptions, fit_faces, load_models_once, read_photo
+from facerf_cli.composite import Composition
+from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import find_faces
-from facerf_cli.files.images import read_image
-from facerf_cli.files.light_files import read_light
+from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
-from facerf_cli.light.sphere import (
-    RigLight,
-    azel_to_direction,
-    brightest_direction,
-    direction_to_azel,
-    rig_directions,
-)
-from facerf_cli.main import main as facerf
+from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
 from facerf_cli.metrics import light_error_deg
-from facerf_cli.pipeline import (
-    FaceTexture,
-    explain_photo,
-    light_evidence,
-    predict_olat,
-    refine_photo_light,
-    weigh_batches,
-)
+from facerf_cli.models import DEFAULT_CHECKPOINT, Models, load_models
+from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.pipeline import estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.training.pretrained import load_light_features
 
-PHOTOS = [Path("examples/astronaut.jpg"), Path("../shared/data/photos")]
-TURNS_DEG = (0, 120)  # evenly spaced from 0, as --rotate FROM:TO:N has them
-LAMPS, FILL = 6, 0.15
+TURNS_DEG = (0, 120)  # of each map
+SINGLE_LIGHTS, FILL = 6, 0.15  # FILL is the light in front, of a key light of about 1
 MEASURES = ("angle", "weights", "weights scaled", "SH", "SH scaled")
 RIG = rig_directions()
-_MOVED_PX = 30.0  # further from where it was, it is another face
+LIGHT_FEATURES = DEFAULT_CHECKPOINT.with_name("light_features.safetensors")
+_MOVED_PX = 30.0  # from its place in the photo; further off, it is another face
+_Estimate = tuple[str, str, Tensor]  # what it was estimated from, by which method, weights [150, 3]
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """A light [150, 3] over the rig, and how `facerf relight` is asked for it."""
+class KnownLight:
+    """A named light, weights [150, 3] over the rig."""
 
-    name: str  # of relight's picture
+    name: str
     weights: Tensor
-    option: tuple[str, str]
 
 
 def main() -> None:
-    given = _arguments()
+    parser = arguments(__doc__)
+    parser.add_argument("photos", type=Path, nargs="*", help="photos, or folders of them")
+    parser.add_argument("--maps", type=Path, default=MAPS, help="folder of envmaps")
+    parser.add_argument("--refine", action="store_true", help="refine by the features of S_f")
+    parser.add_argument("--seed", type=int, default=0, help="of the single lights")
+    parser.add_argument("--lights", type=int, help="use only the first ones")
+    given = parser.parse_args()
     torch.set_num_threads(1)
-    lights = [*maps(given.maps), *lamps(given.seed)]
-    rows = []
-    for photo in (path for entry in given.photos for path in _photos(entry)):
-        for way in given.way:
-            estimates = in_texture if way == "texture" else through_image
-            for light, found in estimates(photo, lights, given):
-                rows.append({"way": way, "photo": photo.stem, "light": light.name, **compared(found, light)})
-                print(
-                    way, photo.stem, light.name, *(f"{rows[-1][name]:.3g}" for name in MEASURES), flush=True
-                )
-    if given.json:
-        given.json.write_text(json.dumps(rows, indent=1) + "\n")
-    for way in given.way:
-        table(way, [row for row in rows if row["way"] == way])
+    lights = [*single_lights(given.seed), *map_lights(given.maps)][: given.lights]
+    models = load_models(None, "builtin", torch.device("cpu"))
+    features = load_light_features(LIGHT_FEATURES) if given.refine else None
+    rows: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for photo in photos(given.photos):
+        for light, (source, method, weights) in estimates(models, photo, lights, features):
+            row = compare(weights, light)
+            rows.setdefault((source, method), []).append(row)
+            if method != "plain least squares":
+                print(source, photo.stem, light.name, *(f"{row[name]:.3g}" for name in MEASURES), flush=True)
+    print("\nmedian / mean / 90th percentile")
+    print_header("estimated from", "by", "n", *MEASURES)
+    for (source, method), found in sorted(rows.items()):
+        print_row(source, method, len(found), *(_spread([row[name] for row in found]) for name in MEASURES))
 
 
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add = parser.add_argument
-    add("photos", type=Path, nargs="*", default=PHOTOS, help="photos, or folders of them")
-    add("--maps", type=Path, default=Path("../shared/data/hdri"))
-    add("--way", nargs="+", choices=("texture", "picture"), default=["texture", "picture"])
-    add("--refine", action="store_true", help="by the features of S_f")
-    add("--signed", action="store_true", help="the paper's plain least squares")
-    add("--seed", type=int, default=0, help="of the lamps")
-    add("--json", type=Path)
-    return parser.parse_args()
-
-
-def _photos(entry: Path) -> list[Path]:
-    """A photo, or those of a folder."""
-    if entry.is_dir():
-        return sorted(path for path in entry.iterdir() if path.suffix.lower() in (".jpg", ".jpeg", ".png"))
-    return [entry]
-
-
-def maps(folder: Path) -> Iterator[Known]:
+def map_lights(folder: Path) -> Iterator[KnownLight]:
+    """Yield the envmaps of a folder at each rotation."""
     for path in sorted((*folder.glob("*.hdr"), *folder.glob("*.exr"))):
         envmap = torch.from_numpy(read_image(path).pixels)
-        for frame, weights in enumerate(rotated_weights(envmap, RIG, TURNS_DEG)):
-            yield Known(f"{path.stem}.{frame:04d}", weights, ("--envmap", str(path)))
+        for turn_deg, weights in zip(TURNS_DEG, rotated_weights(envmap, RIG, TURNS_DEG), strict=True):
+            yield KnownLight(f"{path.stem} {turn_deg} deg", weights)
 
 
-def lamps(seed: int) -> Iterator[Known]:
-    """Key lights at lights of the rig, most of them before the face, and a dim one in front."""
+def single_lights(seed: int) -> Iterator[KnownLight]:
+    """Yield key lights of the rig, most of them in front of the face, each with the dim light in front."""
     random = np.random.default_rng(seed)
     front = int((RIG @ azel_to_direction(0.0, 10.0)).argmax())
-    for _ in range(LAMPS):
-        azimuth, elevation = random.uniform(-120, 120), random.uniform(-20, 60)
-        key = int((RIG @ azel_to_direction(azimuth, elevation)).argmax())
+    for _ in range(SINGLE_LIGHTS):
+        azimuth_deg, elevation_deg = random.uniform(-120, 120), random.uniform(-20, 60)
+        key = int((RIG @ azel_to_direction(azimuth_deg, elevation_deg)).argmax())
         colour = [round(float(part), 2) for part in (1.0, random.uniform(0.6, 1), random.uniform(0.4, 1))]
         weights = torch.zeros(len(RIG), 3)
         weights[key] += torch.tensor(colour)
         weights[front] += FILL
-        words = [
-            [f"{float(value):.4g}" for value in (*direction_to_azel(RIG[light]), *rgb)]
-            for light, rgb in ((key, colour), (front, [FILL] * 3))
-        ]
-        name = "light_" + "+".join("_".join(part) for part in words)
-        yield Known(name, weights, ("--light", ";".join(",".join(part) for part in words)))
+        yield KnownLight(f"light {azimuth_deg:.0f},{elevation_deg:.0f}", weights)
 
 
-def in_texture(photo: Path, lights: list[Known], given: argparse.Namespace) -> Iterator[tuple[Known, Tensor]]:
-    """Relit and estimated in the chart; the field is held to its photo, as `facerf relight` has it."""
-    options = PhotoOptions(Settings())
-    models = load_models_once(options)
-    item = Item(photo, Path(photo.stem), photo.stem)
-    face = fit_faces(item, read_photo(item, options), options)[0].texture
-    olats = predict_olat(models, face, RIG, quotient=explain_photo(models, face))
-    features = load_light_features(LIGHT_FEATURES)
-    for light, texture in zip(
-        lights, weigh_batches(olats, torch.stack([light.weights for light in lights])), strict=True
-    ):
-        relit = FaceTexture(texture, face.visible, face.normals)
-        evidence = light_evidence(models, relit, RIG)
-        weights = evidence.least_squares(not given.signed)
-        if given.refine:
-            weights = refine_photo_light(evidence, weights, features, not given.signed).weights
-        yield light, weights
+def estimates(
+    models: Models, path: Path, lights: list[KnownLight], features: FeatureNetwork | None
+) -> Iterator[tuple[KnownLight, _Estimate]]:
+    """Relight a photo by each light and yield what is estimated back, from the texture and from a PNG."""
+    photo = read_image(path).pixels
+    landmarks_px = find_faces(photo, str(path))[0].landmarks_px
+    head = fit_photo(models, photo, landmarks_px)
+    composition = Composition(models.face, photo, head)
+    weights = torch.stack([light.weights for light in lights])
+    all_relit = relit_by(composition, head, reflectance_of(models, head), RIG, weights)
+    for light, relit in zip(lights, all_relit, strict=True):
+        face = replace(head.face, texture=relit.texture)
+        for method, found in by_both(models, replace(head, face=face), features):
+            yield light, ("texture", method, found)
+        rig_light = RigLight(RIG, light.weights)
+        ev = composition.auto_exposure_ev(relit.texture)
+        image = composition.image(rig_light, relit)
+        relit_photo = through_png(composition.exposed(rig_light, relit, image, ev))
+        seen_px = find_faces(relit_photo, light.name)[0].landmarks_px
+        if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
+            print(f"PNG {path.stem} {light.name}: left out, another face was detected")
+            continue
+        for method, found in by_both(models, fit_photo(models, relit_photo, seen_px), features):
+            yield light, ("PNG", method, found / 2**ev)
 
 
-def through_image(
-    photo: Path, lights: list[Known], given: argparse.Namespace
-) -> Iterator[tuple[Known, Tensor]]:
-    """Through an 8-bit PNG of the whole photo and the two commands."""
-    how = ["--refine", "features"] * given.refine + ["--signed"] * given.signed
-    with tempfile.TemporaryDirectory() as scratch:
-        relit, out = Path(scratch) / "relit", Path(scratch) / "out"
-        options = list(dict.fromkeys(light.option for light in lights))
-        turns = f"0:{len(TURNS_DEG) * TURNS_DEG[1]}:{len(TURNS_DEG)}"
-        _run(
-            "relight",
-            str(photo),
-            "-o",
-            str(relit),
-            "--rotate",
-            turns,
-            *(word for two in options for word in two),
-        )
-        exposures_ev = json.loads((relit / "report.jsonl").read_text())["exposure_ev"]
-        for exr in relit.glob("*.exr"):
-            exr.unlink()
-        _run("estimate-light", str(relit), "-o", str(out), "--width", "64", *how)
-        where = _face_centre_px(photo)
-        for light in lights:
-            name = f"{photo.stem}_{light.name}"
-            if np.linalg.norm(_face_centre_px(relit / f"{name}.png") - where) > _MOVED_PX:
-                print(f"picture {photo.stem} {light.name}: the detector took something else for the face")
-                continue
-            found = read_light(out / f"{name}_light.json").weights
-            yield light, found / 2 ** exposures_ev[name]
+def through_png(image: np.ndarray) -> np.ndarray:
+    """Write an image [H, W, 3] as an 8-bit PNG and read it."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_display(Path(folder, "relit.png"), image)
+        return read_image(Path(folder, "relit.png")).pixels
 
 
-def _face_centre_px(photo: Path) -> np.ndarray:
-    """Of the face that the verbs take, [2]."""
-    return find_faces(read_image(photo).pixels, str(photo))[0].landmarks_px.mean(0)
+def by_both(models: Models, head: Head, features: FeatureNetwork | None) -> Iterator[tuple[str, Tensor]]:
+    """Estimate weights [150, 3] by the method of `facerf estimate-light` and by plain least squares."""
+    found = estimate_light(models, head, features=features)
+    yield "facerf", found.light.weights
+    yield "plain least squares", found.evidence.least_squares(non_negative=False)
 
 
-def _run(*line: str) -> None:
-    with redirect_stdout(io.StringIO()):  # the paths of what it wrote
-        if facerf(["-q", *line]):
-            raise SystemExit(f"facerf {line[0]} {line[1]}: failed")
-
-
-def compared(found: Tensor, light: Known) -> dict[str, float | bool]:
+def compare(found: Tensor, light: KnownLight) -> dict[str, float]:
+    """Compare estimated weights [150, 3] with the truth by each of MEASURES."""
     truth, estimate = RigLight(RIG, light.weights), RigLight(RIG, found)
     toward = brightest_direction(truth)
     coefficients = rig_coefficients(estimate, 2), rig_coefficients(truth, 2)
     return {
-        "seen": bool(toward[2] > 0),
         "angle": light_error_deg(brightest_direction(estimate).numpy(), toward.numpy()),
-        "weights": _off(found, light.weights),
-        "weights scaled": _off_scaled(found, light.weights),
-        "SH": _off(*coefficients),
-        "SH scaled": _off_scaled(*coefficients),
+        "weights": _error(found, light.weights),
+        "weights scaled": _scaled_error(found, light.weights),
+        "SH": _error(*coefficients),
+        "SH scaled": _scaled_error(*coefficients),
     }
 
 
-def _off(found: Tensor, truth: Tensor) -> float:
+def _error(found: Tensor, truth: Tensor) -> float:
     return float((found - truth).norm() / truth.norm())
 
 
-def _off_scaled(found: Tensor, truth: Tensor) -> float:
-    return _off(found * (found * truth).sum() / found.square().sum().clamp_min(1e-12), truth)
+def _scaled_error(found: Tensor, truth: Tensor) -> float:
+    return _error(found * (found * truth).sum() / found.square().sum().clamp_min(1e-12), truth)
 
 
-def table(way: str, rows: list[dict]) -> None:
-    print(f"\n{way}: {len(rows)} cases    (median, mean, 90th percentile)")
-    for name, chosen in (("all", rows), ("seen", [row for row in rows if row["seen"]]),
-                         ("behind", [row for row in rows if not row["seen"]])):  # fmt: skip
-        print(f"  {name}, {len(chosen)} cases")
-        for measure in MEASURES if chosen else ():
-            values = np.array([row[measure] for row in chosen])
-            of_all = np.median(values), values.mean(), np.quantile(values, 0.9)
-            print(f"    {measure:16s}", *(f"{value:8.2f}" for value in of_all))
+def _spread(values: list[float]) -> str:
+    return f"{np.median(values):.2f} / {np.mean(values):.2f} / {np.quantile(values, 0.9):.2f}"
 
 
 if __name__ == "__main__":

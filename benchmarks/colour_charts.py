@@ -1,21 +1,21 @@
-"""How often a colour chart is found in a picture, how well it corrects, and what else is taken for one.
+"""How often a colour chart is found, how well its matrix corrects, and what else is taken for a chart.
 
-    python benchmarks/colour_charts.py --pictures 300 --sheet charts.png
-    python benchmarks/colour_charts.py --photos PICTURE ... --sheet charts.png
+    python benchmarks/colour_charts.py [--images 300] [--sheet charts.png]
+    python benchmarks/colour_charts.py --photos IMAGE ... --sheet charts.png
 
-Pictures are rendered: charts of 15 to 85 % of a picture's width, turned any way, tilted up to 40 degrees, out
-of focus, noisy, with vignetting, under light that falls off, before walls, clouds of colour and rectangles;
-by cameras whose colours are up to a quarter off. As many pictures have such surroundings and no chart.
-What the matrix is worth is told by the published colours, as the camera sees them without noise, corrected.
-Real photographs (sRGB, or as their files say) have no truth: what is left of delta E after the fit is told.
+Images are rendered: charts of 15 to 85 % of an image's width, in any rotation, tilted up to 40 degrees,
+blurred, noisy, with vignetting, under light that falls off, in front of walls, clouds of colour and
+rectangles, by cameras whose colours are up to a quarter off. As many images have no chart. The matrix is
+judged by the published colours, as the camera sees them without noise, corrected. Naive twin: no matrix.
+Photos have no truth; their delta E is what the fit leaves.
 """
 
-import argparse
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from _common import ROOT, arguments
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.transform import resize
@@ -27,30 +27,28 @@ from facerf_cli.capture.find_chart import find_chart
 from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import read_image, write_display
 
-sys.path.insert(0, str(Path(__file__).parents[1]))  # the renderer is the tests'
+sys.path.insert(0, str(ROOT))  # the renderer of charts is the tests'
 from tests.capture.chart_image import background, chart_image
 
 SHAPE = (360, 480)
 _DISTANCE = 2.5  # of the camera, in widths of the chart
-_SHOWN = 12
+_SHOWN = 12  # images on the sheet
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--pictures", type=int, default=60)
-    parser.add_argument("--sheet", type=Path, help="a picture of some, with what was sampled outlined")
-    parser.add_argument(
-        "--photos", type=Path, nargs="+", help="photographs in the place of rendered pictures"
-    )
-    options = parser.parse_args()
-    tiles = [told(path) for path in options.photos] if options.photos else counted(options.images)
-    if options.sheet:
+    parser = arguments(__doc__)
+    parser.add_argument("--images", type=int, default=60, help="with a chart, and as many without")
+    parser.add_argument("--sheet", type=Path, help="an image of some, with the sampled patches outlined")
+    parser.add_argument("--photos", type=Path, nargs="+", help="photos, in place of rendered images")
+    given = parser.parse_args()
+    tiles = [of_photo(path) for path in given.photos] if given.photos else of_rendered(given.images)
+    if given.sheet:
         sized = [resize(tile, (*SHAPE, 3), anti_aliasing=True) for tile in tiles[:_SHOWN]]
-        write_display(options.sheet, contact_sheet(np.stack(sized)))
+        write_display(given.sheet, contact_sheet(np.stack(sized)))
 
 
-def told(path: Path) -> np.ndarray:
-    """A photograph [H, W, 3], outlined, after a line of what is found in it."""
+def of_photo(path: Path) -> np.ndarray:
+    """Print what is found in a photo; the photo [H, W, 3], outlined."""
     image = read_image(path).pixels
     found = find_chart(image)
     if found is None:
@@ -62,28 +60,28 @@ def told(path: Path) -> np.ndarray:
     return outline_patches(image, found)
 
 
-def counted(images: int) -> list[np.ndarray]:
-    """Rendered pictures [H, W, 3], outlined, after lines of what is found in all."""
+def of_rendered(images: int) -> list[np.ndarray]:
+    """Print what is found in rendered images; these [H, W, 3], outlined."""
     rows, tiles, seconds = [], [], 0.0
     for seed in range(images):
-        image, corners_px, camera = draw_photograph(seed)
+        image, corners_px, camera = draw_photo(seed)
         begun_s = time.perf_counter()
         found = find_chart(image)
         seconds += time.perf_counter() - begun_s
         rows.append(figures(image, corners_px, camera, found))
         tiles += [image if found is None else outline_patches(image, found)]
-    print(summary(np.array(rows)), f"{seconds / images:.2f} s a picture", sep="\n")
+    print(summary(np.array(rows)), f"{seconds / images:.2f} s an image", sep="\n")
     false = sum(find_chart(surroundings(seed)) is not None for seed in range(images))
-    print(f"without a chart: {false} of {images} pictures taken for one")
+    print(f"without a chart: {false} of {images} images taken for one")
     return tiles
 
 
-def draw_photograph(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A picture [H, W, 3] of a chart, its corners [4, 2] and the camera's matrix [3, 3]."""
+def draw_photo(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render an image [H, W, 3] of a chart; its corners [4, 2] and the camera's matrix [3, 3]."""
     draw = np.random.default_rng(seed)
     corners_px = draw_corners(draw)
     camera = np.eye(3) + np.where(np.eye(3), 0.25, 0.15) * draw.uniform(-1, 1, (3, 3))
-    light = np.exp(draw.uniform(-0.25, 0.25, 2))
+    light = np.exp(draw.uniform(-0.25, 0.25, 2)).tolist()
     noise, clutter = draw.uniform(0.002, 0.02), draw.uniform(0, 1)
     image = chart_image(corners_px, SHAPE, camera, light, noise, clutter, seed)
     blurred = ndimage.gaussian_filter(image, (*[draw.uniform(0, 1.2)] * 2, 0))
@@ -92,7 +90,7 @@ def draw_photograph(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def draw_corners(draw: np.random.Generator) -> np.ndarray:
-    """Of a chart [4, 2] that is turned, tilted, and wholly in the picture with its frame."""
+    """Draw the corners [4, 2] of a rotated, tilted chart that lies within the image with its frame."""
     corners = (area_corners() - area_corners().mean(0)) / np.ptp(area_corners()[:, 0])
     angles = (draw.uniform(-180, 180), *draw.uniform(-40, 40, 2))
     turned = Rotation.from_euler("zxy", angles, degrees=True).apply(np.c_[corners, np.zeros(4)])
@@ -130,14 +128,14 @@ def summary(rows: np.ndarray) -> str:
     _, _, off, before, after = rows[rows[:, 1] == 1].T
     lines.append(f"corners off by {np.median(off):.3f} of a patch (median), {off.max():.2f} (most)")
     lines.append(
-        f"mean delta E 2000 of a picture's 24 colours: {before.mean():.1f} before, {after.mean():.2f} after;"
+        f"mean delta E 2000 of an image's 24 colours: {before.mean():.1f} before, {after.mean():.2f} after;"
     )
-    lines.append(f"the worst picture's {before.max():.1f} before, {after.max():.2f} after")
+    lines.append(f"the worst image's {before.max():.1f} before, {after.max():.2f} after")
     return "\n".join(lines)
 
 
 def surroundings(seed: int) -> np.ndarray:
-    """A picture [H, W, 3] without a chart."""
+    """Render an image [H, W, 3] without a chart."""
     draw = np.random.default_rng(10_000 + seed)
     return background(draw, SHAPE, draw.uniform(0, 1)).astype(np.float32)
 

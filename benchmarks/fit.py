@@ -1,198 +1,122 @@
-"""What the landmark fit is worth: landmark error on photos, normals against photometric stereo, speed.
+"""The landmark fit: its error on photos, its normals next to photometric stereo, its speed in a batch.
 
-    python benchmarks/fit.py --shared ../shared [--face-model builtin|PATH] [--sweep] [--all]
+    python benchmarks/fit.py [PHOTO|DIR ...] [--face-model builtin|PATH] [--all]
 
-Photos: skimage's astronaut and the portraits in SHARED/data/photos. Normals: Extended Yale B, frontal picture
-fitted. The truth is photometric stereo over a subject's lights, twice: plain least squares over all of them
-(attached shadows flatten it), and one that leaves out shadows and saturation (noisier). The peer is the
-unfitted neutral mean in the fit's pose. `--sweep` uses Yale B's development subjects; `--all` scores all 21.
+- Landmark error of each photo, against dlib's landmarks, in percent of the inter-ocular distance.
+- Mean angle of the normals to those of photometric stereo over all flashes of a subject of Extended Yale B,
+  whose frontal image is fitted. Naive twin: the mean face without expression in the fit's pose.
+- Faces a second in a batch. Naive twin: one face at a time.
+
+Without Extended Yale B the normals are left out.
 """
 
-import argparse
-import itertools
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import skimage.data
 import torch
+from _common import SHIFTS, YALE_B, arguments, best_s, photos
 
-from facerf_cli.capture.yale_b import read_shifts, read_yale_b
-from facerf_cli.evaluation.protocols.yale_b_cases import SETTINGS_SUBJECTS, Sitter, face_mask
-from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.face.fit import FaceFit, FitSettings, fit_batch, fit_landmarks, trust_inside
-from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
-from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.face.topology import grid_triangles
+from facerf_cli.capture.checks.stereo import photometric_stereo
+from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
+from facerf_cli.composite import Composition, Target
+from facerf_cli.evaluation.protocols.yale_b_cases import Sitter, face_mask
+from facerf_cli.face.fit import fit_batch
+from facerf_cli.face.head import Head
+from facerf_cli.face.landmarks import find_faces
+from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.images import read_image
+from facerf_cli.models import Models, load_models
+from facerf_cli.pipeline import fit_photo
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import vertex_normals
 
-SUBJECTS = ("yaleB05", "yaleB15", "yaleB22")
-Truth = tuple[np.ndarray, np.ndarray]  # normals [H, W, 3], where they are known [H, W]
+SUBJECTS = ["yaleB05", "yaleB15", "yaleB22"]  # of which normals are measured, unless --all
 CROP_PX = 256
-
-
-@dataclass(frozen=True)
-class Photo:
-    """A picture's landmarks in its crop, and which of them count."""
-
-    name: str
-    image: np.ndarray  # uint8 sRGB [H, W, 3]
-    crop: Crop
-    landmarks_px: np.ndarray
-    trust: np.ndarray
-
-
-def look_at(name: str, image: np.ndarray) -> Photo:
-    faces = detect_landmarks(np.ascontiguousarray(image))
-    if not faces:
-        raise SystemExit(f"{name}: no face found")
-    (face,) = choose_face(faces, "largest", name)
-    crop = from_landmarks(face.landmarks_px, CROP_PX)
-    landmarks_px = crop.to_crop(face.landmarks_px)
-    return Photo(name, image, crop, landmarks_px, trust_inside(landmarks_px, crop, *image.shape[:2]))
-
-
-def photos(shared: Path) -> list[Photo]:
-    found = [look_at("astronaut", skimage.data.astronaut())]
-    for path in sorted((shared / "data/photos").glob("*.jpg")):
-        found.append(look_at(path.stem, to_display(read_image(path).pixels)))
-    return found
-
-
-def fit(model: MorphableModel, photo: Photo, settings: FitSettings) -> FaceFit:
-    return fit_landmarks(model, photo.landmarks_px, photo.crop, settings, photo.trust)
-
-
-def least_squares(values: np.ndarray, lights: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Albedo times normal [P, 3] of pixels under L lights [L, 3], values and weights [L, P]."""
-    normal = np.einsum("lp,li,lj->pij", weights, lights, lights) + 1e-6 * np.eye(3)
-    return np.linalg.solve(normal, np.einsum("lp,li,lp->pi", weights, lights, values)[..., None])[..., 0]
-
-
-def shadow_aware(values: np.ndarray, lights: np.ndarray) -> np.ndarray:
-    """Least absolute deviations over what is neither shadowed nor saturated."""
-    usable = (values > 0.03) & (values < 0.97)
-    scaled = least_squares(values, lights, np.ones_like(values))
-    for _ in range(8):
-        predicted = lights @ scaled.T
-        weights = usable * (predicted > 0.02) / np.maximum(np.abs(predicted - values), 0.02)
-        scaled = least_squares(values, lights, weights)
-    return scaled
-
-
-def yale_truths(sitter: Sitter) -> list[Truth]:
-    """Photometric-stereo normals: plain least squares over all lights, and shadow-aware."""
-    mask = face_mask()
-    values = sitter.olats.astype(np.float64)[:, mask]
-    directions = np.stack([flash.direction for flash in sitter.flashes])
-    truths = []
-    for scaled in (
-        least_squares(values, directions, np.ones_like(values)),
-        shadow_aware(values, directions),
-    ):
-        normals = np.zeros((*mask.shape, 3))
-        normals[mask] = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-9)
-        truths.append((normals, mask))
-    return truths
-
-
-def fitted_normals(vertices: torch.Tensor, photo: Photo) -> tuple[np.ndarray, np.ndarray]:
-    """Camera-space normals of the fit at the photo's pixels [H, W, 3], and where the face is [H, W]."""
-    side_px = 2 * CROP_PX
-    triangles = grid_triangles()
-    with torch.no_grad():
-        fragments = rasterize(vertices, triangles, crop_camera(side_px))
-        normals = interpolate(vertex_normals(vertices, triangles), triangles, fragments).numpy()
-    height, width = photo.image.shape[:2]
-    y, x = np.mgrid[:height, :width] + 0.5
-    at = np.floor(photo.crop.to_crop(np.stack([x, y], -1)) * side_px / CROP_PX).astype(int)
-    inside = ((at >= 0) & (at < side_px)).all(-1)
-    column, row = at.clip(0, side_px - 1)[..., 0], at.clip(0, side_px - 1)[..., 1]
-    sampled = normals[row, column]
-    sampled = sampled / np.maximum(np.linalg.norm(sampled, axis=-1, keepdims=True), 1e-9)
-    return sampled, inside & (fragments.triangle.numpy()[row, column] >= 0)
-
-
-def angles_deg(vertices: torch.Tensor, photo: Photo, truths: list[Truth]) -> list[float]:
-    """Mean angle of a fit's normals to each truth."""
-    normals, covered = fitted_normals(vertices, photo)
-    angles = []
-    for truth, known in truths:
-        mask = covered & known
-        cosine = (normals[mask] * truth[mask]).sum(-1).clip(-1, 1)
-        angles.append(float(np.degrees(np.arccos(cosine)).mean()))
-    return angles
-
-
-def faces_per_second(model: MorphableModel, batch: int = 64) -> float:
-    torch.manual_seed(0)
-    alpha, beta = torch.randn(batch, len(model.identity)), 0.3 * torch.randn(batch, len(model.expression))
-    vertices = model.vertices(alpha, beta) + torch.tensor([0.0, 0.0, -0.95])
-    camera = crop_camera(CROP_PX)
-    landmarks_px = project(model.landmarks(vertices), camera)
-    fit_batch(model, landmarks_px, camera)
-    start = time.perf_counter()
-    fit_batch(model, landmarks_px, camera)
-    return batch / (time.perf_counter() - start)
-
-
-def score(
-    model: MorphableModel, images: list[Photo], yale: list[tuple[Photo, list[Truth]]], settings: FitSettings
-) -> str:
-    """One line: landmark errors in percent of the inter-ocular distance, angles in degrees."""
-    errors = [100 * fit(model, photo, settings).error_iod for photo in images]
-    yale_errors, fitted, neutral = [], [], []
-    for photo, truths in yale:
-        found = fit(model, photo, settings)
-        yale_errors.append(100 * found.error_iod)
-        fitted.append(angles_deg(found.vertices_camera(model), photo, truths))
-        plain = replace(found, alpha=0 * found.alpha, beta=0 * found.beta)
-        neutral.append(angles_deg(plain.vertices_camera(model), photo, truths))
-    each = np.array(fitted)
-    return (
-        f"photos % {np.round(errors, 2)} | yale % {np.mean(yale_errors):.2f} | "
-        f"angle {each.mean(0).round(2)} (least squares, shadow-aware) "
-        f"neutral {np.mean(neutral, 0).round(2)} | "
-        f"worst {each.max(0).round(1)} each {each[:4, 0].round(1)}"
-    )
-
-
-def settings_to_try() -> list[FitSettings]:
-    grid = itertools.product((0.02, 0.03, 0.045), (0.06, 0.12), (0.05, 0.2, 0.4, 0.7), (0.3, 0.6, 1.0))
-    return [FitSettings(inner, contour, identity_std=a, expression_std=b) for inner, contour, a, b in grid]
+BATCH, ONE_BY_ONE = 64, 8  # faces
+_ROUNDS = 3
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--shared", type=Path, default=Path("../shared"))
+    parser = arguments(__doc__)
+    parser.add_argument("photos", type=Path, nargs="*", help="photos, or folders of them")
     parser.add_argument("--face-model", default="builtin")
-    parser.add_argument("--sweep", action="store_true", help="try many priors, on these same pictures")
-    parser.add_argument("--all", action="store_true", help="all subjects of Yale B")
-    options = parser.parse_args()
-    model = load_face_model(options.face_model)
-    images = photos(options.shared)
-    shifts = read_shifts(options.shared / "bench/yale_b/shifts.csv")
-    database = read_yale_b(options.shared / "data/extended_yale_b", shifts)
-    chosen = SETTINGS_SUBJECTS if options.sweep else SUBJECTS
-    subjects = [name for name in database.subjects if options.all or name in chosen]
-    yale = []
+    parser.add_argument("--all", action="store_true", help="all 21 subjects of Extended Yale B, not three")
+    given = parser.parse_args()
+    models = load_models(None, given.face_model, torch.device("cpu"))
+    for path in photos(given.photos):
+        error_iod = fitted(models, read_image(path).pixels, str(path)).fit.error_iod
+        print(f"{path.stem}: landmark error {100 * error_iod:.2f} %", flush=True)
+    if YALE_B.is_dir() and SHIFTS.is_file():
+        database = read_yale_b(YALE_B, read_shifts(SHIFTS))
+        report_normals(models, database, database.subjects if given.all else SUBJECTS)
+    else:
+        print(f"normals: left out, needs Extended Yale B in {YALE_B}")
+    report_speed(models.face)
+
+
+def fitted(models: Models, photo: np.ndarray, name: str) -> Head:
+    """Fit the face of a photo [H, W, 3] to dlib's landmarks."""
+    return fit_photo(models, photo, find_faces(photo, name)[0].landmarks_px)
+
+
+def report_normals(models: Models, database: YaleB, subjects: list[str]) -> None:
+    """Print mean angles in degrees to the normals of photometric stereo, of the fit and of the mean face."""
+    angles_deg = []
     for subject in subjects:
         sitter = Sitter(database, subject)
-        frontal = np.round(255 * sitter.image("frontal")).astype(np.uint8)
-        photo = look_at(subject, np.repeat(frontal[..., None], 3, -1))
-        yale.append((photo, yale_truths(sitter)))
-    print(model.name, "| photos:", *(photo.name for photo in images), "| yale:", *subjects)
-    if options.sweep:
-        for settings in settings_to_try():
-            print(settings, score(model, images, yale, settings), flush=True)
-    print(score(model, images, yale, FitSettings()))
-    print(f"{faces_per_second(model):.0f} faces a second at B=64 on {torch.get_num_threads()} thread(s)")
+        photo = np.repeat(sitter.image("frontal")[..., None], 3, -1)
+        head = fitted(models, photo, subject)
+        mean_face = replace(head.fit, alpha=0 * head.fit.alpha, beta=0 * head.fit.beta)
+        directions = np.stack([flash.direction for flash in sitter.flashes])
+        inside = face_mask()
+        truth = np.zeros((*inside.shape, 3))
+        values = sitter.olats[:, inside].astype(float)
+        truth[inside] = photometric_stereo(values, directions, inside).normals
+        row = [
+            angle_deg(models.face, photo, head, Target(fit), truth, inside) for fit in (head.fit, mean_face)
+        ]
+        angles_deg.append(row)
+        print(f"{subject}: normals {row[0]:.1f} degrees off, of the mean face {row[1]:.1f}", flush=True)
+    ours, naive = np.mean(angles_deg, 0)
+    print(f"{len(angles_deg)} subjects: {ours:.2f} degrees, mean face {naive:.2f} ({ours / naive:.2f} of it)")
+
+
+def angle_deg(
+    model: MorphableModel,
+    photo: np.ndarray,
+    head: Head,
+    target: Target,
+    truth: np.ndarray,
+    inside: np.ndarray,
+) -> float:
+    """The mean angle between rendered normals and the true ones [H, W, 3] in a mask [H, W]."""
+    view = Composition(model, photo, head, target).view
+    covered = inside & (view.full(view.mask) > 0.5)
+    normals = view.full(view.normal)[covered]
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+    cosine = (normals * truth[covered]).sum(-1).clip(-1, 1)
+    return float(np.degrees(np.arccos(cosine)).mean())
+
+
+def report_speed(model: MorphableModel) -> None:
+    """Print faces a second of a batch and of one face at a time."""
+    generator = torch.Generator().manual_seed(0)
+    alpha = torch.randn(BATCH, len(model.identity), generator=generator)
+    beta = 0.3 * torch.randn(BATCH, len(model.expression), generator=generator)
+    camera = crop_camera(CROP_PX)
+    vertices = model.vertices(alpha, beta) + torch.tensor([0.0, 0.0, -0.95])
+    landmarks_px = project(model.landmarks(vertices), camera)
+    fit_batch(model, landmarks_px[:1], camera)  # the first call is slower
+    ways = {
+        "batch": lambda: [fit_batch(model, landmarks_px, camera)],
+        "one by one": lambda: [fit_batch(model, face[None], camera) for face in landmarks_px[:ONE_BY_ONE]],
+    }
+    seconds, _ = best_s(ways, _ROUNDS)
+    rates = BATCH / seconds["batch"], ONE_BY_ONE / seconds["one by one"]
+    print(
+        f"{rates[0]:.0f} faces a second in a batch of {BATCH}, {rates[0] / rates[1]:.1f} times as many as "
+        f"one by one ({torch.get_num_threads()} threads)"
+    )
 
 
 if __name__ == "__main__":

@@ -1,16 +1,17 @@
-"""Time of one frame of the canonical mesh, beside embree's ray casting and the textbook loop over triangles.
+"""The time of one frame of the face mesh, next to embree's ray casting and the textbook loop over triangles.
 
-    python benchmarks/rasterize.py [--threads N]
+    python benchmarks/rasterize.py [--sides 256 512]
 
-The face turns from frame to frame, so embree builds its tree anew for each; "trace only" leaves that out.
+The face turns from frame to frame, so embree builds its tree for each; "trace only" leaves that out. Times
+are multiples of `rasterize`'s.
 """
 
-import argparse
-import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
+from _common import arguments, best_s
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from torch import Tensor
@@ -18,6 +19,7 @@ from torch import Tensor
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.raster.camera import (
+    PIXEL_CENTRE,
     Camera,
     crop_camera,
     pixel_centres_px,
@@ -28,28 +30,59 @@ from facerf_cli.raster.camera import (
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import render_texture, unwrap
 
-SIDES_PX = (256, 512)
 TEXTURE_SIDE = 256
+_ROUNDS = 5
 
 
-def best_ms(run: Callable[[], object], repeats: int = 7) -> float:
-    """The fastest of several runs, in milliseconds; the machine may be shared."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return 1000 * min(times)
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--sides", type=int, nargs="+", default=[256, 512], help="of the frame, in pixels")
+    given = parser.parse_args()
+    pose = pose_to_rotation(25, 5, 3)
+    vertices = load_face_model("builtin").mean @ pose.T + torch.tensor([0.0, 0, -1.0])
+    for side_px in given.sides:
+        report(side_px, vertices)
+
+
+def report(side_px: int, vertices: Tensor) -> None:
+    """Print how often all agree on the triangle of a pixel, and their times."""
+    camera, triangles = crop_camera(side_px), grid_triangles()
+    texture, image = torch.rand(3, TEXTURE_SIDE, TEXTURE_SIDE), torch.rand(3, side_px, side_px)
+    rays = pixel_rays(pixel_centres_px(camera), camera).reshape(-1, 3).numpy()
+    scene = embree_scene(vertices, triangles)
+    ways: dict[str, Callable[[], Any]] = {
+        "rasterize": lambda: rasterize(vertices, triangles, camera),
+        "embree, tree and trace": lambda: embree_triangles(embree_scene(vertices, triangles), rays),
+        "embree, trace only": lambda: embree_triangles(scene, rays),
+        "render_texture": lambda: render_texture(texture, vertices, triangles, grid_uv(), camera),
+        "render_texture and backward": lambda: with_gradients(vertices, texture, camera),
+        f"unwrap to {TEXTURE_SIDE}": lambda: unwrap(image, vertices, triangles, camera, TEXTURE_SIDE),
+    }
+    seconds, results = best_s(ways, _ROUNDS)
+    looped_s, looped = best_s(
+        {"loop over triangles": lambda: loop_over_triangles(vertices, triangles, camera)}, 1
+    )
+    fragments = rasterize(vertices, triangles, camera)
+    covered, ours = fragments.covered.numpy(), fragments.triangle.numpy()
+    hit = results["embree, trace only"].reshape(side_px, side_px)
+    agree = [float((ours == other)[covered].mean()) for other in (hit, looped["loop over triangles"])]
+    print(
+        f"{side_px} px: {covered.sum()} pixels covered; same triangle as embree in {agree[0]:.3%}, "
+        f"as the loop in {agree[1]:.3%}"
+    )
+    for name, value in {**seconds, **looped_s}.items():
+        print(f"  {name:<28}{1000 * value:>10.1f} ms{value / seconds['rasterize']:>10.2f} x")
 
 
 def embree_scene(vertices: Tensor, triangles: Tensor) -> rtcore_scene.EmbreeScene:
+    """Build embree's tree."""
     scene = rtcore_scene.EmbreeScene()
     TriangleMesh(scene, vertices.numpy(), triangles.numpy().astype(np.int32))
     return scene
 
 
 def embree_triangles(scene: rtcore_scene.EmbreeScene, rays: np.ndarray) -> np.ndarray:
-    """Triangle that each ray [P, 3] from the camera hits [P]; embree finds the barycentrics as well."""
+    """The triangle [P] that each ray [P, 3] from the camera hits; embree finds the barycentrics as well."""
     return scene.run(np.zeros_like(rays), rays, output=True)["primID"]
 
 
@@ -62,7 +95,7 @@ def loop_over_triangles(vertices: Tensor, triangles: Tensor, camera: Camera) -> 
         a, b, c = px[corners]
         x0, y0 = np.maximum(np.floor(np.min([a, b, c], 0)), 0).astype(int)
         x1, y1 = np.ceil(np.max([a, b, c], 0)).astype(int)
-        y, x = np.mgrid[y0 : min(y1, camera.height_px), x0 : min(x1, camera.width_px)] + 0.5
+        y, x = np.mgrid[y0 : min(y1, camera.height_px), x0 : min(x1, camera.width_px)] + PIXEL_CENTRE
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if x.size == 0 or area == 0:
             continue
@@ -77,51 +110,10 @@ def loop_over_triangles(vertices: Tensor, triangles: Tensor, camera: Camera) -> 
 
 
 def with_gradients(vertices: Tensor, texture: Tensor, camera: Camera) -> None:
+    """Render a texture and run backward to the vertices."""
     leaf = vertices.clone().requires_grad_()
     image, _ = render_texture(texture, leaf, grid_triangles(), grid_uv(), camera)
-    image.sum().backward()
-
-
-def rows(side_px: int, vertices: Tensor) -> list[tuple[str, float]]:
-    camera, triangles = crop_camera(side_px), grid_triangles()
-    texture = torch.rand(3, TEXTURE_SIDE, TEXTURE_SIDE)
-    rays = pixel_rays(pixel_centres_px(camera), camera).reshape(-1, 3).numpy()
-    scene = embree_scene(vertices, triangles)
-    image = torch.rand(3, side_px, side_px)
-    fragments = rasterize(vertices, triangles, camera)
-    hit = embree_triangles(scene, rays).reshape(side_px, side_px)
-    agree = float((fragments.triangle.numpy() == hit)[fragments.covered.numpy()].mean())
-    loop = loop_over_triangles(vertices, triangles, camera)
-    agree_loop = float((fragments.triangle.numpy() == loop)[fragments.covered.numpy()].mean())
-    print(
-        f"{side_px} px: {int(fragments.covered.sum())} pixels covered; same triangle as embree in "
-        f"{agree:.3%}, as the loop in {agree_loop:.3%}"
-    )
-    return [
-        ("rasterize", best_ms(lambda: rasterize(vertices, triangles, camera))),
-        ("render_texture", best_ms(lambda: render_texture(texture, vertices, triangles, grid_uv(), camera))),
-        ("render_texture and backward", best_ms(lambda: with_gradients(vertices, texture, camera))),
-        ("unwrap to 256", best_ms(lambda: unwrap(image, vertices, triangles, camera, TEXTURE_SIDE))),
-        (
-            "embree, tree and trace",
-            best_ms(lambda: embree_triangles(embree_scene(vertices, triangles), rays)),
-        ),
-        ("embree, trace only", best_ms(lambda: embree_triangles(scene, rays))),
-        ("loop over triangles", best_ms(lambda: loop_over_triangles(vertices, triangles, camera), repeats=1)),
-    ]
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--threads", type=int, default=2)
-    torch.set_num_threads(parser.parse_args().threads)
-    pose = pose_to_rotation(25, 5, 3)
-    vertices = load_face_model("builtin").mean @ pose.T + torch.tensor([0.0, 0, -1.0])
-    for side_px in SIDES_PX:
-        table = rows(side_px, vertices)
-        own_ms = table[0][1]
-        for name, milliseconds in table:
-            print(f"  {name:<28}{milliseconds:>10.1f} ms{milliseconds / own_ms:>10.2f} x")
+    image.sum().backward()  # type: ignore[no-untyped-call]
 
 
 if __name__ == "__main__":

@@ -1,17 +1,14 @@
-"""Steps of training per second, beside a bare loop of the same network and loss on one batch in memory.
+"""Steps of training a second, next to a bare loop of the same network and loss on one batch in memory.
 
-    python benchmarks/training_speed.py --bank RUN/bank [--dataset DATASET] [--presets default tiny paper]
+    python benchmarks/training_speed.py --bank RUN/bank [--dataset DATASET --presets default tiny paper]
 
-Both run by turns in this process, a round of steps each, so that whatever else the machine does falls on both
-alike; the first step of a round, whose batch nobody began ahead, and the last, which saves, are left out.
-The bare loop only goes forward, back, and down the gradient: no drawing, clipping, averaging, logging.
-`waiting` is the share of the loop's time in which it waits for batches. The processor's time is shown beside
-the clock's, for a busy machine. The preset `paper` wants a prepared dataset; its VGG networks have random
-weights here, which cost the same.
+Both loops take turns in this process. The first step of a round, whose batch nothing drew ahead, and the last
+one, which saves, are left out. The bare loop goes forward, backward and down the gradient: no drawing,
+clipping, averaging or logging. `waiting` is the share of time in which the loop waits for batches. The ratio
+is also given in processor time, which a busy machine does not disturb. The preset `paper` needs a prepared
+dataset; its VGG networks have random weights here, which cost the same.
 """
 
-import argparse
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from synthetic import held_out_bank
+from _common import arguments, first_heads, print_header, print_row, required
 
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.morphable import load_face_model
@@ -36,28 +33,40 @@ from facerf_cli.training.settings import PRESETS, TrainSettings
 from facerf_cli.training.state import build_optimizer
 from facerf_cli.training.texture_objective import TextureObjective
 
-_HEADS = 40  # of the bank, besides the mean face: a step does not depend on how many there are
-_TINY_WIDTHS = (8, 12, 16)  # as `facerf train --preset tiny` has them
+_TINY_WIDTHS = (8, 12, 16)  # as in `facerf train --preset tiny`
 TINY_NETWORK = DefaultReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2)
-_NEVER = 1_000_000_000
+_NEVER = 1_000_000_000  # steps between validations
+_LEAST_STEPS = 5  # of a round, two of which are left out
 Times = np.ndarray  # [N, 2] seconds of steps: by the clock, and of the processor
 
 
 def main() -> None:
-    given = _arguments()
+    parser = arguments(__doc__)
+    add = parser.add_argument
+    add("--bank", type=Path, help="folder that `facerf train --bank` filled")
+    add("--heads", type=int, default=40, help="of the bank; a step does not depend on how many there are")
+    add("--dataset", type=Path, help="prepared, with pairs, for the preset paper")
+    add("--presets", nargs="+", default=["default", "tiny"], choices=list(PRESETS))
+    add("--steps", type=int, default=20, help="of a round")
+    add("--rounds", type=int, default=3)
+    add("--workers", type=int, default=0, help="processes that draw batches")
+    add("--threads", type=int, default=torch.get_num_threads())
+    given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    presets = {}
-    for name in given.presets:
+    objectives = {name: build(name, given.bank, given.heads, given.dataset) for name in given.presets}
+    print_header("preset", "steps a second", "bare loop", "ratio", "of processor time", "waiting on data")
+    for name, objective in objectives.items():
         settings = replace(PRESETS[name], workers=given.workers)
-        presets[name] = measure(build(name, given.bank, given.dataset), settings, given.steps, given.rounds)
-        print(_line(name, presets[name]), flush=True)
-    found = {"presets": presets, "workers": given.workers, "threads": given.threads}
-    if given.json:
-        given.json.write_text(json.dumps(found, indent=1) + "\n")
+        ours, bare, waiting = measure(objective, settings, max(given.steps, _LEAST_STEPS), given.rounds)
+        (our_s, our_cpu_s), (bare_s, bare_cpu_s) = ours.mean(0), bare.mean(0)
+        ratios = f"{bare_s / our_s:.2f}", f"{bare_cpu_s / our_cpu_s:.2f}"
+        print_row(name, f"{1 / our_s:.2f}", f"{1 / bare_s:.2f}", *ratios, f"{100 * waiting:.1f} %")
 
 
-def measure(objective: Objective, settings: TrainSettings, steps: int, rounds: int) -> dict[str, float]:
-    """Rates of a preset's loop and of the bare one, and the share of waiting."""
+def measure(
+    objective: Objective, settings: TrainSettings, steps: int, rounds: int
+) -> tuple[Times, Times, float]:
+    """Times of the steps of a preset's loop and of the bare one, and the share of waiting."""
     objective.validate = lambda: Validation({objective.chooses_by: 0.0}, None)  # type: ignore[method-assign]
     objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     objective.bf16 = settings.bf16
@@ -72,11 +81,11 @@ def measure(objective: Objective, settings: TrainSettings, steps: int, rounds: i
             train(objective, Path(folder), until, resume=number > 0, report=watch)
             ours.append(_without_ends(watch.times))
             waiting.append(watch.waiting)
-    return _rates(np.concatenate(ours), np.concatenate(bare)) | {"waiting": float(np.mean(waiting))}
+    return np.concatenate(ours), np.concatenate(bare), float(np.mean(waiting))
 
 
 class _Watch:
-    """Notes when each step of the loop ends."""
+    """Note when each step of the loop ends."""
 
     def __init__(self) -> None:
         self.times, self.waiting = [_now()], 0.0
@@ -91,7 +100,7 @@ def _now() -> tuple[float, float]:
 
 
 def _bare_step(objective: Objective, settings: TrainSettings) -> Callable[[], None]:
-    """A step on one batch that is drawn here."""
+    """Make a step on one batch that is drawn here."""
     batch = objective.draw(settings.batch, lambda index: seeded(settings.seed, 1, index), 1)
     optimizer = build_optimizer(settings.optimizer, objective.networks.parameters())
 
@@ -112,35 +121,18 @@ def _timed(step: Callable[[], None], steps: int) -> Times:
 
 
 def _without_ends(times: list[tuple[float, float]]) -> Times:
-    """How long each step took, but for the first and the last."""
+    """The duration of each step, except the first and the last."""
     return np.diff(times, axis=0)[1:-1]
 
 
-def _rates(ours: Times, bare: Times) -> dict[str, float]:
-    our_s, our_cpu_s = ours.mean(0).tolist()
-    bare_s, bare_cpu_s = bare.mean(0).tolist()
-    return {
-        "steps_per_s": 1 / our_s,
-        "bare_steps_per_s": 1 / bare_s,
-        "ratio": bare_s / our_s,
-        "processor_ratio": bare_cpu_s / our_cpu_s,
-        "processor_steps_per_s": 1 / our_cpu_s,
-    }
-
-
-def build(name: str, bank: Path | None, dataset: Path | None) -> Objective:
-    """What a preset minimises, untrained."""
+def build(name: str, bank: Path | None, heads: int, dataset: Path | None) -> Objective:
+    """Make the untrained objective of a preset."""
     if name == "paper":
-        return _paper(_needed(dataset, "--dataset"))
-    heads, _ = held_out_bank(_needed(bank, "--bank"), "builtin", _HEADS)
-    network = DefaultReflectanceNetwork(TINY_NETWORK) if name == "tiny" else DefaultReflectanceNetwork()
-    return TextureObjective(heads, network)
-
-
-def _needed(path: Path | None, option: str) -> Path:
-    if path is None:
-        raise SystemExit(f"this preset wants {option}")
-    return path
+        return _paper(required(dataset, "a prepared dataset", "--dataset"))
+    source = first_heads(required(bank, "a bank of heads", "--bank"), heads)
+    settings = TINY_NETWORK if name == "tiny" else DefaultReflectanceSettings()
+    settings = replace(settings, rig_lights=len(source.baked[0].directions))
+    return TextureObjective(source, DefaultReflectanceNetwork(settings))
 
 
 def _paper(folder: Path) -> Objective:
@@ -149,33 +141,6 @@ def _paper(folder: Path) -> Objective:
     geometry = GeometryNetwork(GeometryNetworkSettings("paper", len(model.identity), len(model.expression)))
     networks = PaperReflectanceNetwork(), geometry, VggFeatures(), LightNetwork()
     return JointObjective(dataset, model, *networks)
-
-
-def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add = parser.add_argument
-    add("--bank", type=Path, help="folder that `facerf train` filled")
-    add("--dataset", type=Path, help="prepared, with pairs")
-    add("--presets", nargs="+", default=["default", "tiny"], choices=list(PRESETS))
-    add("--steps", type=int, default=20, help="of a round")
-    add("--rounds", type=int, default=3)
-    add("--workers", type=int, default=0, help="processes that draw batches")
-    add("--threads", type=int, default=torch.get_num_threads())
-    add("--json", type=Path, help="write all figures here")
-    given = parser.parse_args()
-    if given.steps < 5:
-        parser.error("--steps: five at the least, two of which are left out")
-    return given
-
-
-def _line(name: str, row: dict[str, float]) -> str:
-    return (
-        f"{name:8} {row['steps_per_s']:6.2f} steps a second, bare {row['bare_steps_per_s']:6.2f}, ratio "
-        f"{row['ratio']:.2f} (of processor time {row['processor_ratio']:.2f}), waiting "
-        f"{100 * row['waiting']:.1f} %"
-    )
 
 
 if __name__ == "__main__":

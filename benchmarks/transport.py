@@ -1,20 +1,21 @@
-"""The baked transport against a path tracer, Mitsuba: how far apart their pictures are, and their times.
+"""Baked light transport next to a path tracer, Mitsuba: the difference of their images, and their times.
 
-    python benchmarks/transport.py [--face-model builtin|PATH] [--size 384] [--lights 12] [--pictures DIR]
+    python benchmarks/transport.py [--face-model builtin|PATH] [--size 384] [--lights 12] [--images DIR]
 
-A diffuse head with a drawn appearance, lamps of no size, seen from the front and from a side. Direct light
-alone and with one bounce. Both renderers' pictures are unwrapped into the chart; the error is the root mean
-square over texels that are seen and lie more than two texels off every shadow's edge, relative to the mean
-radiance of the lit ones in the path tracer's picture; over all texels, and over those alone that are lit.
+The scene is a diffuse head with a drawn appearance under point lights, seen from the front and from a side,
+in direct light alone and with one bounce. Both images are unwrapped to UV space. The error is the root mean
+square over visible texels that lie more than two texels from the edge of a shadow, relative to the mean
+radiance of the lit ones in the path tracer's image; over all texels, and over the lit ones alone.
 """
 
-import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from _common import arguments, print_header, print_row, required_package
 from scipy.ndimage import binary_dilation
 from torch import Tensor
 
@@ -35,10 +36,10 @@ from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.stage_cameras import StageCamera
 
-DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and what a picture's side takes in
-CHART = 128  # texels along the chart's side
+DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and the width that an image shows
+TEXTURE_SIDE = 128  # texels
 EDGE_TEXELS = 2
-LIT = 0.01  # share of the picture's highest radiance above which a texel counts as lit
+LIT = 0.01  # share of the image's highest radiance above which a texel counts as lit
 LIGHTS_DEG = (  # azimuth, elevation: from the front to the back
     *[(0, 0), (0, 40), (-30, 10), (45, 20), (-45, -25), (60, 50)],
     *[(-75, 0), (90, 15), (0, 80), (0, -60), (-120, 10), (135, 30)],
@@ -47,7 +48,7 @@ LIGHTS_DEG = (  # azimuth, elevation: from the front to the back
 
 @dataclass(frozen=True)
 class Comparison:
-    """Relative errors [L] of each light, and the mean radiance [L] that they are relative to.
+    """Relative errors [L] of each light, and the mean radiance [L] to which they are relative.
 
     The last entry is of all lights' texels together.
     """
@@ -59,48 +60,53 @@ class Comparison:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = arguments(__doc__)
     parser.add_argument("--face-model", default="builtin")
-    parser.add_argument("--size", type=int, default=384)
-    parser.add_argument("--lights", type=int, default=len(LIGHTS_DEG))
-    parser.add_argument("--samples", type=int, default=128)
+    parser.add_argument("--size", type=int, default=192, help="of the images, in pixels")
+    parser.add_argument("--lights", type=int, default=6, help=f"at most {len(LIGHTS_DEG)}")
+    parser.add_argument("--samples", type=int, default=32, help="paths a pixel")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--pictures", type=Path)
-    arguments = parser.parse_args()
-    model = load_face_model(arguments.face_model)
-    generator = torch.Generator().manual_seed(arguments.seed)
+    parser.add_argument("--images", type=Path, help="folder for both renderers' images")
+    given = parser.parse_args()
+    required_package("mitsuba", "synth")
+    model = load_face_model(given.face_model)
+    generator = torch.Generator().manual_seed(given.seed)
     alpha = 0.7 * torch.randn(len(model.identity), generator=generator)
     appearance = draw_appearance(512, generator)
-    angles = LIGHTS_DEG[: arguments.lights]
+    angles = LIGHTS_DEG[: given.lights]
     directions = np.stack([azel_to_direction(*map(float, angle)).numpy() for angle in angles])
-    cameras = [stage_camera(arguments.size, yaw) for yaw in (0.0, 40.0)]
-    results, times = {}, {"bake": [], "irradiance": [], "photograph": [], "mitsuba": []}
+    cameras = [stage_camera(given.size, yaw_deg) for yaw_deg in (0.0, 40.0)]
+    results: dict[int, Comparison] = {}
+    times: dict[str, list[float]] = {"bake": [], "irradiance": [], "photograph": [], "mitsuba": []}
+    direct: list[Tensor] = []  # the path tracer's images without bounces
     for bounces in (0, 1):
-        settings = PathSettings(samples=arguments.samples, bounces=bounces, gloss=False, relief=False)
-        ours, theirs = render_both(
-            model, alpha, appearance, directions, cameras, settings, arguments.seed, times
-        )
-        if bounces == 0:
-            truth = theirs
-        results[bounces] = compare(model, alpha, cameras, ours, theirs, truth)
-        if arguments.images is not None:
-            write_images(arguments.images, bounces, ours, theirs)
+        settings = PathSettings(samples=given.samples, bounces=bounces, gloss=False, relief=False)
+        ours, theirs = render_both(model, alpha, appearance, directions, cameras, settings, given.seed, times)
+        direct = direct or theirs
+        results[bounces] = compare(model, alpha, cameras, ours, theirs, direct)
+        if given.images is not None:
+            write_images(given.images, bounces, ours, theirs)
+    print(f"{model.name}, {given.size} px, {given.samples} paths a pixel, {results[0].texels} texels")
+    print_errors(results, angles)
+    print_times(times, len(angles))
+
+
+def print_errors(results: dict[int, Comparison], angles: Sequence[tuple[int, int]]) -> None:
+    """Print the errors of each light without and with a bounce."""
+    print_header("azimuth, elevation", "direct", "of lit texels", "one bounce", "of lit texels", "radiance")
+    for light, name in enumerate([*(f"{a}, {e}" for a, e in angles), "all lights"]):
+        percents = [f"{e[light]:.1%}" for n in (0, 1) for e in (results[n].errors, results[n].errors_lit)]
+        print_row(name, *percents, f"{results[1].means[light]:.4f}")
+
+
+def print_times(times: dict[str, list[float]], lights: int) -> None:
+    """Print the times of both renderers, and the ratio for an image."""
+    mean_s = {name: float(np.mean(values)) for name, values in times.items()}
+    print(f"bake of {lights} lights {mean_s['bake']:.2f} s, their irradiance {mean_s['irradiance']:.2f} s")
     print(
-        f"{model.name}, {arguments.size} px, {arguments.samples} paths a pixel, {results[0].texels} texels\n"
+        f"an image: bake {1000 * mean_s['photograph']:.0f} ms, mitsuba {1000 * mean_s['mitsuba']:.0f} ms, "
+        f"{mean_s['mitsuba'] / mean_s['photograph']:.1f} times as long"
     )
-    print(f"{'':14}{'direct':>14}{'with one bounce':>24}")
-    print("azimuth elevation    all    lit        all    lit   mean radiance")
-    for light, name in enumerate([*(f"{a:7} {e:9}" for a, e in angles), f"{'all lights':17}"]):
-        percents = [(results[n].errors[light], results[n].errors_lit[light]) for n in (0, 1)]
-        (direct, direct_lit), (total, total_lit) = percents
-        print(f"{name} {direct:6.1%} {direct_lit:6.1%}     {total:6.1%} {total_lit:6.1%}", end="")
-        print(f"{results[1].means[light]:16.4f}")
-    print()
-    per_image = {name: float(np.mean(values)) for name, values in times.items()}
-    print(f"bake of {len(angles)} lights {per_image['bake']:.2f} s, ", end="")
-    print(f"their irradiance {per_image['irradiance']:.2f} s")
-    print(f"a picture: bake {1000 * per_image['photograph']:.0f} ms, ", end="")
-    print(f"mitsuba {1000 * per_image['mitsuba']:.0f} ms ({arguments.samples} paths a pixel)")
 
 
 def stage_camera(side_px: int, yaw_deg: float) -> StageCamera:
@@ -119,7 +125,7 @@ def render_both(
     seed: int,
     times: dict[str, list[float]],
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Diffuse pictures [L, 3, H, W] of each camera by both renderers; their seconds go into `times`."""
+    """Render diffuse images [L, 3, H, W] of each camera by both renderers; their seconds go into `times`."""
     head = build_head(model, alpha, torch.zeros(len(model.expression)))
     wanted = seen_vertices(head, cameras)
     bake = BakeSettings(light_radius_deg=0, bounce_samples=64 if settings.bounces else 0)
@@ -144,15 +150,16 @@ def render_both(
 
 
 def seen_vertices(head: HeadMesh, cameras: list[StageCamera]) -> np.ndarray:
-    """Corners [V] bool of the triangles that some camera sees."""
+    """Mask [V] of the corners of the triangles that some camera sees."""
     wanted = np.zeros(len(head.vertices), bool)
     for camera in cameras:
         vertices = torch.from_numpy(head.vertices) @ camera.head_to_camera.T + camera.translation_m
         side = camera.camera
-        sizes = (side.focal_px, side.width_px, side.height_px, side.cx_px, side.cy_px)
-        finer = Camera(*(4 * size for size in sizes))
+        finer = Camera(
+            4 * side.focal_px, 4 * side.width_px, 4 * side.height_px, 4 * side.cx_px, 4 * side.cy_px
+        )
         triangle = rasterize(vertices, torch.from_numpy(head.triangles), finer).triangle
-        wanted[head.triangles[triangle[triangle >= 0].unique()].ravel()] = True
+        wanted[head.triangles[np.unique(triangle[triangle >= 0])].ravel()] = True
     return wanted
 
 
@@ -164,39 +171,38 @@ def compare(
     theirs: list[Tensor],
     direct: list[Tensor],
 ) -> Comparison:
-    """`direct` are the path tracer's pictures without bounces: they tell what is lit, where shadows end."""
+    """Compare in UV space; `direct`, the path tracer's images without bounces, show what is lit."""
     vertices = model.vertices(alpha[None], torch.zeros(1, len(model.expression)))[0]
-    ours_at, theirs_at, lit_at = ([[] for _ in range(len(ours[0]))] for _ in range(3))
-    for camera, our, their, lamp in zip(cameras, ours, theirs, direct, strict=True):
+    lights = range(len(ours[0]))
+    ours_at, theirs_at, lit_at = ([list[Tensor]() for _ in lights] for _ in range(3))
+    for camera, our, their, unbounced in zip(cameras, ours, theirs, direct, strict=True):
         at = vertices @ camera.head_to_camera.T + camera.translation_m
-        for light in range(len(our)):
+        for light in lights:
             (a, seen), (b, _), (c, _) = (
-                unwrap(images[light], at, grid_triangles(), camera.camera, CHART)
-                for images in (our, their, lamp)
+                unwrap(images[light], at, grid_triangles(), camera.camera, TEXTURE_SIDE)
+                for images in (our, their, unbounced)
             )
             lit = c.mean(0) > LIT * their.max()
-            edge = binary_dilation(lit, iterations=EDGE_TEXELS) & binary_dilation(
-                ~lit, iterations=EDGE_TEXELS
-            )
-            clear = (seen > 0.5) & ~torch.from_numpy(edge)
+            near = [binary_dilation(part.numpy(), iterations=EDGE_TEXELS) for part in (lit, ~lit)]
+            clear = (seen > 0.5) & ~torch.from_numpy(near[0] & near[1])
             ours_at[light].append(a[:, clear])
             theirs_at[light].append(b[:, clear])
             lit_at[light].append(lit[clear])
-    a, b, lit = ([torch.cat(parts, -1) for parts in at] for at in (ours_at, theirs_at, lit_at))
-    rows = [_errors(*row) for row in zip(a, b, lit, strict=True)]
-    rows.append(_errors(torch.cat(a, -1), torch.cat(b, -1), torch.cat(lit)))
+    each = [[torch.cat(parts, -1) for parts in at] for at in (ours_at, theirs_at, lit_at)]
+    rows = [_errors(*row) for row in zip(*each, strict=True)]
+    rows.append(_errors(*(torch.cat(parts, -1) for parts in each)))
     errors, errors_lit, means = (list(column) for column in zip(*rows, strict=True))
-    return Comparison(errors, errors_lit, means, sum(part.numel() for part in lit) // len(lit))
+    return Comparison(errors, errors_lit, means, sum(part.numel() for part in each[2]) // len(lights))
 
 
 def _errors(ours: Tensor, theirs: Tensor, lit: Tensor) -> tuple[float, float, float]:
-    """The error over all texels [3, N], over the lit ones [N] bool, and the mean radiance of those."""
+    """The error over all texels [3, N], the error over the lit ones [N] bool, and their mean radiance."""
     mean, squares = float(theirs[:, lit].mean()), (ours - theirs) ** 2
     return float(squares.mean().sqrt()) / mean, float(squares[:, lit].mean().sqrt()) / mean, mean
 
 
 def write_images(folder: Path, bounces: int, ours: list[Tensor], theirs: list[Tensor]) -> None:
-    """Ours above theirs above four times the difference, one file a camera."""
+    """Write ours above theirs above four times the difference, one file a camera."""
     folder.mkdir(parents=True, exist_ok=True)
     for camera, (our, their) in enumerate(zip(ours, theirs, strict=True)):
         rows = [torch.cat(list(part), -1) for part in (our, their, 4 * (our - their).abs())]

@@ -5,16 +5,13 @@ and over channels alike. Values are as the caller gives them, scene-linear Rec.7
 white. A metric fits the exposure of the prediction only if its definition says so.
 """
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from facerf_cli.colour import lab_d65, luminance
-
-Key = TypeVar("Key", bound=Hashable)
 
 PSNR_HIGHEST_DB = 100.0  # reported for equal images, whose PSNR is infinite
 _SMALLEST = 1e-12  # of a denominator; avoids 0 / 0 for a black prediction
@@ -254,8 +251,3 @@ def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
         part[:] = totals[drawn].sum(1) / counts[drawn].sum(1)
     low, high = np.percentile(means, [_LOW, _HIGH])
     return float(low), float(high)
-
-
-def average(rows: Sequence[Mapping[Key, float]]) -> dict[Key, float]:
-    """Average mappings of the same keys, such as the values of images over several seeds."""
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}

@@ -1,6 +1,7 @@
 """Metrics against the reference scorer, slow twins, and bounds."""
 
 import importlib
+import math
 from collections.abc import Iterator
 from types import ModuleType
 
@@ -14,6 +15,7 @@ from facerf_cli.metrics import (
     dssim,
     ita_deg,
     light_error_deg,
+    mean_interval,
     mse,
     psnr,
     si_mse,
@@ -172,3 +174,27 @@ def test_tone_drift_uses_only_the_skin() -> None:
     assert tone_drift_deg(truth, truth, 0 * skin, albedo) is None
     grey = np.broadcast_to(truth.mean(-1, keepdims=True), truth.shape)
     assert tone_drift_deg(truth, grey, skin, albedo) is None
+
+
+@pytest.mark.parametrize(
+    ("ita", "tone"),
+    [(70, "very light"), (55, "light"), (41, "intermediate"), (28, "tan"), (10, "brown"), (-30, "dark")],
+)
+def test_tones_are_the_published_classes(ita: float, tone: str) -> None:
+    assert tone_of(ita) == tone
+
+
+def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
+    random = np.random.default_rng(0)
+    groups = random.normal(size=40)
+    interval = mean_interval((g, groups[g] + 0.01 * random.normal()) for g in range(40) for _ in range(50))
+    assert interval is not None and (interval.images, interval.groups) == (2000, 40)
+    half = 1.96 * groups.std() / math.sqrt(40)
+    np.testing.assert_allclose(interval.high - interval.low, 2 * half, rtol=0.1)
+    assert interval.low < interval.mean < interval.high
+
+
+def test_one_group_has_no_interval() -> None:
+    interval = mean_interval([("a", 1.0), ("a", 3.0)])
+    assert interval is not None and interval.mean == 2 and math.isnan(interval.low)
+    assert mean_interval([]) is None

@@ -1,5 +1,7 @@
+import importlib
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,8 +137,9 @@ def test_a_seed_repeats_an_image() -> None:
 
 
 @pytest.mark.slow
-def test_the_benchmark_holds_on_a_small_image_of_the_builtin_head() -> None:
-    from benchmarks import transport as benchmark
+def test_the_benchmark_holds_on_a_small_image_of_the_builtin_head(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
+    benchmark = importlib.import_module("transport")
     from facerf_cli.face.morphable import load_face_model
     from facerf_cli.synth.appearance.materials import draw_appearance
 
