@@ -18,7 +18,6 @@ from held_out_heads import RelitTexture, drift_of, groups, print_tables
 def test_every_script_imports_and_has_help(
     script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("embreex")
     module = importlib.import_module(script)
     monkeypatch.setattr(sys, "argv", [f"{script}.py", "--help"])
     with pytest.raises(SystemExit) as end:
