@@ -38,3 +38,7 @@ def __getattr__(name: str) -> Any:
     from facerf_cli import api
 
     return getattr(api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -49,7 +49,10 @@ VERBS: tuple[Callable[..., Any], ...] = (
 # Verbs with subcommands.
 GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
-EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
+EPILOG = (
+    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
+    "the verb."
+)
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 # Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})

@@ -30,7 +30,10 @@ from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptio
 from facerf_cli.errors import UsageError
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
-_EPILOG = "Global options (see 'facerf --help') may stand before or after the verb."
+_EPILOG = (
+    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
+    "the verb."
+)
 
 
 def olat(

@@ -92,6 +92,8 @@ def collect_setups(
     setups += map(_single_lights, lights)
     if not setups:
         raise UsageError("no light given; add --envmap, --light, or --light-from with a photo")
+    if rotate is not None and not any(setup.envmap for setup in setups):
+        raise UsageError("--rotate: turns maps; add --envmap or --light-from, or leave it out")
     names = [setup.name + setup.frame for setup in setups]
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two images would be named {min(twice)}; give each light once")

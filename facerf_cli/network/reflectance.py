@@ -72,5 +72,7 @@ def make_reflectance_network(form: str = "default", **settings: Any) -> Reflecta
     have.
     """
     if form not in REFLECTANCE_FORMS:
-        raise UsageError(f"form {form}: no such Reflectance Network; give {' or '.join(REFLECTANCE_FORMS)}")
+        raise UsageError(
+            f"form {form}: no such Reflectance Network; give one of {', '.join(REFLECTANCE_FORMS)}"
+        )
     return REFLECTANCE_FORMS[form].from_metadata({"form": form, **settings})

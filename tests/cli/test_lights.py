@@ -111,7 +111,7 @@ def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
         parse_rotations("left")
     (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
-    with pytest.raises(UsageError, match=r"rig\.txt: '0,100': an elevation is from -90"):
+    with pytest.raises(UsageError, match=r"rig\.txt: '0,100': the elevation is out of range; give -90"):
         parse_lights(str(tmp_path / "rig.txt"))
 
 
@@ -130,7 +130,7 @@ def test_frame_numbers_stay_at_the_end() -> None:
     turned = LightSetup("sky", ".0001")
     assert turned.output(still, "", ".exr") == Path("out/a_sky.0001.exr")
     assert LightSetup("sky").output(moving, "_face0", ".png") == Path("out/b/setup_face0_sky.0007.png")
-    assert turned.output(moving, "", ".exr") == Path("out/b/shot_sky.0001.0007.exr")
+    assert turned.output(moving, "", ".exr") == Path("out/b/setup_sky.0001.0007.exr")
 
 
 def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

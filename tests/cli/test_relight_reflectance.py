@@ -80,7 +80,7 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
     (line,) = capsys.readouterr().err.splitlines()
     assert "mine: a checkpoint without a Reflectance Network" in line
     assert relight("other", LIGHT_FEATURES, "--reflectance", "diffuse-sh") == 1
-    assert "give one by `facerf train`" in capsys.readouterr().err
+    assert "give a checkpoint of `facerf train`" in capsys.readouterr().err
 
 
 def test_the_field_is_what_it_was(given: Path, tmp_path: Path) -> None:

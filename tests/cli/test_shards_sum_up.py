@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.evaluation_run import run_protocol
+from facerf_cli.cli.items.evaluation_run import run_protocol
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.logs import configure_logging
 from facerf_cli.main import main
@@ -46,7 +46,7 @@ def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:
     shards = ["relight-dataset", str(tmp_path / "shards"), *line]
     assert main(whole) == 0
     assert main([*shards, "--shard", "1/2"]) == 2
-    assert "give this line once with --lazy and no --shard" in capsys.readouterr().err
+    assert "run once with --lazy and without --shard first" in capsys.readouterr().err
     assert main([*shards, "--lazy"]) == 0
     assert main([*shards, "--shard", "2/2"]) == 0 and main([*shards, "--shard", "1/2"]) == 0
     assert tree(tmp_path / "shards/relit") == tree(tmp_path / "whole/relit")

@@ -51,7 +51,7 @@ def test_a_start_whose_weights_do_not_fit_is_named_before_baking(
 
 def test_an_unknown_form_is_named_before_baking(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "-o", str(tmp_path / "run"), "--form", "cubist"]) == 2
-    assert "form cubist: no such Reflectance Network; give default or paper" in capsys.readouterr().err
+    assert "form cubist: no such Reflectance Network; give one of default, paper" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -201,7 +201,12 @@ def _photos(options: TrainOptions, side: int) -> Photos | None:
 def _reflectance_network(options: TrainOptions) -> Any:
     settings = _TINY_FORMS.get(options.form, {}) if options.preset == "tiny" else {}
     ablation = {"normals": False} if options.without_normals else {}
-    return make_reflectance_network(options.form, **settings, **ablation)
+    try:
+        return make_reflectance_network(options.form, **settings, **ablation)
+    except TypeError:
+        raise UsageError(
+            f"--without-normals: the form {options.form} has no setting normals; leave it out"
+        ) from None
 
 
 def _geometry_network(options: TrainOptions, mean_translation_m: tuple[float, float, float]) -> nn.Module:
