@@ -20,8 +20,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from facerf_cli.cli.options import Settings, Shard, workers_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
@@ -399,6 +397,9 @@ def _with_progress(
     results: Iterator[_Result], total: int, verb: str, settings: Settings
 ) -> Iterator[_Result]:
     """Pass the results through, with a progress bar on stderr if that is a terminal."""
+    # imported here, since --help does without it
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
     # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.

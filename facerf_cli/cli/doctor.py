@@ -1,6 +1,5 @@
 """`facerf doctor`: the installation and its licences, on one screen."""
 
-import importlib.metadata
 import platform
 import re
 import textwrap
@@ -47,9 +46,11 @@ def _installation() -> dict[str, dict[str, Any]]:
 
 def _packages() -> dict[str, str]:
     """Versions of the required packages and of the installed extras, without the developers' tools."""
+    from importlib import metadata  # slow to load, and --help does without it
+
     try:
-        requirements = importlib.metadata.requires("facerf") or []
-    except importlib.metadata.PackageNotFoundError:
+        requirements = metadata.requires("facerf") or []
+    except metadata.PackageNotFoundError:
         return {"facerf": f"{MISSING} (run from its source; install it with pip)"}
     versions = {}
     for requirement in requirements:
@@ -57,8 +58,8 @@ def _packages() -> dict[str, str]:
         if re.search(r"extra == .dev", requirement):
             continue
         try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
             if "extra ==" not in requirement:
                 versions[name] = MISSING
     return versions

@@ -72,7 +72,9 @@ def test_a_form_by_its_name_is_its_class_with_its_settings(network: Any) -> None
 
 
 def test_unknown_forms_and_settings_are_refused() -> None:
-    with pytest.raises(UsageError, match="form other: no such Reflectance Network; give one of default, paper"):
+    with pytest.raises(
+        UsageError, match="form other: no such Reflectance Network; give one of default, paper"
+    ):
         make_reflectance_network("other")
     with pytest.raises(TypeError):
         make_reflectance_network("paper", rig_lights=3)
