@@ -150,7 +150,8 @@ def predict_olat(
 
     `lights` is the size of a uniform rig, or unit directions [L, 3] in camera space.
     """
-    directions = rig_directions(lights) if isinstance(lights, int) else torch.from_numpy(lights).float()
+    rig = np.asarray(lights)
+    directions = torch.from_numpy(rig).float() if rig.ndim else rig_directions(int(rig))
     fit = _posed(head.fit, pose)
     rotation = None if fit is None else fit.rotation
     batches = pipeline.predict_olat(models, head, directions, rotation, network_alone)
@@ -159,7 +160,10 @@ def predict_olat(
 
 
 def estimate_light(models: Models, head: Head, lights: int = 150, reflectance: Kind = "field") -> Light:
-    """Estimate the light of a head's photo over a rig; raises InputError where too little is visible."""
+    """Estimate the light of a head's photo over a rig of `lights`; baselines have a rig of their own.
+
+    Raises InputError where too little of the face is visible.
+    """
     with torch.no_grad():
         light = pipeline.estimate_light(models, head, reflectance, rig_directions(lights)).light
     return Light(light.directions.numpy(), light.weights.numpy())

@@ -9,7 +9,8 @@ the relit one R, a photo pixel P becomes
 For bright sources both are the quotient P R / S. Where the source is nearly black the quotient would be
 noise, and e, a small share of the source's mean, keeps the pixel near R. Under the photo's own light (R = S)
 the photo comes back. Hair and background follow by `Surround`. All steps are linear in light: two lights
-composed apart add up to both composed at once.
+composed apart add up to both composed at once, but for a slight undershoot of the surround, which is clipped.
+A light with negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
 from collections.abc import Mapping
@@ -214,6 +215,11 @@ class Surround:
         local = (around + floor * change) / (self._around_source + floor).clamp(min=_TINY)
         local = local.minimum(change * _BRIGHTER).maximum(change / _DARKER)
         return torch.lerp(change.expand_as(local), local, self._near)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of one change of light."""
+        return 3 * self._mask.nbytes
 
     def over_photo(self, change: Tensor) -> np.ndarray:
         """A change of light [3, s, s] over the photo [H, W, 3]."""

@@ -4,8 +4,8 @@
                            head -> estimate_light -> light
                            head -> predict_olat -> a texture for each light
 
-Every verb, every protocol of `evaluate` and every benchmark calls these functions. Images are scene-linear
-[H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
+The verbs on photos, the protocols of `evaluate` and most benchmarks call these functions. Images are
+scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.baselines import Kind
@@ -23,7 +22,7 @@ from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Target
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
+from facerf_cli.face.fit import fit_landmarks, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk, weighted_sums
@@ -31,7 +30,7 @@ from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
 from facerf_cli.network.feature_networks import FeatureNetwork
-from facerf_cli.network.inputs import exposure_of
+from facerf_cli.network.inputs import exposure_of, resize
 
 TEXTURE_SIDE = 256  # texels, by default
 _CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
@@ -80,7 +79,7 @@ def reflectance_of(
 
 
 def explain(models: Models, head: Head, kind: Kind = "field", network_alone: bool = True) -> Explained:
-    """Read both reflectance and light of a head's photo, as far as the model can tell them apart."""
+    """Read both reflectance and light of a head's photo, as far as the model can separate them."""
     if kind == "field":
         return Explained(
             reflectance_of(models, head, kind, network_alone), estimate_light(models, head).light
@@ -107,15 +106,16 @@ def predict_olat(
     `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's.
     """
     quotient = None if network_alone else photo_quotient(models, head.face)
-    olats = Field(models, head.face, quotient, memory_bytes, bf16).olats(lights, _turn(head.fit, rotation))
-    yield from olats
+    turn = None if rotation is None else head.fit.turn_to(rotation)
+    return Field(models, head.face, quotient, memory_bytes, bf16).olats(lights, turn)
 
 
 @dataclass(frozen=True, eq=False)
 class LightEstimate:
     """The light of a photo, the evidence for it, and the texture [3, t, t] of the face under it.
 
-    If features refined the weights, `refined` says how, and `least_squares` [L, 3] are those before.
+    If features refined the weights, `refined` holds the refinement, and `least_squares` [L, 3] are those
+    before.
     """
 
     light: RigLight
@@ -137,14 +137,14 @@ def estimate_light(
     """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
 
     Without `non_negative` the paper's plain least squares are solved. `features` (V_f or S_f) refines the
-    weights. The models other than the field have a light of their own. Eyes are left out, as in the paper,
+    weights. The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
     """
     evidence = photo_evidence(head.face, keep_eyes)
     if kind != "field":
         explained = explain(models, head, kind)
         texture = explained.reflectance.relit(explained.light.directions, explained.light.weights[None])
-        small = F.interpolate(texture, evidence.photo.shape[1:], mode="area")[0]
+        small = resize(texture, evidence.photo.shape[-1])[0]
         return LightEstimate(explained.light, evidence, small)
     rig = rig_directions() if rig is None else rig
     olats = torch.cat(list(Field(models, shrunk(head.face)).olats(rig)))
@@ -171,7 +171,8 @@ def relight(
     Without a photo the face alone is shown, in the frame of its crop. `reflectance` is read from the head
     if it is not given.
     """
-    reflectance = reflectance or reflectance_of(models, head)
+    if reflectance is None:
+        reflectance = reflectance_of(models, head)
     composition = Composition(models.face, photo, head, target)
     weights = light.weights[None]
     relit = next(relit_by(composition, head, reflectance, light.directions, weights, target))
@@ -193,7 +194,7 @@ def relit_by(
     clamped.
     """
     surround = composition.surround
-    turn = _turn(head.fit, None if target.fit is None else target.fit.rotation)
+    turn = None if target.fit is None else head.fit.turn_to(target.fit.rotation)
     if surround is not None and isinstance(reflectance, Field):
         summed = weighted_sums(
             reflectance.olats(directions, turn), weights, lambda olats: olats, surround.changes
@@ -202,8 +203,3 @@ def relit_by(
         return
     for texture in reflectance.relit(directions, weights, turn):
         yield Relit(texture, None if surround is None else surround.changes(texture[None])[0])
-
-
-def _turn(fit: FaceFit, rotation: Tensor | None) -> Tensor | None:
-    """The rotation [3, 3] of camera-space vectors that takes the fit's head to a pose, head_to_camera."""
-    return None if rotation is None else rotation @ fit.rotation.T

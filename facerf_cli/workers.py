@@ -173,8 +173,8 @@ def spread(
     """Yield `work(item)` of each item in the items' order, computed by the workers.
 
     `broken` gives the result of an item whose worker died while it had it. Before an item is tried again,
-    `recover` gives its result if the lost worker had finished it, else None. Workers log by way of this one;
-    Ctrl-C here ends them. An exception of `work` is raised here.
+    `recover` gives its result if the lost worker had finished it, else None. Workers log through this
+    process; Ctrl-C here ends them. An exception of `work` is raised here.
     """
     if workers.ray is not None and items:
         from facerf_cli.ray_workers import in_ray

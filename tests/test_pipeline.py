@@ -107,3 +107,10 @@ def test_the_light_of_the_photo_explains_it(models: Models, head: Head) -> None:
     estimate = estimate_light(models, head, rig=rig_directions(60))
     assert estimate.light.weights.shape == (60, 3) and (estimate.light.weights >= 0).all()
     assert estimate.evidence.residual(estimate.explained) < 0.25
+
+
+def test_a_mask_that_hides_nothing_changes_nothing(models: Models, head: Head) -> None:
+    whole = np.ones(head.cropped.shape[:2], np.float32)
+    assert torch.equal(head.without(models.face, whole).face.texture, head.face.texture)
+    whole[: len(whole) // 2] = 0
+    assert head.without(models.face, whole).face.visible.sum() < 0.8 * head.face.visible.sum()

@@ -1,7 +1,8 @@
 """The interface of the field and the baselines: the reflectance of a face and the light of its photo.
 
-Every model here is linear in its light. A light is always given as weights of a rig's lights (`RigLight`), so
-that the light which one model estimates from a photo can illuminate another model.
+Every model is linear in light, except where a baseline clamps negative light. A light is always given as
+weights of a rig's lights (`RigLight`), so that the light which one model estimates from a photo can
+illuminate another model.
 """
 
 from dataclasses import dataclass

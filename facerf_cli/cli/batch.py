@@ -189,17 +189,17 @@ def run_items(
 
     With `--shard` only this process's share of them, which has a report of its own. `prepare` is called once,
     before the first item, and not at all where everything is finished: it loads what `process` needs, so that
-    what is wrong with that is said once. With several workers `process` runs in other processes and must be
-    picklable. Raises `UsageError` (exit 2) where the output folder cannot be used.
+    an error in that is reported once; in a dry run, too. With several workers `process` runs in other
+    processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be used.
     """
     items = settings.shard.share(items)
     finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
     done = set(finished)
     todo = [item for item in items if item not in done]
-    if options.dry_run:
-        return _list_what_would_be_done(todo, finished, outputs_of)
     if todo and prepare:
         prepare()
+    if options.dry_run:
+        return _list_what_would_be_done(todo, finished, outputs_of)
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if finished:
         advice = "--overwrite makes them again, for example with other options"

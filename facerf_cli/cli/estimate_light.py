@@ -1,6 +1,7 @@
 """`facerf estimate-light`: the light of a photo as a map, as numbers and as an image."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -38,11 +39,11 @@ class EstimateLight:
         """Every file of an item's (first) face."""
         return [item.output(self.options.photo.first_tag + ending) for ending in _OUTPUTS]
 
-    def prepare(self) -> None:
-        """Load the models, before the first photo."""
+    def prepare(self, dry_run: bool) -> None:
+        """Load the models, before the first photo; in a dry run check the options only."""
         from facerf_cli.cli.items.photo_lights import prepare_light
 
-        prepare_light(self.options)
+        prepare_light(self.options, with_networks=not dry_run)
 
     def __call__(self, item: Item) -> Outcome:
         """Estimate the light of every chosen face."""
@@ -132,6 +133,12 @@ def estimate_light(
     work = EstimateLight(how, width, sh_order)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
-        "estimate-light", inputs, work, work.outputs_of, options, photo.settings, prepare=work.prepare
+        "estimate-light",
+        inputs,
+        work,
+        work.outputs_of,
+        options,
+        photo.settings,
+        prepare=partial(work.prepare, dry_run),
     )
     raise typer.Exit(code)

@@ -99,8 +99,7 @@ def transfer(
         typer.Argument(
             metavar="DATASET|PHOTO...",
             help="Folder of `facerf prepare-dataset`; or with --photos, two images of each person (A B A B "
-            "...), "
-            "or a folder of images for each person.",
+            "...), or a folder of images for each person.",
             show_default=False,
         ),
     ],
@@ -195,8 +194,7 @@ def yale_b(
             "--shifts",
             metavar="CSV",
             help="Align images by rows subject,light,dy,dx: pixels down and right that move an image onto "
-            "its "
-            "subject's frontal one.",
+            "its subject's frontal one.",
             show_default="no alignment",
         ),
     ] = None,
@@ -235,8 +233,7 @@ def pairs(
         typer.Argument(
             metavar="PREDICTIONS...",
             help="Folders of images with the names of the truths; each folder is a method. Others are "
-            "compared "
-            "with the first.",
+            "compared with the first.",
             show_default=False,
         ),
     ],
@@ -265,8 +262,7 @@ def pairs(
             "--facts",
             metavar="CSV",
             help="Read a row for each image: name, person, and columns for the tables (text) or for the list "
-            "of "
-            "images (numbers).",
+            "of images (numbers).",
             show_default="a person is a truth's topmost folder",
         ),
     ] = None,

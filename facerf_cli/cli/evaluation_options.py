@@ -29,8 +29,7 @@ ReflectanceOption = Annotated[
         "--reflectance",
         metavar="KIND",
         help="Measure field, diffuse-sh, specular-sh or prt; repeatable, and the others are compared with "
-        "the "
-        "first.",
+        "the first.",
         show_default="field",
     ),
 ]

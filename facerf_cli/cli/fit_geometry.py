@@ -41,12 +41,6 @@ class FitGeometry:
         """Every file of an item's (first) face."""
         return [item.output(self.photo.first_tag + ending) for ending in _OUTPUTS]
 
-    def prepare(self) -> None:
-        """Load the models, before the first photo."""
-        from facerf_cli.cli.items.photos import prepare_photos
-
-        prepare_photos(self.photo)
-
     def __call__(self, item: Item) -> Outcome:
         """Fit every chosen face."""
         from facerf_cli.cli.items.fit_photos import write_fits
@@ -80,6 +74,12 @@ def fit_geometry(
     work = FitGeometry(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
-        "fit-geometry", inputs, work, work.outputs_of, options, photo.settings, prepare=work.prepare
+        "fit-geometry",
+        inputs,
+        work,
+        work.outputs_of,
+        options,
+        photo.settings,
+        prepare=photo.preparation(dry_run),
     )
     raise typer.Exit(code)

@@ -10,7 +10,7 @@ from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
 Refine = Literal["none", "features"]
-MOST_LIGHTS = 1024  # in the least squares; with more, non-negative ones take minutes
+MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,10 @@ class LightOptions:
         if self.vgg_weights is not None and self.refine == "none":
             raise UsageError("--vgg-weights: used by --refine features only; give both")
         lights = parse_lights(self.rig)
-        if (lights if isinstance(lights, int) else len(lights)) > MOST_LIGHTS:
-            raise UsageError(f"--lights {self.rig}: too many lights to estimate; give {MOST_LIGHTS} at most")
+        if (lights if isinstance(lights, int) else len(lights)) > MOST_ESTIMATED:
+            raise UsageError(
+                f"--lights {self.rig}: too many lights to estimate; give {MOST_ESTIMATED} at most"
+            )
         if self.matte is not None and not self.matte.is_file():
             raise UsageError(f"--matte {self.matte}: no such file; give one that exists")
 

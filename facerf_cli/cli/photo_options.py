@@ -1,5 +1,6 @@
 """Options of every verb that reads photos: the face, its landmarks, the face model, the texture."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -54,6 +55,16 @@ class PhotoOptions:
             )
         if self.landmarks is not None and not self.landmarks.exists():
             raise UsageError(f"--landmarks {self.landmarks}: no such file or folder; give one that exists")
+
+    def preparation(self, dry_run: bool) -> Callable[[], None]:
+        """A function that loads what every photo needs; in a dry run without the networks."""
+
+        def prepare() -> None:
+            from facerf_cli.cli.items.photos import prepare_photos
+
+            prepare_photos(self, with_networks=not dry_run)
+
+        return prepare
 
     @property
     def first_tag(self) -> str:

@@ -45,12 +45,6 @@ class PredictOlat:
         """The stack and the contact sheet of the face with a tag."""
         return [item.output(f"{tag}_olat.exr"), item.output(f"{tag}_olat.png")]
 
-    def prepare(self) -> None:
-        """Load the models, before the first photo."""
-        from facerf_cli.cli.items.photos import prepare_photos
-
-        prepare_photos(self.photo)
-
     def __call__(self, item: Item) -> Outcome:
         """Predict every chosen face."""
         from facerf_cli.cli.items.olat_stacks import write_stacks
@@ -103,5 +97,7 @@ def predict_olat(
     photo.check()
     work = PredictOlat(photo, lights, pose, image, network_alone, int(memory * 2**30), precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch("predict-olat", inputs, work, work.outputs_of, options, settings, prepare=work.prepare)
+    code = run_batch(
+        "predict-olat", inputs, work, work.outputs_of, options, settings, prepare=photo.preparation(dry_run)
+    )
     raise typer.Exit(code)

@@ -17,7 +17,7 @@ from facerf_cli.cli.batch import (
     run_files,
 )
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
-from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
+from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -60,12 +60,16 @@ class Relight:
         tag = self.photo.first_tag
         return [setup.output(item, tag, suffix) for setup in self.setups for suffix in (".exr", ".png")]
 
-    def readable(self) -> "Relight":
-        """Load the models, and keep the setups whose maps can be read."""
-        from facerf_cli.cli.items.light_weights import readable
-        from facerf_cli.cli.items.photos import prepare_photos
+    def readable(self, dry_run: bool) -> "Relight":
+        """Load the models, and keep the setups whose maps can be read.
 
-        prepare_photos(self.photo)
+        A dry run loads no networks, and so estimates no light of a photo.
+        """
+        from facerf_cli.cli.items.light_weights import readable
+
+        self.photo.preparation(dry_run)()
+        if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
+            return self
         setups = readable(self.setups)
         if not setups:
             raise FacerfError("no map can be read; give others")
@@ -233,8 +237,8 @@ def relight(
     )
     options = BatchOptions(output, overwrite, dry_run, jobs)
     items = collect_items(inputs, output, PHOTO_SUFFIXES)
-    todo = not dry_run and not all_finished(items, work.outputs_of, options, settings)
-    usable = work.readable() if todo else work
+    finished = all_finished(items, work.outputs_of, options, settings)
+    usable = work if finished else work.readable(dry_run)
     code = run_files("relight", items, usable, usable.outputs_of, options, settings)
     if ball and not dry_run and settings.shard.number == 1:
         _write_balls(usable, options)
@@ -243,15 +247,16 @@ def relight(
 
 def _write_balls(work: Relight, options: BatchOptions) -> None:
     """Write the balls under each map to `balls/NAME.exr` and `.png`, unless they are there."""
-    folder = options.output / "balls"
-    missing = {
-        setup: path
-        for setup in work.setups
-        if (path := folder / f"{setup.name}{setup.frame}.exr")
-        and setup.envmap is not None
-        and (options.overwrite or not path.with_suffix(".png").exists())
-    }
-    if missing:
-        from facerf_cli.cli.items.light_weights import write_balls
 
-        write_balls(list(missing), list(missing.values()), work.exposure_ev)
+    def path_of(setup: LightSetup) -> Path:
+        return options.output / "balls" / f"{setup.name}{setup.frame}.exr"
+
+    maps = [setup for setup in work.setups if setup.envmap is not None]
+    missing = [
+        setup for setup in maps if options.overwrite or not path_of(setup).with_suffix(".png").exists()
+    ]
+    if missing:
+        from facerf_cli.cli.items.light_weights import readable, write_balls
+
+        drawn = readable(missing)
+        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure_ev)

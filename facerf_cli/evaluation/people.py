@@ -11,6 +11,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path
 from facerf_cli.dataset.relight import render_source
 from facerf_cli.dataset.weights import load_pairs, pair_weights, weights_path
+from facerf_cli.errors import InputError
 from facerf_cli.evaluation.crop_view import CropView
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, fit_from_arrays, fit_landmarks
@@ -55,9 +56,11 @@ class Person:
             fit = _in_own_frame(fit_from_arrays(header.fit))
             if self.refit:
                 fit = refitted(self.model, fit)
-            self._crops[camera] = CameraCrop(
-                header, CropView.of(self.model, fit, header.seen, self.keep_eyes)
-            )
+            try:
+                view = CropView.of(self.model, fit, header.seen, self.keep_eyes)
+            except InputError as error:
+                raise InputError(f"{self.name}/{camera}: {error}") from None
+            self._crops[camera] = CameraCrop(header, view)
         return self._crops[camera]
 
     def posed_as(self, fit: FaceFit, camera: str) -> CameraCrop:
@@ -120,7 +123,7 @@ def refitted(model: MorphableModel, fit: FaceFit) -> FaceFit:
 
 
 def _in_own_frame(fit: FaceFit) -> FaceFit:
-    """The fit with its crop as an image of its own: the crop's pixels are the photo's."""
+    """The fit with its crop as a separate image: the crop's pixels are the photo's."""
     side_px = fit.crop.size_px
     return replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px))
 

@@ -77,6 +77,10 @@ class FaceFit:
         """'good' up to an error of `GOOD_ERROR_IOD`, 'fair' up to `FAIR_ERROR_IOD`, else 'poor'."""
         return quality_of(self.error_iod)
 
+    def turn_to(self, rotation: Tensor) -> Tensor:
+        """The rotation [3, 3] of camera-space vectors from this pose to another, head_to_camera [3, 3]."""
+        return rotation @ self.rotation.T
+
     def vertices_camera(self, model: MorphableModel) -> Tensor:
         """The mesh in camera space [V, 3]; raises ValueError unless `model` is the fitted model."""
         if (model.name, len(model.identity), len(model.expression)) != (

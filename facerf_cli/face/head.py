@@ -46,8 +46,10 @@ class Head:
         vertices = self.fit.vertices_camera(model)
         kept = unwrap(image, vertices, grid_triangles(), self.fit.camera, side)[0][0]
         visible = self.face.visible * (kept > _SEEN_WELL)
+        if torch.equal(visible, self.face.visible):
+            return self
         if visible.max() < 0.5:
-            raise InputError("the face is masked out: nothing of it is left to look at; give another matte")
+            raise InputError("the face is masked out: no part of it is left; give another matte")
         texture = inpaint(self.face.texture, visible)
         return replace(self, face=replace(self.face, texture=texture, visible=visible))
 

@@ -15,7 +15,7 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
 
 _TINY = 1e-8
-FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
+_FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
 _MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
 
 
@@ -73,7 +73,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     inside = (mask * coverage > 0.02).numpy()
     if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
-        mask = mask * smooth(edge_px / max(FEATHER * side_px, 1))
+        mask = mask * smooth(edge_px / max(_FEATHER * side_px, 1))
     unit = F.normalize(normal, dim=-1)
     return FaceView(camera.height_px, camera.width_px, top, left, uv, unit, position_m, coverage, mask)
 

@@ -13,6 +13,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
@@ -226,3 +227,44 @@ def test_procedural_maps_by_seed(given: Path, tmp_path: Path, capsys: pytest.Cap
     assert read_image(tmp_path / f"{names[0]}.exr").pixels.max() > 0
     assert relight(given, tmp_path, "--envmap", "procedural:none") == 2
     assert "write procedural:N" in capsys.readouterr().err
+
+
+def test_the_network_alone(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is another image and another stack, which say so; a stack that was predicted keeps what it holds."""
+    for folder, line in (("corrected", []), ("alone", ["--network-alone"])):
+        assert relight(given, tmp_path / folder, "--light", "40,10", *line) == 0
+    corrected, alone = (
+        read_image(tmp_path / folder / "astronaut_light_40_10.exr") for folder in ("corrected", "alone")
+    )
+    assert np.abs(corrected.pixels - alone.pixels).max() > 0.01
+    assert "facerf:network_alone" in alone.metadata and "facerf:network_alone" not in corrected.metadata
+    checkpoint, landmarks = str(given / "lambert.safetensors"), str(given / "astronaut.json")
+    stack = [
+        "predict-olat",
+        str(PHOTO),
+        "--lights",
+        "4",
+        "--landmarks",
+        landmarks,
+        "-o",
+        str(tmp_path / "olat"),
+    ]
+    assert main(["--checkpoint", checkpoint, *stack, "--network-alone"]) == 0
+    stack_path = tmp_path / "olat/astronaut_olat.exr"
+    assert "facerf:network_alone" in read_olat_header(stack_path).metadata
+    assert relight(given, tmp_path / "c", "--light", "1,2", "--network-alone", photo=stack_path) == 1
+    assert "a stack holds the field as predicted" in capsys.readouterr().err
+    assert relight(given, tmp_path / "d", "--light", "1,2", "--network-alone", "--reflectance", "prt") == 2
+
+
+def test_a_dry_run_checks_what_a_run_would_load(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.exr").write_text("no map")
+    line = ["--light", "1,2", "--dry-run"]
+    assert relight(given, tmp_path / "out", *line, "--envmap", str(tmp_path / "bad.exr")) == 1
+    said = capsys.readouterr()
+    assert "bad.exr" in said.err and "bad" not in said.out
+    assert relight(given, tmp_path / "out", *line, "--input-colourspace", "nope") == 2
+    assert relight(given, tmp_path / "out", *line, "--face-model", "nope.npz") == 1
+    assert not (tmp_path / "out").exists()

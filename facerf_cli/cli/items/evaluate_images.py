@@ -3,12 +3,13 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.items.evaluation import MethodOptions, load_methods
+from facerf_cli.cli.items.evaluation import MethodOptions, load_methods, prepare_methods
 from facerf_cli.cli.items.evaluation_run import run_protocol
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
@@ -33,10 +34,12 @@ def run_yale_b(
     """Measure the subjects of Extended Yale B, all if none are named; the exit code."""
     database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
     chosen = _chosen(database, subjects)
-    work = _YaleB(MethodOptions.of(photo, options), database, network_alone)
+    methods = MethodOptions.of(photo, options)
+    work = _YaleB(methods, database, network_alone)
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
     tables = layout(database, chosen, network_alone)
-    return run_protocol(tables, items, work, options, photo.settings, photo)
+    prepare = partial(prepare_methods, methods, options)
+    return run_protocol(tables, items, work, options, photo.settings, photo, prepare)
 
 
 def _chosen(database: YaleB, given: Sequence[str]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from facerf_cli.cli.batch import Item
@@ -9,9 +10,9 @@ from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     every_nth,
-    load_before,
     load_methods,
     people_items,
+    prepare_methods,
     read_split,
     require_enough,
 )
@@ -41,7 +42,6 @@ def run_olat(
     prepared, pairs = read_split(dataset, split, photo.face_model, refit)
     chosen = _paper_pairs(dataset, pairs) if options.preset else every_nth(pairs, every)
     methods = MethodOptions.of(photo, options)
-    load_before(methods, options)
     work = _Olat(methods, prepared, chosen, options.keep_eyes, refit, network_alone)
     layout = Layout(
         name="olat",
@@ -52,7 +52,8 @@ def run_olat(
         notes=_notes(split, refit, network_alone),
     )
     items = people_items(dataset, list(chosen), options.output)
-    return run_protocol(layout, items, work, options, photo.settings, photo)
+    prepare = partial(prepare_methods, methods, options)
+    return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
 def _notes(split: str, refit: bool, network_alone: bool) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 from facerf_cli.cli.batch import Item
@@ -10,11 +10,11 @@ from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     chosen_sources,
-    load_before,
     load_methods,
     people_items,
     photo_items,
     portraits,
+    prepare_methods,
     read_split,
 )
 from facerf_cli.cli.items.evaluation_run import run_protocol
@@ -64,8 +64,8 @@ def run_reconstruction(
             *(() if folder else ("Each photo counts as a person.",)),
         ),
     )
-    load_before(methods, options)
-    return run_protocol(layout, items, work, options, photo.settings, photo)
+    prepare = partial(prepare_methods, methods, options)
+    return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +126,13 @@ def run_geometry(
         published=TABLE_4,
         notes=(f"The mean face is rendered by {trained}; both are compared where both show the face.",),
     )
-    if not options.dry_run:
-        _mean_methods(forms)  # an error of a checkpoint is reported once
-    return run_protocol(layout, items, work, options, photo.settings, photo)
+
+    def prepare() -> None:
+        prepare_methods(forms.methods, options)
+        if not options.dry_run:
+            _mean_methods(forms)
+
+    return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
 @dataclass(frozen=True)

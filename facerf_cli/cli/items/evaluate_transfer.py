@@ -3,16 +3,17 @@
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items, expand_stdin
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
-    load_before,
     load_methods,
     people_items,
     portraits,
+    prepare_methods,
     read_split,
     require_enough,
 )
@@ -62,8 +63,8 @@ def run_transfer(
         published=TABLE_2_TRANSFER,
         notes=_notes(folder is None, network_alone),
     )
-    load_before(methods, options)
-    return run_protocol(layout, items, work, options, photo.settings, photo)
+    prepare = partial(prepare_methods, methods, options)
+    return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
 def _notes(photos: bool, network_alone: bool) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from facerf_cli.baselines import Kind
 from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items.photos import face_model as face_model_of
-from facerf_cli.cli.items.photos import fit_faces, load_models_once, read_photo
+from facerf_cli.cli.items.photos import fit_faces, load_models_once, prepare_photos, read_photo
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, read_pairs
@@ -47,8 +47,12 @@ def load_methods(options: MethodOptions) -> tuple[Method, ...]:
     )
 
 
-def load_before(methods: MethodOptions, options: EvaluateOptions) -> None:
-    """Load the methods before any item, so that an error of a checkpoint is reported once."""
+def prepare_methods(methods: MethodOptions, options: EvaluateOptions) -> None:
+    """Load the methods before any item, so that an error of an option or a checkpoint is reported once.
+
+    A dry run checks the options only.
+    """
+    prepare_photos(methods.photo, with_networks=False)
     if not options.dry_run:
         load_methods(methods)
 

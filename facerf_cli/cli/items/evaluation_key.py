@@ -1,4 +1,4 @@
-"""Keys that tell what figures depend on, so that one table never mixes two ways of measuring."""
+"""Keys of all that figures depend on, so that one table never mixes two ways of measuring."""
 
 import dataclasses
 import hashlib
@@ -17,6 +17,7 @@ from facerf_cli.models import DEFAULT_CHECKPOINT
 # Fields that change no figure; and fields that hold a name or a file's path.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
 _WITHOUT_EFFECT |= {"shard", "ray", "output_base"}
+_MEASURING = 2  # raised when the same options give other figures
 _NAME_OR_PATH = {"face_model", "vgg_weights"}
 
 
@@ -26,6 +27,7 @@ def evaluation_key(
     """16 digits that depend on all that figures depend on: version, protocol, settings, options, networks."""
     facts = {
         "version": __version__,
+        "measuring": _MEASURING,
         "protocol": protocol,
         "compare": _plain(compare),
         "options": _plain(options),

@@ -38,8 +38,10 @@ from facerf_cli.files.images import write_exr
 from facerf_cli.logs import LOGGER_NAME, Provenance, json_line
 from facerf_cli.models import DEFAULT_CHECKPOINT
 
+CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
 KEPT, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
+log = logging.getLogger(LOGGER_NAME)
 
 
 def keep_images(
@@ -84,7 +86,7 @@ def _place(kind: str, case: str) -> str:
 
 def keep_strips(
     strips: Mapping[str, Strip], folder: Path, item: str, settings: Settings, stamp: Mapping[str, str]
-) -> "tuple[KeptStrip, ...]":
+) -> tuple[KeptStrip, ...]:
     """Write an item's strips to FOLDER/strips/ITEM/NUMBER.jpg, in place of older ones."""
     place = folder / STRIPS / item
     for old in place.glob("[0-9][0-9][0-9].jpg"):
@@ -105,10 +107,6 @@ def _write_strip(path: Path, strip: Strip, made: Provenance) -> None:
         embed_xmp(temporary, made.attributes())
 
 
-CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
-log = logging.getLogger(LOGGER_NAME)
-
-
 def run_protocol(
     protocol: Layout,
     items: Sequence[Item],
@@ -116,6 +114,7 @@ def run_protocol(
     options: EvaluateOptions,
     settings: Settings,
     photo: PhotoOptions | None = None,
+    prepare: Callable[[], object] | None = None,
 ) -> int:
     """Measure the items and write their tables; return the exit code, 0 done, 1 some failed.
 
@@ -123,7 +122,8 @@ def run_protocol(
     item's rows are DIR/cases/ITEM.json, so finished items are skipped and an interrupted run continues; an
     item is unfinished if a strip or image that it kept is gone. At the end: DIR/summary.json, DIR/images.csv,
     DIR/report.html, and a table on stdout. If an item failed or a prediction is missing, each is named and no
-    summary is written. `photo` has the face model of the images; they and the summary name it.
+    summary is written. `photo` has the face model of the images; they and the summary name it. `prepare`
+    loads what the items need; it is not called where all are finished.
     """
     if not items:
         raise UsageError(f"evaluate {protocol.name}: nothing to evaluate; give other inputs")
@@ -131,11 +131,16 @@ def run_protocol(
     work = _Measure(protocol.metrics[0], compare, options, settings, photo, key)
     _check_earlier(items, work)
     batch = BatchOptions(options.output, options.overwrite, options.dry_run, options.jobs)
-    if not options.dry_run:
-        _measures(options).check()  # fails before anything is measured
-        for name in (SUMMARY, IMAGES, PAGE):  # they are about to be out of date
-            (options.output / name).unlink(missing_ok=True)
-    code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings)
+
+    def begin() -> None:
+        if prepare:
+            prepare()
+        if not options.dry_run:
+            _measures(options).check()  # fails before anything is measured
+            for name in (SUMMARY, IMAGES, PAGE):  # they are about to be out of date
+                (options.output / name).unlink(missing_ok=True)
+
+    code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings, begin)
     if code:
         log.error("no summary is written while images are missing; finished items are kept, so run it again")
     elif not options.dry_run and sums_up(items, work.outputs_of, batch, settings):

@@ -60,7 +60,7 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
 def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
     """Directions [L, 3] and rgb weights [M, L, 3] of M setups.
 
-    Maps are integrated over the rig's lights; single lights follow them as lights of their own.
+    Maps are integrated over the rig's lights; single lights follow them as additional lights.
     """
     single = [(row, light) for row, setup in enumerate(setups) for light in setup.lights]
     directions = directions_of(rig) if any(setup.envmap for setup in setups) else torch.zeros(0, 3)

@@ -54,7 +54,7 @@ def _olats(
 ) -> Iterator[Tensor]:
     """Yield OLATs in batches [l, 3, H, W], textures or images; small images [l, h, w, 3] go to `tiles`."""
     models = load_models_once(work.photo)
-    large, small = _see(face, work), _see(face, work, 2 * _TILE_PX)
+    large, small = _uv_and_coverage(face, work), _uv_and_coverage(face, work, 2 * _TILE_PX)
     olats = predict_olat(
         models,
         face.head,
@@ -69,7 +69,9 @@ def _olats(
         yield render_face(textures, *large) if work.image else textures
 
 
-def _see(face: FittedFace, work: PredictOlat, side_px: int | None = None) -> tuple[Tensor, Tensor]:
+def _uv_and_coverage(
+    face: FittedFace, work: PredictOlat, side_px: int | None = None
+) -> tuple[Tensor, Tensor]:
     """`see_face` in the asked pose, by the crop's camera, its image `side_px` wide."""
     vertices = _posed(face, work).vertices_camera(load_models_once(work.photo).face)
     return see_face(vertices, crop_camera(side_px or face.fit.crop.size_px))
@@ -84,11 +86,13 @@ def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat)
     posed, uv_maps = _posed(face, work), face.head.face
     source, normals, seen = uv_maps.texture, uv_maps.normals, uv_maps.visible
     if work.image:
-        uv, seen = _see(face, work)
-        turn = posed.rotation @ face.fit.rotation.T
+        uv, seen = _uv_and_coverage(face, work)
+        turn = face.fit.turn_to(posed.rotation)
         both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
         source, normals = render_face(both, uv, seen)
     metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    if work.network_alone:
+        metadata["facerf:network_alone"] = 1
     return StackHeader(
         kind="image" if work.image else "texture",
         directions=directions.numpy(),

@@ -35,10 +35,10 @@ _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
 log = logging.getLogger(LOGGER_NAME)
 
 
-def prepare_light(options: LightOptions) -> None:
+def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
     """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
-    prepare_photos(options.photo)
-    if options.refine == "features":
+    prepare_photos(options.photo, with_networks)
+    if with_networks and options.refine == "features":
         _feature_network(options.vgg_weights)
 
 

@@ -99,8 +99,10 @@ def _relight_face(
     metadata = provenance(item, work.photo, models.checkpoint_name)
     if work.reflectance != "field":
         metadata["facerf:reflectance"] = work.reflectance
+    if work.network_alone:
+        metadata["facerf:network_alone"] = 1
     alpha = image.alpha if work.composite == "photo" else None
-    bytes_each = head.face.texture.nbytes
+    bytes_each = head.face.texture.nbytes + (composition.surround.nbytes if composition.surround else 0)
     shown = _Shown(composition, directions, weights, relit, bytes_each, alpha)
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
@@ -109,8 +111,9 @@ def _target(fit: FaceFit, image: LinearImage, work: Relight) -> Target:
     """The head in the pose of `--pose`, composed as the options choose."""
     rotation = rotation_of(work.pose)
     posed = None if rotation is None else replace(fit, rotation=rotation)
-    in_photo = work.matte is not None and work.composite == "photo"
-    matte = read_matte(work.matte, image.pixels.shape[:2]) if in_photo and work.matte else None
+    if work.matte is None or work.composite != "photo":
+        return Target(posed, work.composite, work.keep_background)
+    matte = read_matte(work.matte, image.pixels.shape[:2])
     return Target(posed, work.composite, work.keep_background, matte)
 
 
@@ -121,6 +124,8 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         )
     if work.reflectance != "field":
         raise InputError(f"{item.input_path}: a stack holds the field; for {work.reflectance} give its photo")
+    if work.network_alone:
+        raise InputError(f"{item.input_path}: a stack holds the field as predicted; give its photo")
     stack = read_olat_stack(item.input_path)
     composer, facts = _stack_composer(item, stack, work)
     directions = torch.from_numpy(stack.header.directions).float()
@@ -176,7 +181,7 @@ def _write_setups(
 ) -> Iterator[tuple[Path, float]]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
 
-    Where they do not fit at once, automatic exposure needs a prediction of its own.
+    Where they do not fit at once, automatic exposure needs a second prediction.
     """
     at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
     parts = [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]

@@ -204,6 +204,8 @@ def _reflectance_network(options: TrainOptions) -> Any:
     try:
         return make_reflectance_network(options.form, **settings, **ablation)
     except TypeError:
+        if not options.without_normals:
+            raise
         raise UsageError(
             f"--without-normals: the form {options.form} has no setting normals; leave it out"
         ) from None

@@ -49,7 +49,7 @@ def compare_olats(
         crop = person.posed_as(fit, pair.target_camera)
         light = torch.from_numpy(crop.header.directions[pair.target_light]).float()
         same_pose = pair.source_camera == pair.target_camera
-        asked = _Question(light, crop.view.fit.rotation @ fit.rotation.T, crop, same_pose)
+        asked = _Question(light, fit.turn_to(crop.view.fit.rotation), crop, same_pose)
         yield _compare(person, pair, asked, methods, network_alone)
 
 

@@ -44,7 +44,7 @@ def reconstruct(
 def reconstruction(method: Method, head: Head) -> tuple[np.ndarray, RigLight]:
     """The face rendered by its own reflectance under its own light [S, S, 3], and that light."""
     explained = method.explained(head)
-    target = Target(head.fit, "face")
+    target = Target(composite="face")
     return method.image(head, explained.reflectance, explained.light, target), explained.light
 
 

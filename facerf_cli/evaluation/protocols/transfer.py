@@ -53,7 +53,7 @@ def _rendered(
         method.name: method.image(other.head, others[method.name].reflectance, own[method.name].light, target)
         for method in methods
     }
-    turn_deg = angle_of(view.fit.rotation @ other.view.fit.rotation.T)
+    turn_deg = angle_of(other.view.fit.turn_to(view.fit.rotation))
     facts = {**side.case.facts, "turn": turn_class(turn_deg), "turn_deg": turn_deg}
     return Comparison(
         replace(side.case, facts=facts),
