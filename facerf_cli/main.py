@@ -23,7 +23,7 @@ from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.options import DeviceName, Settings, with_machines
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, DeviceName, Settings, with_machines
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
@@ -49,11 +49,6 @@ VERBS: tuple[Callable[..., Any], ...] = (
 # Verbs with subcommands.
 GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
-EPILOG = (
-    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
-    "the verb."
-)
-HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 # Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})
 VALUED = frozenset({"--device", "--checkpoint", "--seed"})

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.light_options import LightOptions, Refine
 from facerf_cli.cli.options import (
     DryRunOption,

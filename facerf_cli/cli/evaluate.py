@@ -20,6 +20,8 @@ from facerf_cli.cli.evaluation_options import (
     with_shared_options,
 )
 from facerf_cli.cli.options import (
+    EPILOG,
+    HELP_NAMES,
     FaceModelOption,
     InputColourspaceOption,
     NetworkAloneOption,
@@ -30,10 +32,6 @@ from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptio
 from facerf_cli.errors import UsageError
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
-_EPILOG = (
-    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
-    "the verb."
-)
 
 
 def olat(
@@ -293,4 +291,4 @@ _PROTOCOLS: tuple[tuple[Callable[..., int], tuple[str, ...]], ...] = (
 
 for _function, _left_out in _PROTOCOLS:
     _command = with_machines(with_shared_options(_function, _left_out))
-    app.command(epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})(_command)
+    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(_command)

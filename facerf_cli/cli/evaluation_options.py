@@ -177,7 +177,7 @@ def _evaluate_options(
     dry_run: DryRunOption = False,
 ) -> EvaluateOptions:
     """Collect the shared options; a command's signature ends with these parameters."""
-    given = EvaluateOptions(
+    return EvaluateOptions(
         output,
         _kinds(reflectance or ["field"]),
         tuple(against or ()),
@@ -187,8 +187,11 @@ def _evaluate_options(
         space=space,
         lpips=lpips,
         vgg_weights=vgg_weights,
+        preset=preset,
+        jobs=jobs,
+        overwrite=overwrite,
+        dry_run=dry_run,
     )
-    return replace(given, preset=preset, jobs=jobs, overwrite=overwrite, dry_run=dry_run)
 
 
 def _kinds(given: Sequence[str]) -> tuple[Kind, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.values import azel, numbers
 from facerf_cli.errors import UsageError

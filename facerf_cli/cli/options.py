@@ -12,6 +12,12 @@ from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
 
 T = TypeVar("T")
+EPILOG = (
+    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
+    "the verb."
+)
+HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 
 

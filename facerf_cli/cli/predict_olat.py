@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,

@@ -7,15 +7,8 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import (
-    PHOTO_SUFFIXES,
-    BatchOptions,
-    Item,
-    Outcome,
-    all_finished,
-    collect_items,
-    run_files,
-)
+from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.options import (

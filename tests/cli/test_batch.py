@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, BatchOptions, Item, Outcome, collect_items, run_batch
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.options import Settings
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
 from facerf_cli.cli.items.evaluation import MethodOptions, portraits
 from facerf_cli.cli.items.photos import load_models_once

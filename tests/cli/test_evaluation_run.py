@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items import evaluation_run
 from facerf_cli.cli.items.evaluate_transfer import _Couple, _TransferPhotos
 from facerf_cli.cli.items.evaluation import MethodOptions

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
 from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations, split_frame
 from facerf_cli.cli.values import parse_lights

@@ -9,7 +9,8 @@ import pytest
 import typer
 
 from facerf_cli import main
-from facerf_cli.cli.batch import BatchOptions, Item, sums_up
+from facerf_cli.cli.batch import BatchOptions, sums_up
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import JobsOption, Settings, Shard, settings_of, with_machines
 from facerf_cli.errors import UsageError
 from facerf_cli.logs import configure_logging

@@ -9,7 +9,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path

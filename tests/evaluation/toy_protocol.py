@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation_run import run_protocol
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions

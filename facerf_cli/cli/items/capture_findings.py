@@ -19,7 +19,7 @@ from rich.text import Text
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.findings import Finding, stopping
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, workers_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli import __version__
-from facerf_cli.cli.batch import Item
 from facerf_cli.cli.convert_light import Axes, ConvertLight, Form
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import directions_of
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.light_files import (

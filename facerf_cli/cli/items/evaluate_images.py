@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
-from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation import MethodOptions, load_methods, prepare_methods
 from facerf_cli.cli.items.evaluation_run import run_protocol
 from facerf_cli.cli.options import Settings

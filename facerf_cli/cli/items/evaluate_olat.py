@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from facerf_cli.cli.batch import Item
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     every_nth,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items, expand_stdin
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_stdin
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     load_methods,

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.items.photos import face_model as face_model_of
 from facerf_cli.cli.items.photos import fit_faces, load_models_once, prepare_photos, read_photo
 from facerf_cli.cli.photo_options import PhotoOptions

@@ -13,8 +13,9 @@ import numpy as np
 from PIL import Image
 
 from facerf_cli import __version__
-from facerf_cli.cli.batch import BatchOptions, Item, Outcome, run_items, sums_up
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.cli.evaluation_options import EvaluateOptions
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation_key import evaluation_key, item_key, networks_of
 from facerf_cli.cli.items.photos import face_model
 from facerf_cli.cli.options import Settings

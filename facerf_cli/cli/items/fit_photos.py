@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import FittedFace, face_model, facts_of, fit_faces, provenance, read_photo
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.colour import srgb_to_linear

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import (
     FittedFace,
     directions_of,

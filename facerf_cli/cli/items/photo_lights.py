@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.light_image import draw_estimate
 from facerf_cli.cli.items.photos import (
     FittedFace,

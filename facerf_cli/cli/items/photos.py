@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose

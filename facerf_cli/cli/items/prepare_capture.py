@@ -17,7 +17,8 @@ from facerf_cli.capture.draft import as_text, draft_stage
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.select import Selection, has_new_frames, select_frames
 from facerf_cli.capture.stage_json import STAGE_FILE
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, BatchOptions, Item, Outcome, run_items, sums_up
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.capture_findings import (
     CheckOnly,
     check,

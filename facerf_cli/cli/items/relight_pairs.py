@@ -7,7 +7,8 @@ from typing import Any
 
 from rich.progress import track
 
-from facerf_cli.cli.batch import BatchOptions, Item, Outcome, collect_items, run_items
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_items
+from facerf_cli.cli.inputs import Item, collect_items
 from facerf_cli.cli.lights import MAP_SUFFIXES
 from facerf_cli.cli.options import Settings, workers_of
 from facerf_cli.cli.relight_dataset import RelightDataset

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.cli.batch import Item
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.light_weights import weights_over_rig, weights_over_stack
 from facerf_cli.cli.items.photos import (
     FittedFace,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from facerf_cli.cli.batch import PHOTO_SUFFIXES, collect_items
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.train import TrainOptions
