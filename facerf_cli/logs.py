@@ -2,7 +2,6 @@
 
 import json
 import logging
-import logging.handlers
 import math
 import sys
 from collections.abc import Mapping
@@ -137,8 +136,10 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
 
 def log_to_queue(queue: Any, level: int) -> None:
     """Send this process's log, from a level on, to a queue only: any object with `put_nowait`."""
+    from logging.handlers import QueueHandler  # --help does without it
+
     logger = logging.getLogger(LOGGER_NAME)
-    logger.handlers[:] = [logging.handlers.QueueHandler(queue)]
+    logger.handlers[:] = [QueueHandler(queue)]
     logger.propagate = False
     logger.setLevel(level)
 

@@ -1,7 +1,6 @@
 """Process items one after another, in processes of this machine (`--jobs`), or as tasks of Ray (`--ray`)."""
 
 import logging
-import multiprocessing
 import os
 import signal
 import sys
@@ -10,7 +9,6 @@ from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import wait
 from typing import Any, TypeVar
 
 from facerf_cli.errors import FacerfError
@@ -38,6 +36,8 @@ def in_processes(
 
     Each process has its own pipe: a lock or a queue that processes share could stay locked by a killed one.
     """
+    from multiprocessing.connection import wait  # --help does without it
+
     waiting = deque(range(len(items)))
     workers: dict[Any, _Worker] = {}
     try:
@@ -68,6 +68,8 @@ def in_processes(
 
 def _start_worker(workers: dict[Any, _Worker], jobs: int) -> None:
     """Start one more process; it sends "ready" when it can receive the work and items."""
+    import multiprocessing
+
     spawn = multiprocessing.get_context("spawn")  # torch does not survive a fork once its threads run
     ours, theirs = spawn.Pipe()
     level = logging.getLogger(LOGGER_NAME).level

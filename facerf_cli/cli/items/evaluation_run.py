@@ -138,15 +138,21 @@ def run_protocol(
             prepare()
         if not options.dry_run:
             _measures(options).check()  # fails before anything is measured
-            for name in (SUMMARY, IMAGES, PAGE):  # they are about to be out of date
-                (options.output / name).unlink(missing_ok=True)
+            _remove_summary(options.output)
 
     code = run_items(f"evaluate {protocol.name}", items, work, work.outputs_of, batch, settings, begin)
     if code:
         log.error("no summary is written while images are missing; finished items are kept, so run it again")
     elif not options.dry_run and sums_up(items, work.outputs_of, batch, settings):
+        _remove_summary(options.output)
         _finish(protocol, items, work)
     return code
+
+
+def _remove_summary(folder: Path) -> None:
+    """Remove the tables of an earlier run, which are about to be out of date."""
+    for name in (SUMMARY, IMAGES, PAGE):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _check_earlier(items: Sequence[Item], work: "_Measure") -> None:
