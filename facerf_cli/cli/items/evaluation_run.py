@@ -34,6 +34,7 @@ from facerf_cli.evaluation.report_html import About, choose, page
 from facerf_cli.evaluation.strips import Strip, StripKeeper, strip_of
 from facerf_cli.evaluation.summary import Layout, Summary, print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.documents import json_text
 from facerf_cli.files.image_metadata import embed_xmp
 from facerf_cli.files.images import write_exr
 from facerf_cli.logs import LOGGER_NAME, Provenance, json_line
@@ -281,7 +282,7 @@ def _write_documents(
     jpegs = {case.strip.case: (folder / case.strip.file).read_bytes() for case in chosen.all()}
     content = {"facerf": about.version, "command": about.command, **about.facts, **summary.as_dict()}
     texts = {PAGE: page(summary, about, chosen, jpegs)}
-    texts[SUMMARY] = json.dumps(json.loads(json_line(content)), ensure_ascii=False, indent=1) + "\n"
+    texts[SUMMARY] = json_text(json.loads(json_line(content)), indent=1) + "\n"
     for name, text in texts.items():
         with atomic_path(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
