@@ -35,7 +35,7 @@ from facerf_cli.metrics import light_error_deg
 from facerf_cli.models import DEFAULT_CHECKPOINT, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.pipeline import estimate_light, fit_photo, reflectance_of, relit_by
-from facerf_cli.training.pretrained import load_light_features
+from facerf_cli.training.pretrained import load_features
 
 TURNS_DEG = (0, 120)  # of each map
 SINGLE_LIGHTS, FILL = 6, 0.15  # FILL is the light in front, of a key light of about 1
@@ -65,7 +65,7 @@ def main() -> None:
     torch.set_num_threads(1)
     lights = [*single_lights(given.seed), *map_lights(given.maps)][: given.lights]
     models = load_models(None, "builtin", torch.device("cpu"))
-    features = load_light_features(LIGHT_FEATURES) if given.refine else None
+    features = load_features(LIGHT_FEATURES, "light_features") if given.refine else None
     rows: dict[tuple[str, str], list[dict[str, float]]] = {}
     for photo in photos(given.photos):
         for light, (source, method, weights) in estimates(models, photo, lights, features):

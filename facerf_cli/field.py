@@ -15,7 +15,7 @@ from facerf_cli.light.estimate import LightEvidence, estimate_weights
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models
-from facerf_cli.network.inputs import colour_cast
+from facerf_cli.network.inputs import without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
@@ -49,7 +49,7 @@ class Field:
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals = normals[None].to(device)
         visible = face.visible[None, None]
-        texture = face.texture[None] / colour_cast(face.texture[None], visible)
+        texture = without_cast(face.texture[None], visible, self.models.source_colours)
         source = (texture, face.normals[None], visible)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
             encoded = network.encode(*(tensor.to(device) for tensor in source))

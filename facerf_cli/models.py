@@ -12,6 +12,7 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.inputs import SourceColours
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
@@ -31,6 +32,7 @@ class Models:
     checkpoint_name: str
     metadata: dict[str, Any]
     device: torch.device
+    source_colours: SourceColours | None = None  # of the network's training; None: no cast is removed
 
 
 def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
@@ -52,7 +54,17 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
         checkpoint_name=path.stem,
         metadata=metadata,
         device=device,
+        source_colours=_source_colours(path, metadata),
     )
+
+
+def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | None:
+    if "source_colours" not in metadata:
+        return None
+    try:
+        return SourceColours.from_metadata(metadata["source_colours"])
+    except (LookupError, TypeError, ValueError):
+        raise InputError(f"{path}: invalid source_colours in its metadata; train it again") from None
 
 
 def _require_builtin_coefficients(path: Path, geometry: Any) -> None:

@@ -11,19 +11,21 @@ import typer
 
 from facerf_cli.cli.options import Settings, flag, settings_of, was_given
 from facerf_cli.errors import UsageError
-from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings
+from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
+_CROP_STAGES = ("joint", "appearance-features")  # which read a dataset's crops
 _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
+    "appearance_features": ("joint",),
     "photos": ("joint",),
     "light_features": ("joint", "reflectance"),
     "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),
     "mean_face": ("joint", "reflectance"),
     "views": _TEXTURE_STAGES,
-    "texture_size": _TEXTURE_STAGES,
-    "dataset": (*_TEXTURE_STAGES, "joint"),
+    "texture_size": (*_TEXTURE_STAGES, *_CROP_STAGES),
+    "dataset": (*_TEXTURE_STAGES, *_CROP_STAGES),
     "fit_with": _TEXTURE_STAGES,
     "heads_from": (*_TEXTURE_STAGES, "geometry"),
     "heads": (*_TEXTURE_STAGES, "geometry"),
@@ -62,9 +64,10 @@ class TrainOptions:
     heads: int | None
     views: int | None
     bank: Path | None
-    texture_size: int
+    texture_size: int | None
     photos: Path | None
     vgg_weights: str | None
+    appearance_features: Path | None
     light_features: Path | None
     without_normals: bool
     mean_face: bool
@@ -97,8 +100,8 @@ def train(
         _run(
             help="Train the networks of a stage. reflectance: the Reflectance Network, on textures; "
             "geometry: the Geometry Network, on rendered heads; joint: both, through the rasterizer; "
-            "light-features: "
-            "the network of --light-features; diffuse-sh: the network of that baseline.",
+            "light-features, appearance-features: the networks of those options; diffuse-sh: the network "
+            "of that baseline.",
             show_default="joint with --preset paper, else reflectance",
         ),
     ] = None,
@@ -123,8 +126,16 @@ def train(
         ),
     ] = None,
     texture_size: Annotated[
-        int, _data(min=32, max=1024, metavar="PX", help="Unwrap a dataset to textures of this side.")
-    ] = 128,
+        int | None,
+        _data(
+            min=32,
+            max=1024,
+            metavar="PX",
+            help="Unwrap a dataset to textures of this side; the stages joint and appearance-features read "
+            "its crops at this side, too.",
+            show_default="128, joint 256; with --preset paper 512",
+        ),
+    ] = None,
     photos: Annotated[
         Path | None,
         _data(
@@ -176,6 +187,14 @@ def train(
             metavar="imagenet|PATH",
             help="Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a "
             "file.",
+            show_default="without this loss",
+        ),
+    ] = None,
+    appearance_features: Annotated[
+        Path | None,
+        _loss(
+            metavar="FILE",
+            help="Use a checkpoint of the stage appearance-features in place of --vgg-weights.",
             show_default="without this loss",
         ),
     ] = None,
@@ -243,7 +262,7 @@ def train(
     settings = settings_of(context)
     if max_time is None and steps is None:
         max_time = _DEFAULT_TIME
-    training = PRESETS[preset]
+    training = preset_of(preset, stage)
     optimizer = training.optimizer
     training = replace(
         training,
@@ -276,6 +295,7 @@ def train(
             texture_size=texture_size,
             photos=photos,
             vgg_weights=vgg_weights,
+            appearance_features=appearance_features,
             light_features=light_features,
             without_normals=without_normals,
             mean_face=mean_face,
@@ -292,8 +312,10 @@ def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
     for name, stages in _STAGES.items():
         if name in given and stage not in stages:
             raise UsageError(f"{flag(name)}: does not apply to the stage {stage}; leave it out")
-    if stage == "joint" and "dataset" not in given:
-        raise UsageError("--stage joint: needs a prepared dataset; give --dataset")
+    if stage in _CROP_STAGES and "dataset" not in given:
+        raise UsageError(f"--stage {stage}: needs a prepared dataset; give --dataset")
+    if {"vgg_weights", "appearance_features"} <= given:
+        raise UsageError("--appearance-features: takes the place of --vgg-weights; give one of them")
     for name in ("heads_from", "heads", "views", "bank"):
         if {name, "dataset"} <= given:
             raise UsageError(

@@ -7,7 +7,7 @@ stack. Both have the exposure of the texture stages: the source so that the face
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.crop_move import UNMOVED, CropMove
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs
 from facerf_cli.dataset.relight import relit_images
@@ -23,7 +24,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.network.inputs import MEAN_RADIANCE, resize
+from facerf_cli.network.inputs import MEAN_RADIANCE
 
 _STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
 _SUBJECTS_AVERAGED = 16  # enough for the mean position of heads
@@ -34,8 +35,8 @@ _DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not 
 class CropPairs:
     """B pairs of crops of the same people, scene-linear, in the fixed camera of crops of side S.
 
-    source and target [B, 3, S, S], their detected landmarks [B, 68, 2] in crop pixels, and the unit vector
-    toward the target's light in camera space [B, 3].
+    source and target [B, 3, S, S], their detected landmarks [B, 68, 2] in crop pixels, the unit vector
+    toward the target's light in camera space [B, 3], and the people's places in `Dataset.subjects` [B].
     """
 
     source: Tensor
@@ -43,6 +44,7 @@ class CropPairs:
     source_landmarks_px: Tensor
     target_landmarks_px: Tensor
     light: Tensor
+    people: Tensor
 
     def to(self, device: torch.device) -> "CropPairs":
         """Copy the pairs to `device`."""
@@ -57,12 +59,17 @@ class PairReader:
     pairs: list[Pair]
     side_px: int
 
-    def draw(self, generator: torch.Generator) -> CropPairs:
-        """Read a random pair, B = 1."""
-        return self.read(self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))])
+    def of(self, pairs: list[Pair]) -> "PairReader":
+        """A reader of these pairs."""
+        return replace(self, pairs=pairs)
 
-    def read(self, pair: Pair) -> CropPairs:
-        """Read the crops of a pair, B = 1."""
+    def draw(self, generator: torch.Generator) -> CropPairs:
+        """Read a random pair, B = 1, each crop as a detector's box would cut it."""
+        pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+        return self.read(pair, (CropMove.draw(generator), CropMove.draw(generator)))
+
+    def read(self, pair: Pair, moves: tuple[CropMove, CropMove] = (UNMOVED, UNMOVED)) -> CropPairs:
+        """Read the crops of a pair, B = 1, the source's and the target's moved."""
         source_stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
         path = self.dataset.stack_path(pair.subject, pair.target_camera)
         target_stack = _stack_info(path)
@@ -72,17 +79,27 @@ class PairReader:
             raise InputError(
                 f"{path}: the source has another size than the stack; run relight-dataset with --overwrite"
             )
-        exposed = source * (MEAN_RADIANCE / source_stack.mean_on_face(source))
+        exposed = source * (MEAN_RADIANCE / source_stack.colour_on_face(source).mean())
+        moved, moved_target = moves
         return CropPairs(
-            source=self._resized(exposed),
-            target=self._resized(target * (MEAN_RADIANCE / target_stack.lit_mean)),
-            source_landmarks_px=source_stack.landmarks_px[None] * (self.side_px / source_stack.side_px),
-            target_landmarks_px=target_stack.landmarks_px[None] * (self.side_px / target_stack.side_px),
+            source=moved.image(exposed[None], self.side_px),
+            target=moved_target.image(target[None] * (MEAN_RADIANCE / target_stack.lit_mean), self.side_px),
+            source_landmarks_px=self._landmarks_px(source_stack, moved),
+            target_landmarks_px=self._landmarks_px(target_stack, moved_target),
             light=target_stack.directions[pair.target_light][None],
+            people=torch.tensor([self.dataset.subjects.index(pair.subject)]),
         )
 
-    def _resized(self, image: Tensor) -> Tensor:
-        return resize(image[None], self.side_px)
+    def source_colours(self, count: int) -> Tensor:
+        """Mean colours [N, 3] of the face in `count` sources, spread over the pairs."""
+        colours = []
+        for pair in spread_pairs(self, count, lambda pair: True):
+            stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
+            colours.append(stack.colour_on_face(self._read_source(pair)))
+        return torch.stack(colours)
+
+    def _landmarks_px(self, stack: "_StackInfo", moved: CropMove) -> Tensor:
+        return moved.points(stack.landmarks_px / stack.side_px)[None] * self.side_px
 
     def _read_source(self, pair: Pair) -> Tensor:
         path = image_path(self.dataset, *pair.key)
@@ -95,12 +112,18 @@ class PairReader:
 
 
 def open_pairs(dataset: Dataset, split: str, side_px: int) -> PairReader:
-    """Open the pairs of a split; raise InputError where it has none."""
+    """Open the pairs of a split; raise InputError where it has none or its crops are smaller."""
     pairs = [pair for pair in read_pairs(dataset) if pair.split == split]
     if not pairs:
         raise InputError(
             f"{dataset.folder}: no pairs in the split {split}; make them with `facerf relight-dataset`, "
             "after a prepare-dataset whose --split puts subjects there"
+        )
+    stack = _stack_info(dataset.stack_path(pairs[0].subject, pairs[0].source_camera))
+    if stack.side_px < side_px:
+        raise InputError(
+            f"{dataset.folder}: its crops have {stack.side_px} px, the networks need {side_px}; run "
+            f"prepare-dataset with --crop {side_px}, or train with --texture-size {stack.side_px}"
         )
     return PairReader(dataset, pairs, side_px)
 
@@ -135,11 +158,11 @@ class _StackInfo:
     lit_mean: float  # mean radiance of the face under a constant map of radiance 1
     face_bits: np.ndarray  # pixels that show the face, eight to a byte
 
-    def mean_on_face(self, image: Tensor) -> float:
-        """Mean radiance of the face in an image [3, H, W]."""
+    def colour_on_face(self, image: Tensor) -> Tensor:
+        """Mean colour [3] of the face in an image [3, H, W]."""
         bits = np.unpackbits(self.face_bits, count=self.side_px**2)
         face = torch.from_numpy(bits).view(self.side_px, self.side_px).bool()
-        return max(float(image[:, face].mean()), _DARKEST)
+        return image[:, face].mean(1).clamp_min(_DARKEST)
 
 
 @lru_cache(maxsize=_STACKS_CACHED)

@@ -19,7 +19,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.errors import InputError
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
-_SAME_CAMERA_SHARE = 0.5  # of the pairs; the others also train the change of pose
+_TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,22 +62,27 @@ def draw_pairs(dataset: Dataset, maps: Sequence[str], per_subject: int, seed: in
 
 
 def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, index: int) -> Pair:
-    """Draw one pair; it depends on (seed, subject, index), the subject's cameras and lights, and `maps`."""
+    """Draw one pair; it depends on (seed, subject, index), the subject's cameras and lights, and `maps`.
+
+    The target's camera is any of the subject's (paper, 'Dataset': 'from a random camera view'); in the split
+    test it is the source's in half of the pairs.
+    """
     name = int.from_bytes(hashlib.sha256(subject.encode()).digest()[:8], "little")
     random = np.random.default_rng([seed, name, index])
     cameras = dataset.cameras[subject]
     source = cameras[int(random.integers(len(cameras)))]
-    others = [camera for camera in cameras if camera != source]
-    same = random.random() < _SAME_CAMERA_SHARE or not others
+    split = dataset.split_of(subject)
+    same = split == _TEST and random.random() < _TEST_SAME_SHARE
+    targets = [camera for camera in cameras if camera != source] if split == _TEST else cameras
     return Pair(
         subject=subject,
         index=index,
-        split=dataset.split_of(subject),
+        split=split,
         source_camera=source,
         envmap=maps[int(random.integers(len(maps)))],
         rotate_deg=round(float(random.uniform(0, 360)), 2),
         exposure_ev=0,
-        target_camera=source if same else others[int(random.integers(len(others)))],
+        target_camera=source if same or not targets else targets[int(random.integers(len(targets)))],
         target_light=int(random.integers(len(dataset.lights_of(subject)))),
     )
 

@@ -18,13 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.crop_move import CropMove
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.documents import digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.logs import LOGGER_NAME
-from facerf_cli.network.inputs import resize
 from facerf_cli.workers import in_shards
 
 CACHED_SIDE_PX = 512  # the side of the paper's crops
@@ -52,11 +52,12 @@ class Photos:
     side_px: int
 
     def draw(self, generator: torch.Generator) -> PhotoCrops:
-        """Draw a random face, B = 1."""
+        """Draw a random face, B = 1, its crop as a detector's box would cut it."""
         place = int(torch.randint(len(self.paths), (), generator=generator))
         crop = torch.from_numpy(read_image(self.paths[place]).pixels).permute(2, 0, 1)[None]
-        scale = self.side_px / CACHED_SIDE_PX
-        return PhotoCrops(resize(crop, self.side_px), self.landmarks_px[place][None] * scale)
+        move = CropMove.draw(generator)
+        points = move.points(self.landmarks_px[place] / CACHED_SIDE_PX)
+        return PhotoCrops(move.image(crop, self.side_px), self.side_px * points[None])
 
 
 def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1) -> Photos:

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
@@ -30,6 +31,7 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
     ("geometry", "default"): GeometryNetwork,
     ("geometry", "paper"): GeometryNetwork,
     ("light_features", "vgg"): LightNetwork,
+    ("appearance_features", "vgg"): AppearanceNetwork,
     ("diffuse_sh", "default"): DiffuseNetwork,
 }
 

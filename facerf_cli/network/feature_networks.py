@@ -21,6 +21,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from facerf_cli.network.inputs import resize
+
 # Index of each convolution in torchvision's `features`, and its channels.
 CONVOLUTIONS = (
     *((0, 64), (2, 64), (5, 128), (7, 128), (10, 256), (12, 256), (14, 256)),
@@ -135,11 +137,15 @@ def _shape_and_type(tensor: Tensor) -> str:
 
 @dataclass(frozen=True)
 class LightSettings:
-    """Sizes of S_f; the default is fast on a CPU at 128 px, `width` 1 is the trunk of VGG-16."""
+    """Sizes of S_f; the default is fast on a CPU, `width` 1 is the trunk of VGG-16.
+
+    `side` is that of the textures it was trained on, the only one at which its features are right.
+    """
 
     width: float = 0.25
     grid: int = 8  # side to which conv3_3 is pooled before the head: the places that are lit show the light
     hidden: int = 128
+    side: int = 128
 
 
 class LightNetwork(nn.Module):
@@ -161,12 +167,12 @@ class LightNetwork(nn.Module):
 
     def forward(self, textures: Tensor) -> Tensor:
         """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where hidden."""
-        deepest = self.trunk.layers(textures)[-1]
+        deepest = self.layers(textures)[-1]
         return F.normalize(self.head(self.pool(deepest).flatten(1)).float(), dim=-1)
 
     def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features of the trunk; see `VggFeatures.layers`."""
-        return self.trunk.layers(linear)
+        """Features of the trunk at its own side; see `VggFeatures.layers`."""
+        return self.trunk.layers(resize(linear, self.settings.side))
 
     def as_metadata(self) -> dict[str, Any]:
         """Form and settings, for a checkpoint."""

@@ -1,5 +1,9 @@
 """Steps between a texture and the layers of a network: exposure, colour cast, roots, resizing, head pose."""
 
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -7,10 +11,41 @@ from torch import Tensor
 MEAN_RADIANCE = 0.25  # of the visible face once its exposure is divided out
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 
-# Mean and covariance of log(red / green) and log(blue / green) of the mean colour of a training source,
-# measured on 192 draws of a bank.
-_CAST_MEAN, _CAST_COVARIANCE = (0.318, -0.214), ((0.094, -0.038), (-0.038, 0.081))
 _ORDINARY_CAST = 2.0  # standard deviations within which a colour cast is left to the network
+_LEAST_DEVIATION = 0.02  # of a log ratio of colours: that of grey data would be 0
+
+
+@dataclass(frozen=True)
+class SourceColours:
+    """Colours of the sources that a network was trained on.
+
+    Mean and covariance of log(red / green) and log(blue / green) of the visible face's mean colour.
+    """
+
+    mean: tuple[float, float]
+    covariance: tuple[tuple[float, float], tuple[float, float]]
+
+    @staticmethod
+    def of(colours: Tensor) -> "SourceColours":
+        """Measure the mean colours [N, 3] of sources, scene-linear and positive, N > 1."""
+        chroma = _chroma(colours.double())
+        covariance = torch.cov(chroma.T) + _LEAST_DEVIATION**2 * torch.eye(2, dtype=chroma.dtype)
+        (a, b), (_, c) = covariance.tolist()
+        red, blue = chroma.mean(0).tolist()
+        return SourceColours((red, blue), ((a, b), (b, c)))
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Numbers for a checkpoint."""
+        return asdict(self)
+
+    @staticmethod
+    def from_metadata(metadata: Any) -> "SourceColours":
+        """Read `as_metadata`; raises KeyError, TypeError or ValueError for anything else."""
+        red, blue = (float(value) for value in metadata["mean"])
+        (a, b), (c, d) = ((float(x), float(y)) for x, y in metadata["covariance"])
+        if not (a > 0 and d > 0 and b == c and a * d > b * b and all(map(math.isfinite, (red, blue, a, d)))):
+            raise ValueError(f"no colours of sources: {metadata}")
+        return SourceColours((red, blue), ((a, b), (c, d)))
 
 
 def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
@@ -23,23 +58,38 @@ def exposure_of(texture: Tensor, visible: Tensor) -> Tensor:
     return exposure.clamp_min(1e-6)
 
 
-def colour_cast(texture: Tensor, visible: Tensor) -> Tensor:
-    """Colour cast of the light on linear textures [B, 3, T, T], as far as it exceeds that of training photos.
+def colour_cast(texture: Tensor, visible: Tensor, trained: SourceColours) -> Tensor:
+    """Colour cast of the light on linear textures [B, 3, T, T], as far as it exceeds that of `trained`.
 
     visible [B, 1, T, T] in 0..1; the result is [B, 3, 1, 1] and positive. Divide textures by it: their mean
-    radiance does not change. It is exactly 1 for ordinary and for grey photos. A colour further from the mean
-    colour of training than `_ORDINARY_CAST` is moved within that distance, and the further it is the closer
-    to the mean: the less usual the colour, the more certainly it is the light's.
+    radiance does not change. It is exactly 1 for ordinary photos. A colour further from the mean colour of
+    training than `_ORDINARY_CAST` is moved within that distance, and the further it is the closer to the
+    mean: the less usual the colour, the more certainly it is the light's.
     """
-    mean = ((texture * visible).sum((2, 3)) / visible.sum((2, 3)).clamp_min(1e-6)).clamp_min(1e-6).double()
-    chroma = (mean[:, [0, 2]] / mean[:, 1:2]).log() - mean.new_tensor(_CAST_MEAN)
-    spread = torch.linalg.cholesky(mean.new_tensor(_CAST_COVARIANCE))
+    mean = mean_colours(texture, visible)
+    chroma = _chroma(mean) - mean.new_tensor(trained.mean)
+    spread = torch.linalg.cholesky(mean.new_tensor(trained.covariance))
     distance = torch.linalg.solve_triangular(spread, chroma.T, upper=False).norm(dim=0)
     inside = (_ORDINARY_CAST / distance.clamp_min(1e-6)) ** 2
     excess = chroma * (1 - inside).clamp_min(0)[:, None]
     cast = torch.stack([excess[:, 0], torch.zeros_like(excess[:, 0]), excess[:, 1]], 1).exp()
     cast = cast * (mean / cast).mean(1, keepdim=True) / mean.mean(1, keepdim=True)
     return cast.to(texture)[..., None, None]
+
+
+def without_cast(texture: Tensor, visible: Tensor, trained: SourceColours | None) -> Tensor:
+    """Divide textures by their `colour_cast`, as in training; unchanged where the colours are unknown."""
+    return texture if trained is None else texture / colour_cast(texture.detach(), visible, trained)
+
+
+def mean_colours(texture: Tensor, visible: Tensor) -> Tensor:
+    """Mean colours [B, 3], positive, float64, of the visible texels; visible [B, 1, T, T] in 0..1."""
+    seen = visible.sum((2, 3)).clamp_min(1e-6)
+    return ((texture * visible).sum((2, 3)) / seen).clamp_min(1e-6).double()
+
+
+def _chroma(colours: Tensor) -> Tensor:
+    return (colours[:, [0, 2]] / colours[:, 1:2]).log()
 
 
 def to_root(radiance: Tensor) -> Tensor:

@@ -3,13 +3,14 @@
 A U-Net of 8 down and 8 up convolutions, 3 x 3, with skips, over the source texture T_s and its normals N_s at
 512 x 512; the light direction enters at its bottleneck of 2 x 2. Five convolutions of stride 1 follow, over
 its features and the target's normals N_t, and give the texture T_t. The down path runs once a face, the rest
-once a light.
+once a light. At a smaller working side the layers are the same; those that find a single texel keep it.
 
 The paper leaves these open: channels are 64 to 512, as is usual for such networks; a down convolution has
-stride 2, an up convolution follows a doubling by nearest neighbours; each except the first and the last is
-followed by group normalisation and a leaky rectifier; a linear layer spreads the light's three numbers over
-as many channels as the bottleneck has; the source is divided by its exposure and the output multiplied by it;
-and the network reads and predicts square roots, which separate shadows as display encodings do.
+stride 2, an up convolution follows an upsampling by nearest neighbours; each of the U-Net's convolutions
+except the first is followed by group normalisation, and each by a leaky rectifier; the five convolutions
+after it have rectifiers and no normalisation; a linear layer spreads the light's three numbers over as many
+channels as the bottleneck has; the source is divided by its exposure and the output multiplied by it; and the
+network reads and predicts square roots, which separate shadows as display encodings do.
 """
 
 from dataclasses import asdict, dataclass
@@ -62,8 +63,9 @@ class PaperReflectanceNetwork(nn.Module):
     def __init__(self, settings: PaperReflectanceSettings = PaperReflectanceSettings()) -> None:
         super().__init__()
         widths, features = settings.widths, settings.features
-        if not widths or settings.side % 2 ** len(widths):
-            raise ValueError(f"a side of {settings.side} cannot be halved {len(widths)} times")
+        if not widths:
+            raise ValueError("no widths")
+        _halved_sides(settings.side, len(widths))  # raises for a side that it cannot halve
         self.settings = settings
         maps = 3 if settings.normals else 0
         before = (3 + maps, *widths[:-1])
@@ -128,8 +130,9 @@ class PaperReflectanceNetwork(nn.Module):
         code = F.leaky_relu(self.light(lights.flatten(0, 1)), _SLOPE)[..., None, None].expand(
             -1, -1, *bottleneck.shape[-2:]
         )
-        for up, skip in zip(reversed(self.up), (code, *reversed(skips)), strict=True):
-            x = up(x, skip)
+        sides = [self.settings.side, *_halved_sides(self.settings.side, len(self.up) - 1)]
+        for up, skip, side in zip(reversed(self.up), (code, *reversed(skips)), reversed(sides), strict=True):
+            x = up(x, skip, side)
         if self.settings.normals:
             normals = resize(normals_target, self.settings.side).to(x.dtype)
             x = torch.cat([x, normals.repeat_interleave(count, 0)], 1)
@@ -158,7 +161,7 @@ class _DownConvolution(nn.Module):
 
 
 class _UpConvolution(nn.Module):
-    """Double the side of coarser features [B L, ...] and a skip [B or B L, ...], and convolve both."""
+    """Upsample coarser features [B L, ...] and a skip [B or B L, ...] to a side, and convolve both."""
 
     def __init__(self, channels_in: int, skip_channels: int, channels_out: int) -> None:
         super().__init__()
@@ -166,14 +169,24 @@ class _UpConvolution(nn.Module):
         self.convolution = nn.Conv2d(channels_in + skip_channels, channels_out, 3, padding=1)
         self.norm = nn.GroupNorm(_GROUPS, channels_out)
 
-    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
+    def forward(self, x: Tensor, skip: Tensor, side: int) -> Tensor:
         # A convolution of both, stacked, in two parts: the part of the skip is the same for all lights.
-        weight = self.convolution.weight
-        own = F.conv2d(_doubled(x), weight[:, : self.channels_in], padding=1)
-        shared = F.conv2d(_doubled(skip), weight[:, self.channels_in :], self.convolution.bias, padding=1)
+        weight, bias = self.convolution.weight, self.convolution.bias
+        own = F.conv2d(_upsampled(x, side), weight[:, : self.channels_in], padding=1)
+        shared = F.conv2d(_upsampled(skip, side), weight[:, self.channels_in :], bias, padding=1)
         both = own + shared.repeat_interleave(len(own) // len(shared), 0)
         return F.leaky_relu(self.norm(both), _SLOPE)
 
 
-def _doubled(x: Tensor) -> Tensor:
-    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+def _upsampled(x: Tensor, side: int) -> Tensor:
+    return x if x.shape[-1] == side else F.interpolate(x, (side, side), mode="nearest")
+
+
+def _halved_sides(side: int, times: int) -> list[int]:
+    """Sides after each halving; a side of one texel stays. Raises ValueError for an odd side above 1."""
+    sides = [side]
+    for _ in range(times):
+        if sides[-1] > 1 and sides[-1] % 2:
+            raise ValueError(f"a side of {side} cannot be halved {times} times")
+        sides.append(max(1, sides[-1] // 2))
+    return sides[1:]

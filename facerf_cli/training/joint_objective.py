@@ -19,12 +19,10 @@ from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.photos import PhotoCrops, Photos
 from facerf_cli.dataset.samples import DatasetTextures, provenance_of
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import (
-    OUTER_EYE_CORNERS,
-)
-from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.network.feature_networks import FeatureNetwork, VggFeatures
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.network.inputs import resize
+from facerf_cli.network.inputs import SourceColours, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera
 from facerf_cli.training.losses import (
     MaskedPair,
@@ -49,6 +47,7 @@ from facerf_cli.training.pretrained import VGG16_LICENCE
 
 _PAPER = PaperWeights()
 _DARKEST = 1e-4  # least radiance; networks take square roots, whose slope at 0 is infinite
+_COLOURS_MEASURED = 192  # sources
 _SHEET_ROWS, _SHEET_PX = 8, 256
 
 
@@ -97,7 +96,7 @@ class JointObjective(Objective):
         super().__init__()
         self.networks = nn.ModuleDict({"reflectance": reflectance, "geometry": geometry})
         self.chooses_by = "si_mse"
-        self.provenance = _provenance(dataset, model, photos, appearance is not None, light is not None)
+        self.provenance = _provenance(dataset, model, photos, appearance, light)
         self.settings = settings
         self.photos = photos
         self.skips_networks = photos is not None  # photos train the geometry alone
@@ -112,6 +111,7 @@ class JointObjective(Objective):
         self._model = model
         self._train = open_pairs(dataset, "train", settings.crop_px)
         self._held_out = open_pairs(dataset, "validation", settings.crop_px)
+        self.source_colours = SourceColours.of(self._train.source_colours(_COLOURS_MEASURED))
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
         if network.rig_lights and not network.has_mean_face:
@@ -178,7 +178,8 @@ class JointObjective(Objective):
         normals = head_normals(target, side)
         network: Any = self.networks["reflectance"]
         with self.mixed_precision():
-            encoded = network.encode(face.texture.clamp_min(_DARKEST), face.normals, face.visible)
+            plain = without_cast(face.texture.clamp_min(_DARKEST), face.visible, self.source_colours)
+            encoded = network.encode(plain, face.normals, face.visible)
             texture = network.decode(encoded, normals, batch.light[:, None])[:, 0]
         image, mask = render_textures(texture.float(), target, self.camera)
         return _Relit(target, texture.float(), image, mask)
@@ -273,9 +274,15 @@ def _sheet_row(batch: CropPairs, relit: _Relit, camera: Camera) -> np.ndarray:
 
 
 def _provenance(
-    dataset: Dataset, model: MorphableModel, photos: Photos | None, appearance: bool, light: bool
+    dataset: Dataset,
+    model: MorphableModel,
+    photos: Photos | None,
+    appearance: nn.Module | None,
+    light: nn.Module | None,
 ) -> dict[str, Any]:
     """Provenance of the dataset, the feature losses and the photos."""
-    terms = [name for name, there in ((f"V_f, {VGG16_LICENCE}", appearance), ("S_f", light)) if there]
+    published = isinstance(appearance, VggFeatures)
+    of = VGG16_LICENCE if published else "trained on people and lights of a dataset (--appearance-features)"
+    terms = [name for name, there in ((f"V_f, {of}", appearance), ("S_f", light)) if there is not None]
     found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
     return provenance_of(dataset, model) | found

@@ -259,6 +259,8 @@ def _metadata(run: _Run, row: Row) -> dict[str, Any]:
     licences = [*provenance["licence"].split("; "), *start.get("licence", "").split("; ")]
     if "provenance" in start:
         provenance["started_from"] = start["provenance"]
+    colours = run.objective.source_colours
+    kept = {"source_colours": start["source_colours"]} if "source_colours" in start else {}
     leg = {
         "objective": type(run.objective).__name__,
         "networks": sorted(run.objective.networks),
@@ -268,6 +270,7 @@ def _metadata(run: _Run, row: Row) -> dict[str, Any]:
         **asdict(run.settings),
     }
     return {
+        **({"source_colours": colours.as_metadata()} if colours else kept),
         "layout_version": LAYOUT_VERSION,
         "licence": "; ".join(dict.fromkeys(words for words in licences if words)),
         "provenance": provenance,

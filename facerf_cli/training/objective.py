@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.network.inputs import SourceColours
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -34,6 +36,7 @@ class Objective(nn.Module):
     networks: nn.ModuleDict  # trained, averaged, saved: by the names of network.saved.FORMS
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; 'licence' is that of the whole
+    source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
 

@@ -1,9 +1,9 @@
-"""Feature networks of the losses: V_f from `--vgg-weights`, S_f from `--light-features`."""
+"""Feature networks of the losses: V_f, published or trained here, and S_f."""
 
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors.torch import load_file
@@ -12,7 +12,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.downloads import PublishedFile, fetch
 from facerf_cli.network.checkpoint import load_networks
-from facerf_cli.network.feature_networks import LightNetwork, VggFeatures
+from facerf_cli.network.feature_networks import VggFeatures
 
 # torchvision's IMAGENET1K_V1; its file name contains the first eight digits of the digest.
 VGG16 = PublishedFile(
@@ -23,6 +23,7 @@ VGG16 = PublishedFile(
 VGG16_LICENCE = (
     "VGG-16: torchvision (BSD-3-Clause), trained on ImageNet (pictures for non-commercial research)"
 )
+FeatureName = Literal["light_features", "appearance_features"]
 _VGG_ADVICE = "give --vgg-weights imagenet, or a .pth or .safetensors of torchvision's vgg16-397923af"
 _LARGEST_FILE = 2**30  # bytes; guards against archives that unpack to far more
 
@@ -48,12 +49,20 @@ def load_vgg(choice: str | Path | None, network: VggFeatures | None = None) -> V
     return network
 
 
-def load_light_features(path: Path) -> LightNetwork:
-    """Load S_f, frozen, from a checkpoint of `facerf train --stage light-features`."""
-    network = load_networks(path, LAYOUT_VERSION)[0].get("light_features")
-    if not isinstance(network, LightNetwork):
+def load_features(path: Path, name: FeatureName, side: int | None = None) -> Any:
+    """Load S_f ('light_features') or V_f ('appearance_features'), frozen, from a checkpoint of its stage.
+
+    Raises InputError where it was not trained on images of `side`: features of another scale mislead a loss.
+    """
+    network: Any = load_networks(path, LAYOUT_VERSION)[0].get(name)
+    stage = name.replace("_", "-")
+    if network is None:
+        raise InputError(f"{path}: has no network {name}; give one of `facerf train --stage {stage}`")
+    trained = network.settings.side
+    if side is not None and trained != side:
         raise InputError(
-            f"{path}: has no network light_features; give one of `facerf train --stage light-features`"
+            f"{path}: its network {name} was trained on images of {trained} px, here they have {side}; train "
+            f"it with --stage {stage} --texture-size {side}, or give --texture-size {trained} here"
         )
     network.eval().requires_grad_(False)
     return network

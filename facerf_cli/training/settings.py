@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Preset = Literal["default", "paper", "tiny"]
-Stage = Literal["reflectance", "geometry", "joint", "light-features", "diffuse-sh"]
+Stage = Literal["reflectance", "geometry", "joint", "light-features", "appearance-features", "diffuse-sh"]
+FEATURE_STAGES = ("light-features", "appearance-features")  # of networks that a loss compares images with
 
 
 @dataclass(frozen=True)
@@ -94,5 +95,15 @@ PRESETS: dict[Preset, TrainSettings] = {
         validate_every=10,
     ),
 }
+
+
+def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
+    """Settings of a preset; the paper's optimizer is for its own loss, not for the networks of its features.
+
+    It does not say how those were trained.
+    """
+    return PRESETS["default" if preset == "paper" and stage in FEATURE_STAGES else preset]
+
+
 # Settings that may differ between a run and its resumption.
 MAY_CHANGE = frozenset({"steps", "max_seconds", "validate_every", "workers", "compile"})

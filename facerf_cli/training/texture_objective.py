@@ -13,13 +13,14 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.feature_networks import LightNetwork, feature_distance
-from facerf_cli.network.inputs import from_root
+from facerf_cli.network.inputs import SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 
 _VALIDATION_SEED = 12345
+_COLOUR_SEED, _COLOURS_MEASURED = 31415, 192
 _SHEET_FACES = 5
 
 
@@ -67,6 +68,7 @@ class TextureObjective(Objective):
         self.light = light
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
+        self.source_colours = _measure_colours(source, self.heads)
         self._validation: list[Sample] = []
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> TextureBatch:
@@ -83,7 +85,7 @@ class TextureObjective(Objective):
         """Compute the term `root` and, with S_f, `light_features`, means over faces."""
         network, sample = self._network(), batch.sample
         with self.mixed_precision():
-            encoded = network.encode(sample.source, sample.normals_source, sample.visible)
+            encoded = self._encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
         # The network measures the exposure on seen texels alone, and divides by it.
         target = sample.target / encoded.exposure[:, None]
@@ -109,7 +111,7 @@ class TextureObjective(Objective):
         rows: list[np.ndarray] = []
         for sample in self._held_out():
             there = sample.to(device)
-            encoded = network.encode(there.source, there.normals_source, there.visible)
+            encoded = self._encoded(there)
             predicted = network.decode(encoded, there.normals_target, there.lights).cpu()
             errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
             turned = (sample.normals_source - sample.normals_target).abs().max()
@@ -130,6 +132,21 @@ class TextureObjective(Objective):
 
     def _network(self) -> Any:
         return self.networks["reflectance"]
+
+    def _encoded(self, sample: Sample) -> Any:
+        source = without_cast(sample.source, sample.visible, self.source_colours)
+        return self._network().encode(source, sample.normals_source, sample.visible)
+
+
+def _measure_colours(source: SampleSource, heads: Tensor) -> SourceColours:
+    """Measure the colours of sources of the training heads."""
+    colours = []
+    for index in range(_COLOURS_MEASURED):
+        generator = seeded(_COLOUR_SEED, index)
+        head = heads[torch.randint(len(heads), (1,), generator=generator)]
+        sample = source.draw(head, 1, generator)
+        colours.append(mean_colours(sample.source, sample.visible))
+    return SourceColours.of(torch.cat(colours))
 
 
 def _set_mean_face(network: Any, source: SampleSource) -> None:

@@ -13,7 +13,7 @@ from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.training import pretrained as feature_networks
-from facerf_cli.training.pretrained import VGG16, load_light_features, load_vgg
+from facerf_cli.training.pretrained import VGG16, load_features, load_vgg
 
 # What is beyond the trunk in the published file, smaller here.
 BEYOND = {"features.17.weight": torch.zeros(2, 2), "classifier.6.bias": torch.zeros(1000)}
@@ -110,7 +110,7 @@ def test_light_features_come_back_frozen(tmp_path: Path) -> None:
     network = LightNetwork(LightSettings(width=1 / 16, grid=2, hidden=4))
     path = tmp_path / "last.safetensors"
     save_networks(path, {"light_features": network}, {"layout_version": LAYOUT_VERSION})
-    loaded = load_light_features(path)
+    loaded = load_features(path, "light_features")
     texture = torch.rand(2, 3, 16, 16)
     assert torch.allclose(loaded(texture), network(texture), atol=1e-2)  # stored in half precision
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
@@ -121,7 +121,7 @@ def test_a_checkpoint_without_light_features_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "last.safetensors"
     save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
     with pytest.raises(InputError, match="has no network light_features; give one of `facerf train"):
-        load_light_features(path)
+        load_features(path, "light_features")
 
 
 def test_offline_names_the_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

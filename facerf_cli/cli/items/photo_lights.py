@@ -28,7 +28,7 @@ from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.pipeline import LightEstimate, estimate_light
-from facerf_cli.training.pretrained import load_light_features, load_vgg
+from facerf_cli.training.pretrained import load_features, load_vgg
 
 LIGHT_FEATURES = Path(__file__).parents[2] / "assets" / "light_features.safetensors"
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
@@ -129,7 +129,7 @@ def _feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
     """V_f if its weights were given, else the shipped S_f; and its name for the report."""
     if vgg_weights is not None:
         return load_vgg(vgg_weights), "V_f (VGG-16, ImageNet)"
-    return load_light_features(LIGHT_FEATURES), "S_f (shipped)"
+    return load_features(LIGHT_FEATURES, "light_features"), "S_f (shipped)"
 
 
 def _write(

@@ -16,11 +16,12 @@ from facerf_cli.dataset.crops import mean_translation_m
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.photos import Photos, open_photos
 from facerf_cli.dataset.samples import open_dataset_textures
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.network.appearance_network import AppearanceNetwork, AppearanceSettings
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
@@ -31,13 +32,14 @@ from facerf_cli.synth.face_crops import RenderedFaces
 from facerf_cli.synth.head_images import add_head_images
 from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
 from facerf_cli.synth.texture_samples import SampleSource
+from facerf_cli.training.appearance_objective import AppearanceObjective
 from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint_objective import JointObjective, JointSettings
 from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
 from facerf_cli.training.loop import Start, train
 from facerf_cli.training.objective import Objective
-from facerf_cli.training.pretrained import load_light_features, load_vgg
+from facerf_cli.training.pretrained import load_features, load_vgg
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Preset, Stage
@@ -67,14 +69,15 @@ class _PresetSizes:
     heads: int = 240
     views: int = 8
     images: int = 24  # of each head, for the Geometry Network
+    texture_side: int = 128  # of a dataset's textures
     joint_side: int = 256  # of the stage joint's crops and textures
     held_out_heads: int = 12
-    light_width: float = 0.25  # of S_f; 1 is VGG-16's
+    light_width: float = 0.25  # of S_f and V_f; 1 is VGG-16's
 
 
 _SIZES: dict[Preset, _PresetSizes] = {
     "default": _PresetSizes(),
-    "paper": _PresetSizes(joint_side=512, light_width=1.0),
+    "paper": _PresetSizes(texture_side=512, joint_side=512, light_width=1.0),
     "tiny": _PresetSizes(heads=16, views=2, images=2, joint_side=64, held_out_heads=4, light_width=0.05),
 }
 
@@ -125,6 +128,7 @@ def _build_objective(options: TrainOptions, networks: Networks) -> Objective:
         "reflectance": _texture,
         "geometry": _geometry,
         "light-features": _light_features,
+        "appearance-features": _appearance_features,
         "joint": _joint,
         "diffuse-sh": _diffuse_sh,
     }
@@ -132,18 +136,31 @@ def _build_objective(options: TrainOptions, networks: Networks) -> Objective:
 
 
 def _texture(options: TrainOptions, networks: Networks) -> Objective:
-    light = load_light_features(options.light_features) if options.light_features else None
-    network = networks.get("reflectance") or _reflectance_network(options)
+    samples = _samples(options)
+    light = _load_light_features(options, samples.side)
+    network = networks.get("reflectance") or _reflectance_network(options, samples.side)
     settings = TextureObjectiveSettings(held_out_heads=_sizes(options).held_out_heads)
-    return TextureObjective(_samples(options), network, light, settings)
+    return TextureObjective(samples, network, light, settings)
 
 
 def _light_features(options: TrainOptions, networks: Networks) -> Objective:
-    sizes = _sizes(options)
+    sizes, samples = _sizes(options), _samples(options)
     network: Any = networks.get("light_features")
-    network = network or LightNetwork(LightSettings(width=sizes.light_width))
+    network = network or LightNetwork(LightSettings(width=sizes.light_width, side=samples.side))
+    _require_side(options.start_from, network.settings.side, samples.side)
     settings = LightFeaturesSettings(held_out_heads=sizes.held_out_heads)
-    return LightFeaturesObjective(_samples(options), network, settings)
+    return LightFeaturesObjective(samples, network, settings)
+
+
+def _appearance_features(options: TrainOptions, networks: Networks) -> Objective:
+    assert options.dataset
+    dataset, side = read_dataset(options.dataset), _joint_side(options)
+    network: Any = networks.get("appearance_features")
+    if network is None:
+        people, width = len(dataset.subjects), _sizes(options).light_width
+        network = AppearanceNetwork(AppearanceSettings(people, side, width))
+    _require_side(options.start_from, network.settings.side, side)
+    return AppearanceObjective(dataset, load_face_model(dataset.face_model), network)
 
 
 def _diffuse_sh(options: TrainOptions, networks: Networks) -> Objective:
@@ -170,24 +187,51 @@ def _geometry(options: TrainOptions, networks: Networks) -> Objective:
 def _joint(options: TrainOptions, networks: Networks) -> Objective:
     assert options.dataset
     dataset = read_dataset(options.dataset)
-    needs_vgg = options.vgg_weights is not None or options.preset == "paper"
-    appearance = load_vgg(options.vgg_weights) if needs_vgg else None
+    side = _joint_side(options)
     if options.preset == "paper" and options.light_features is None:
         raise UsageError(
             "--preset paper: its loss needs S_f; give --light-features FILE, a checkpoint of "
             "`facerf train --stage light-features`, or another preset"
         )
-    side = _sizes(options).joint_side
     return JointObjective(
         dataset,
         load_face_model(),  # the built-in one, for the Geometry Network, whatever the dataset is fitted with
-        networks.get("reflectance") or _reflectance_network(options),
+        networks.get("reflectance") or _reflectance_network(options, side),
         networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
-        appearance,
-        load_light_features(options.light_features) if options.light_features else None,
+        _load_appearance(options, side),
+        _load_light_features(options, side),
         _photos(options, side),
         JointSettings(side, side, mean_face=options.mean_face, seed=options.settings.seed),
     )
+
+
+def _joint_side(options: TrainOptions) -> int:
+    """Side of the crops and textures of the stages that read crops."""
+    return options.texture_size or _sizes(options).joint_side
+
+
+def _load_appearance(options: TrainOptions, side: int) -> Any:
+    """Load V_f, and how a checkpoint names it; None without one."""
+    if options.appearance_features:
+        return load_features(options.appearance_features, "appearance_features", side)
+    if options.vgg_weights is None and options.preset != "paper":
+        return None
+    return load_vgg(options.vgg_weights)
+
+
+def _load_light_features(options: TrainOptions, side: int) -> Any:
+    """Load S_f for images of a side; None without one."""
+    path = options.light_features
+    return load_features(path, "light_features", side) if path else None
+
+
+def _require_side(start_from: Path | None, trained: int, side: int) -> None:
+    """Raise InputError where a network of --start-from was trained on images of another side."""
+    if trained != side:
+        raise InputError(
+            f"{start_from}: trained on images of {trained} px, here they have {side}; "
+            f"give --texture-size {trained}"
+        )
 
 
 def _photos(options: TrainOptions, side: int) -> Photos | None:
@@ -198,8 +242,11 @@ def _photos(options: TrainOptions, side: int) -> Photos | None:
     return open_photos(paths, options.output / "photos", side, options.jobs)
 
 
-def _reflectance_network(options: TrainOptions) -> Any:
-    settings = _TINY_FORMS.get(options.form, {}) if options.preset == "tiny" else {}
+def _reflectance_network(options: TrainOptions, side: int) -> Any:
+    """Make an untrained network of the options' form; the paper's works at the textures' side."""
+    settings = {"side": side} if options.form == "paper" else {}
+    if options.preset == "tiny":
+        settings = _TINY_FORMS.get(options.form, {})
     ablation = {"normals": False} if options.without_normals else {}
     try:
         return make_reflectance_network(options.form, **settings, **ablation)
@@ -221,7 +268,11 @@ def _samples(options: TrainOptions) -> SampleSource:
     if options.dataset:
         rig_lights = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS
         return open_dataset_textures(
-            options.dataset, options.fit_with, options.texture_size, options.jobs, rig_lights
+            options.dataset,
+            options.fit_with,
+            options.texture_size or _sizes(options).texture_side,
+            options.jobs,
+            rig_lights,
         )
     return _fill_bank(options, _bank_folder(options))
 

@@ -1,0 +1,59 @@
+"""V_f where ImageNet's weights cannot be had: the trunk of VGG-16 trained on people and lights.
+
+The paper's V_f is VGG-16 trained on ImageNet ('Loss Functions'). This network has the same trunk and is
+trained by `training/appearance_objective.py` to tell people apart, and the light on them. A checkpoint says
+which of the two V_f is.
+"""
+
+from dataclasses import asdict, dataclass
+from typing import Any, Self
+
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.feature_networks import VggFeatures
+from facerf_cli.network.inputs import resize
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Number of people, side of the images, and sizes; `width` 1 is the trunk of VGG-16."""
+
+    people: int
+    side: int = 128
+    width: float = 0.25
+    grid: int = 8  # side to which conv3_3 is pooled before the head
+    hidden: int = 256
+
+
+class AppearanceNetwork(nn.Module):
+    """Tell who is shown in an image, and where its light comes from."""
+
+    def __init__(self, settings: AppearanceSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.trunk = VggFeatures(settings.width)
+        self.pool = nn.AdaptiveAvgPool2d(settings.grid)
+        self.head = nn.Sequential(
+            nn.Linear(self.trunk.out_channels * settings.grid**2, settings.hidden),
+            nn.ReLU(),
+            nn.Linear(settings.hidden, settings.people + 3),
+        )
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Scores of the people [B, P] and unit directions toward the light [B, 3], camera space."""
+        found = self.head(self.pool(self.layers(images)[-1]).flatten(1)).float()
+        return found[:, :-3], F.normalize(found[:, -3:], dim=-1)
+
+    def layers(self, linear: Tensor) -> list[Tensor]:
+        """Features of the trunk at its own side; see `VggFeatures.layers`."""
+        return self.trunk.layers(resize(linear, self.settings.side))
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "vgg", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
+        return cls(AppearanceSettings(**{name: value for name, value in metadata.items() if name != "form"}))
