@@ -15,9 +15,8 @@ from facerf_cli import pipeline
 from facerf_cli.baselines import Kind
 from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
-from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files import images
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
@@ -100,18 +99,28 @@ def load_models(
 
 
 def fit_photo(
-    models: Models, photo: np.ndarray, landmarks_px: np.ndarray | None = None, texture_side: int = 256
+    models: Models,
+    photo: np.ndarray,
+    landmarks_px: np.ndarray | None = None,
+    texture_side: int | None = None,
+    geometry: Geometry | None = None,
 ) -> Head:
     """Fit the face model to the largest face of a photo, or to given landmarks [68, 2] in its pixels.
 
-    Raises InputError where no face is found or the fit fails.
+    With `geometry` "network" the Geometry Network regresses it from the photo, without landmarks. By default
+    geometry and side of the texture are those with which the networks were trained. Raises InputError where
+    no face is found or the fit fails.
     """
     photo = np.ascontiguousarray(photo, np.float32)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
-    if landmarks_px is None:
-        landmarks_px = find_faces(photo, "photo")[0].landmarks_px
-    return pipeline.fit_photo(models, photo, landmarks_px, texture_side)
+    sides = models.sides(texture_side)
+    if landmarks_px is not None:
+        if geometry == "network":
+            raise UsageError("geometry: 'network' uses no landmarks; leave one out")
+        return pipeline.fit_photo(models, photo, landmarks_px, sides)
+    face = pipeline.find_for(geometry or models.default_geometry, photo, "photo")[0]
+    return pipeline.head_of(models, photo, face, sides)
 
 
 def relight(

@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.fit import Geometry
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_networks
@@ -15,7 +16,21 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.inputs import SourceColours
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
+TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: by default, and at most
+CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
+NO_GEOMETRY_NETWORK = (
+    "a checkpoint without a Geometry Network, which --geometry network needs; give --geometry landmarks, or "
+    "another --checkpoint"
+)
 DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
+
+
+@dataclass(frozen=True)
+class Sides:
+    """Sides of a texture and of the crop that it is unwrapped from."""
+
+    texture: int
+    crop_px: int
 
 
 @dataclass(frozen=True)
@@ -27,12 +42,21 @@ class Models:
 
     face: MorphableModel
     network: ReflectanceNetwork | None
-    geometry: nn.Module | None  # the Geometry Network, where a fit starts
+    geometry: nn.Module | None  # the Geometry Network
     diffuse: DiffuseNetwork | None  # the network of the baseline diffuse-sh
     checkpoint_name: str
     metadata: dict[str, Any]
     device: torch.device
+    trained_sides: Sides = Sides(TEXTURE_SIDE, CROP_PER_TEXTURE * TEXTURE_SIDE)  # or the default ones
+    default_geometry: Geometry = "landmarks"  # "network" if both networks were trained together
     source_colours: SourceColours | None = None  # of the network's training; None: no cast is removed
+
+    def sides(self, texture_side: int | None = None) -> Sides:
+        """The sides that the networks were trained on; or a texture's, with a crop in the same proportion."""
+        trained = self.trained_sides
+        if texture_side is None:
+            return trained
+        return Sides(texture_side, round(texture_side * trained.crop_px / trained.texture))
 
 
 def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
@@ -45,6 +69,7 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
     if not networks.keys() & {"reflectance", "diffuse_sh"}:
         raise InputError(f"{path}: holds no Reflectance Network; give a checkpoint of `facerf train`")
     _require_builtin_coefficients(path, networks.get("geometry"))
+    side = _side(path, metadata, "texture_side", TEXTURE_SIDE)
     on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
     return Models(
         face=load_face_model(face_model),
@@ -54,8 +79,22 @@ def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.d
         checkpoint_name=path.stem,
         metadata=metadata,
         device=device,
+        trained_sides=Sides(side, _side(path, metadata, "crop_px", CROP_PER_TEXTURE * side)),
+        default_geometry=default_geometry(metadata),
         source_colours=_source_colours(path, metadata),
     )
+
+
+def _side(path: Path, metadata: dict[str, Any], name: str, default: int) -> int:
+    side = metadata.get(name, default)
+    if type(side) is not int or not 16 <= side <= CROP_PER_TEXTURE * LARGEST_TEXTURE:
+        raise InputError(f"{path}: invalid {name} in its metadata; train it again")
+    return side
+
+
+def default_geometry(metadata: dict[str, Any]) -> Geometry:
+    """How a checkpoint's heads were made in training, and so are made by default."""
+    return "network" if metadata.get("geometry") == "network" else "landmarks"
 
 
 def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | None:

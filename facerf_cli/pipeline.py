@@ -1,14 +1,14 @@
 """The method, one function an arrow: from one photo to the face under any light, from any head pose.
 
-    photo -> fit_photo -> head -> reflectance_of -> relight -> image
-                           head -> estimate_light -> light
-                           head -> predict_olat -> a texture for each light
+    photo -> fit_photo or regress_photo -> head -> reflectance_of -> relight -> image
+                                            head -> estimate_light -> light
+                                            head -> predict_olat -> a texture for each light
 
 The verbs on photos, the protocols of `evaluate` and most benchmarks call these functions. Images are
 scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,34 +21,66 @@ from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Target
-from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import fit_landmarks, trust_inside
+from facerf_cli.errors import UsageError
+from facerf_cli.face.crop import Box, from_box, from_landmarks
+from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
+from facerf_cli.face.landmarks import Face, FaceBox, find_boxes, find_faces
 from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk, weighted_sums
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.models import Models
+from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 
-TEXTURE_SIDE = 256  # texels, by default
-_CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
-
 
 def fit_photo(
-    models: Models, photo: np.ndarray, landmarks_px: np.ndarray, texture_side: int = TEXTURE_SIDE
+    models: Models, photo: np.ndarray, landmarks_px: np.ndarray, sides: Sides | None = None
 ) -> Head:
     """Crop a photo [H, W, 3] around landmarks [68, 2] in its pixels, fit the face model, unwrap the face.
 
+    `sides` are those that the networks were trained on, unless others are given.
     Raises InputError where the landmarks are no face's or the face lies outside the photo.
     """
-    crop = from_landmarks(landmarks_px, texture_side * _CROP_PER_TEXTURE)
+    sides = sides or models.sides()
+    crop = from_landmarks(landmarks_px, sides.crop_px)
     cropped = crop.apply(photo)
     in_crop = crop.to_crop(landmarks_px)
     trust = trust_inside(in_crop, crop, *photo.shape[:2])
     fit = fit_landmarks(models.face, in_crop, crop, trust=trust, start=regress_head(models, cropped))
-    return Head(cropped, fit, unwrap_face(models.face, fit, cropped, texture_side, photo.shape))
+    return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
+
+
+def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides | None = None) -> Head:
+    """Crop a photo [H, W, 3] around a detector's box, regress the head, unwrap the face.
+
+    One forward pass of the Geometry Network gives pose and shape (paper, 'Network Architecture'); there are
+    no landmarks. Raises InputError where the face lies outside the photo.
+    """
+    sides = sides or models.sides()
+    crop = from_box(box_px, sides.crop_px)
+    cropped = crop.apply(photo)
+    regressed = regress_head(models, cropped)
+    if regressed is None:
+        raise UsageError(f"{models.checkpoint_name}: {NO_GEOMETRY_NETWORK}")
+    fit = regressed_fit(models.face, regressed, crop)
+    return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
+
+
+def find_for(geometry: Geometry, photo: np.ndarray, name: str, which: str = "largest") -> Sequence[FaceBox]:
+    """Find faces in a photo [H, W, 3] with what a geometry needs: landmarks, or boxes alone.
+
+    `which` is largest, all or an index. Raises InputError, with the photo's name, where no face is found.
+    """
+    return (find_boxes if geometry == "network" else find_faces)(photo, name, which)
+
+
+def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | None = None) -> Head:
+    """The head of a face found in a photo: fitted to its landmarks, or regressed where it has none."""
+    if isinstance(face, Face):
+        return fit_photo(models, photo, face.landmarks_px, sides)
+    return regress_photo(models, photo, face.box_px, sides)
 
 
 @torch.no_grad()

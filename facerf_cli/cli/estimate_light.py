@@ -21,7 +21,13 @@ from facerf_cli.cli.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
+from facerf_cli.cli.photo_options import (
+    FaceOption,
+    GeometryOption,
+    LandmarksOption,
+    PhotoOptions,
+    TextureSizeOption,
+)
 from facerf_cli.errors import UsageError
 
 _OUTPUTS = ("_light.exr", "_light.json", "_light.png")
@@ -106,12 +112,13 @@ def estimate_light(
     sh_order: Annotated[
         int, typer.Option(min=0, max=_MOST_ORDER, help="Order of the spherical harmonics in the JSON.")
     ] = 2,
-    texture_size: TextureSizeOption = 256,
+    texture_size: TextureSizeOption = None,
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -127,7 +134,9 @@ def estimate_light(
     """
     if width % 2:
         raise UsageError(f"--width {width}: an odd width has no half; give an even number")
-    photo = PhotoOptions(settings_of(context), input_colourspace, face_model, face, landmarks, texture_size)
+    photo = PhotoOptions(
+        settings_of(context), input_colourspace, face_model, face, landmarks, geometry, texture_size
+    )
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()

@@ -10,8 +10,8 @@ from facerf_cli.cli.evaluation_options import (
     DatasetArgument,
     EvaluateOptions,
     EveryOption,
+    JointFitOption,
     PhotosOrDatasetArgument,
-    RefitOption,
     SplitOption,
     no_part_of_preset,
     only_dataset,
@@ -28,7 +28,7 @@ from facerf_cli.cli.options import (
     settings_of,
     with_machines,
 )
-from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions
+from facerf_cli.cli.photo_options import FaceOption, GeometryOption, LandmarksOption, PhotoOptions
 from facerf_cli.errors import UsageError
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
@@ -40,14 +40,16 @@ def olat(
     options: EvaluateOptions,
     split: SplitOption = "test",
     every: EveryOption = 1,
-    refit: RefitOption = False,
+    joint_fit: JointFitOption = False,
+    geometry: GeometryOption = None,
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
 ) -> int:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
-    Each source of the split's pairs is unwrapped by its fit and relit by the light that the pair names, in
-    the pose of the target camera; the truth is that light of the target's stack. In the same pose the image
+    In each source of the split's pairs the face is found and fitted, as in any photo, and relit by the light
+    that the pair names, in the pose of the target camera; the truth is that light of the target's stack. That
+    pose is fitted to the target camera's image under all lights. In the same pose the image
     is that of `facerf relight`, in another one the face alone, as with --pose. Tables are by pose, by the
     angle of the light, and by skin tone if the capture holds it. The row 'lambert' is the source's own
     texture under the cosine of the light: the least that a method must beat. A second checkpoint, --against
@@ -57,8 +59,9 @@ def olat(
     refuse_without_field(context, options, "network_alone")
     from facerf_cli.cli.items.evaluate_olat import run_olat
 
-    photo = PhotoOptions(settings_of(context), face_model=face_model)
-    return run_olat(dataset, options, photo, split, every, refit, network_alone)
+    photo = PhotoOptions(settings_of(context), face_model=face_model, geometry=geometry)
+    photo.check()
+    return run_olat(dataset, options, photo, split, every, joint_fit, network_alone)
 
 
 def reconstruction(
@@ -67,9 +70,10 @@ def reconstruction(
     options: EvaluateOptions,
     split: SplitOption = "test",
     every: EveryOption = 1,
-    refit: RefitOption = False,
+    joint_fit: JointFitOption = False,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -83,11 +87,13 @@ def reconstruction(
     no_part_of_preset(options, every)
     folder = only_dataset(inputs)
     refuse_for_others(context, photos=folder is None)
-    photo = PhotoOptions(settings_of(context), input_colourspace, face_model, face, landmarks)
+    photo = PhotoOptions(
+        settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
+    )
     photo.check()
     from facerf_cli.cli.items.evaluate_photos import run_reconstruction
 
-    return run_reconstruction(inputs, folder, options, photo, split, every, refit)
+    return run_reconstruction(inputs, folder, options, photo, split, every, joint_fit)
 
 
 def transfer(
@@ -113,8 +119,9 @@ def transfer(
     ] = False,
     split: SplitOption = "test",
     every: EveryOption = 1,
-    refit: RefitOption = False,
+    joint_fit: JointFitOption = False,
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -127,14 +134,16 @@ def transfer(
     no_part_of_preset(options, every)
     refuse_for_others(context, photos)
     refuse_without_field(context, options, "held_to_photo")
-    photo = PhotoOptions(settings_of(context), input_colourspace, face_model, landmarks=landmarks)
+    photo = PhotoOptions(
+        settings_of(context), input_colourspace, face_model, landmarks=landmarks, geometry=geometry
+    )
     photo.check()
     from facerf_cli.cli.items.evaluate_transfer import run_transfer
 
     folder = None if photos else only_dataset(inputs)
     if not photos and folder is None:
         raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    return run_transfer(inputs, folder, options, photo, split, every, refit, not held_to_photo)
+    return run_transfer(inputs, folder, options, photo, split, every, joint_fit, not held_to_photo)
 
 
 def geometry(
@@ -154,13 +163,15 @@ def geometry(
     every: EveryOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> int:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
-    Both are fitted to the same landmarks of one image, and compared where both show the face. The paper
-    trained a network with the mean face: give it as --mean-checkpoint. --against does not apply.
+    Both are fitted to the same landmarks of one image, or with --geometry network regressed from the same
+    crop, and compared where both show the face. The paper trained networks with the mean face: give them as
+    --mean-checkpoint. --against does not apply.
     """
     no_part_of_preset(options, every)
     if options.against:
@@ -168,7 +179,9 @@ def geometry(
     folder = only_dataset(inputs)
     refuse_for_others(context, photos=folder is None)
     refuse_without_field(context, options, "mean_checkpoint")
-    photo = PhotoOptions(settings_of(context), input_colourspace, face_model, face, landmarks)
+    photo = PhotoOptions(
+        settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
+    )
     photo.check()
     from facerf_cli.cli.items.evaluate_photos import run_geometry
 
@@ -205,6 +218,7 @@ def yale_b(
             show_default="all",
         ),
     ] = None,
+    geometry: GeometryOption = None,
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -220,7 +234,7 @@ def yale_b(
     refuse_without_field(context, options, "network_alone")
     from facerf_cli.cli.items.evaluate_images import run_yale_b
 
-    photo = PhotoOptions(settings_of(context), face_model=face_model)
+    photo = PhotoOptions(settings_of(context), face_model=face_model, geometry=geometry)
     return run_yale_b(folder, options, photo, shifts, subjects or [], network_alone)
 
 

@@ -103,15 +103,17 @@ SplitOption = Annotated[
 EveryOption = Annotated[
     int, typer.Option("--every", min=1, metavar="N", help="Measure every Nth pair of DATASET's split only.")
 ]
-RefitOption = Annotated[
+JointFitOption = Annotated[
     bool,
     typer.Option(
-        "--refit", help="Fit each image of DATASET to its own landmarks, not all of a person at once."
+        "--joint-fit",
+        help="Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once, "
+        "instead of each image alone.",
     ),
 ]
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
-_OF_DATASETS = ("split", "every", "refit")
+_OF_DATASETS = ("split", "every", "joint_fit")
 _OF_PHOTOS = ("face", "landmarks", "input_colourspace")
 
 

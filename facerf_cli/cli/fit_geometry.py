@@ -17,7 +17,13 @@ from facerf_cli.cli.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
+from facerf_cli.cli.photo_options import (
+    FaceOption,
+    GeometryOption,
+    LandmarksOption,
+    PhotoOptions,
+    TextureSizeOption,
+)
 
 _OUTPUTS = (
     "_texture.exr",
@@ -59,7 +65,8 @@ def fit_geometry(
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
-    texture_size: TextureSizeOption = 256,
+    geometry: GeometryOption = None,
+    texture_size: TextureSizeOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -70,7 +77,9 @@ def fit_geometry(
     (camera space) and .png, and _overlay.jpg, the mesh over the photo. The report holds each fit's error (a
     share of the distance between the outer eye corners), its quality (good, fair, poor) and the pose.
     """
-    photo = PhotoOptions(settings_of(context), input_colourspace, face_model, face, landmarks, texture_size)
+    photo = PhotoOptions(
+        settings_of(context), input_colourspace, face_model, face, landmarks, geometry, texture_size
+    )
     photo.check()
     work = FitGeometry(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -29,8 +29,22 @@ LandmarksOption = Annotated[
         show_default="detect them",
     ),
 ]
+GeometryOption = Annotated[
+    Literal["landmarks", "network"] | None,
+    typer.Option(
+        "--geometry",
+        help="Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
+        show_default="as the checkpoint was trained: landmarks; network after `train --stage joint`",
+    ),
+]
 TextureSizeOption = Annotated[
-    int, typer.Option("--texture-size", metavar="T", help="Side of the UV texture; a multiple of 256.")
+    int | None,
+    typer.Option(
+        "--texture-size",
+        metavar="T",
+        help="Side of the UV texture; a multiple of 256.",
+        show_default="the checkpoint's; 256 for the shipped one",
+    ),
 ]
 
 
@@ -43,16 +57,20 @@ class PhotoOptions:
     face_model: str = "builtin"
     face: str = "largest"
     landmarks: Path | None = None
-    texture_side: int = 256
+    geometry: Literal["landmarks", "network"] | None = None  # None: as the checkpoint was trained
+    texture_side: int | None = None  # None: the checkpoint's
 
     def check(self) -> None:
         """Raise UsageError for an option that would fail every photo; nothing heavy is loaded."""
         if self.face not in ("largest", "all") and not self.face.isdecimal():
             raise UsageError(f"--face {self.face!r}: not a face; give largest, all or a number from 0")
-        if self.texture_side % _TEXTURE_STEP or not 0 < self.texture_side <= _TEXTURE_MOST:
+        side = self.texture_side
+        if side is not None and (side % _TEXTURE_STEP or not 0 < side <= _TEXTURE_MOST):
             raise UsageError(
                 f"--texture-size {self.texture_side}: give a multiple of 256 up to {_TEXTURE_MOST}"
             )
+        if self.landmarks is not None and self.geometry == "network":
+            raise UsageError("--landmarks: --geometry network uses none; leave one out")
         if self.landmarks is not None and not self.landmarks.exists():
             raise UsageError(f"--landmarks {self.landmarks}: no such file or folder; give one that exists")
 

@@ -20,7 +20,13 @@ from facerf_cli.cli.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
+from facerf_cli.cli.photo_options import (
+    FaceOption,
+    GeometryOption,
+    LandmarksOption,
+    PhotoOptions,
+    TextureSizeOption,
+)
 from facerf_cli.cli.values import parse_lights, parse_pose
 
 Precision = Literal["float32", "bf16"]
@@ -74,7 +80,7 @@ def predict_olat(
         bool, typer.Option("--image/--texture", help="Write images of the face, or UV textures.")
     ] = False,
     network_alone: NetworkAloneOption = False,
-    texture_size: TextureSizeOption = 256,
+    texture_size: TextureSizeOption = None,
     memory: MemoryOption = 2.0,
     precision: Annotated[Precision, typer.Option(help="Compute the network in this precision.")] = "float32",
     overwrite: OverwriteOption = False,
@@ -82,6 +88,7 @@ def predict_olat(
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -94,7 +101,7 @@ def predict_olat(
     settings = settings_of(context)
     parse_lights(lights)
     parse_pose(pose)
-    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, texture_size)
+    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, geometry, texture_size)
     photo.check()
     work = PredictOlat(photo, lights, pose, image, network_alone, int(memory * 2**30), precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)

@@ -23,7 +23,13 @@ from facerf_cli.cli.options import (
     OverwriteOption,
     settings_of,
 )
-from facerf_cli.cli.photo_options import FaceOption, LandmarksOption, PhotoOptions, TextureSizeOption
+from facerf_cli.cli.photo_options import (
+    FaceOption,
+    GeometryOption,
+    LandmarksOption,
+    PhotoOptions,
+    TextureSizeOption,
+)
 from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
@@ -182,13 +188,14 @@ def relight(
         ),
     ] = "cell",
     network_alone: NetworkAloneOption = False,
-    texture_size: TextureSizeOption = 256,
+    texture_size: TextureSizeOption = None,
     memory: MemoryOption = 2.0,
     overwrite: OverwriteOption = False,
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -208,7 +215,7 @@ def relight(
     parse_lights(lights)
     if network_alone and reflectance != "field":
         raise UsageError("--network-alone: is for the field; leave it out, or use --reflectance field")
-    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, texture_size)
+    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, geometry, texture_size)
     photo.check()
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file; give one that exists")

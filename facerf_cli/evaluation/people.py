@@ -1,6 +1,7 @@
 """Faces that protocols measure: people of a prepared dataset, and users' photos, fitted as the verbs do."""
 
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -14,63 +15,119 @@ from facerf_cli.dataset.weights import load_pairs, pair_weights, weights_path
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.crop_view import CropView
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import FaceFit, fit_from_arrays, fit_landmarks
+from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_of
-from facerf_cli.models import Models
-from facerf_cli.pipeline import TEXTURE_SIDE, fit_photo
+from facerf_cli.models import Models, Sides
+from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.synth.appearance.pigments import skin_albedo
 
 T = TypeVar("T")
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
-class CameraCrop:
-    """A camera's crop of a person: the stack's header and the view of the face fitted in it."""
+class Sitting:
+    """A portrait as one method's models see it: the head, and the view in which it is compared."""
 
-    header: StackHeader
+    head: Head
     view: CropView
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
-    """A subject of a prepared dataset; crops are viewed when they are first needed.
+class Portrait:
+    """One face of a photo; every method's own models fit or regress its head, in one crop.
 
-    With `refit` each crop is fitted to its own landmarks, as a photo is, not all of them at once.
+    `face` is the face as it was found, or a fit that was made beforehand. The photo's alpha tells what is
+    neither compared nor used.
     """
 
-    model: MorphableModel
+    photo: LinearImage
+    face: FaceBox | FaceFit
+    sides: Sides
+    keep_eyes: bool = False
+    _sittings: dict[int, tuple[Models, Sitting]] = field(default_factory=dict)
+
+    def by(self, models: Models) -> Sitting:
+        """The portrait by a method's models; InputError where nothing of the face is visible."""
+        if id(models) not in self._sittings:
+            head = self._head(models)
+            shown = _shown(head.fit.crop, self.photo)
+            view = CropView.of(models.face, head.fit, shown, self.keep_eyes)
+            self._sittings[id(models)] = models, Sitting(head.without(models.face, shown), view)
+        return self._sittings[id(models)][1]
+
+    def posed_as(self, fit: FaceFit, models: Models) -> CropView:
+        """The view in which another fit's shape has this portrait's pose."""
+        own = self.by(models).view.fit
+        posed = replace(own, alpha=fit.alpha, beta=fit.beta)
+        return CropView.of(models.face, posed, _shown(posed.crop, self.photo), self.keep_eyes)
+
+    def _head(self, models: Models) -> Head:
+        if not isinstance(self.face, FaceFit):
+            return head_of(models, self.photo.pixels, self.face, self.sides)
+        image = self.photo.pixels
+        face = unwrap_face(models.face, self.face, image, self.sides.texture, image.shape)
+        return Head(image, self.face, face)
+
+
+def common_mask(views: Iterable[CropView]) -> np.ndarray:
+    """The mask [S, S] inside those of all views."""
+    return np.minimum.reduce([view.mask for view in views])
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A subject of a prepared dataset.
+
+    Each source is a photo of its own: the face is found in it, and fitted or regressed as `geometry` says.
+    With `geometry` None the head is that which was fitted to all calibrated cameras of the person at once.
+    """
+
     dataset: Dataset
     name: str
+    geometry: Geometry | None
+    sides: Sides
     keep_eyes: bool = False
-    refit: bool = False
-    _crops: dict[str, CameraCrop] = field(default_factory=dict)
+    _lit: dict[str, Portrait] = field(default_factory=dict)
 
-    def crop(self, camera: str) -> CameraCrop:
-        """A camera's crop of the person."""
-        if camera not in self._crops:
-            header = read_olat_header(self.dataset.stack_path(self.name, camera))
-            fit = _in_own_frame(fit_from_arrays(header.fit))
-            if self.refit:
-                fit = refitted(self.model, fit)
+    def portraits(self, pairs: Iterable[Pair]) -> Iterator[tuple[Pair, Portrait]]:
+        """Yield the pairs with their sources; those in which no face is found are named and left out."""
+        for pair in pairs:
             try:
-                view = CropView.of(self.model, fit, header.seen, self.keep_eyes)
+                portrait = self.portrait(pair)
             except InputError as error:
-                raise InputError(f"{self.name}/{camera}: {error}") from None
-            self._crops[camera] = CameraCrop(header, view)
-        return self._crops[camera]
+                log.warning("%s; left out", error)
+            else:
+                yield pair, portrait
 
-    def posed_as(self, fit: FaceFit, camera: str) -> CameraCrop:
-        """A camera's crop with another fit's shape in its pose; the crop's own where the shapes agree."""
-        crop = self.crop(camera)
-        own = crop.view.fit
-        if torch.equal(own.alpha, fit.alpha) and torch.equal(own.beta, fit.beta):
-            return crop
-        posed = replace(own, alpha=fit.alpha, beta=fit.beta)
-        return CameraCrop(crop.header, CropView.of(self.model, posed, crop.header.seen, self.keep_eyes))
+    def portrait(self, pair: Pair) -> Portrait:
+        """The source of a pair; InputError where no face is found in it."""
+        name = f"{pair.subject}/{pair.index:05d}"
+        return self._portrait(self.source(pair), pair.source_camera, name)
+
+    def lit(self, camera: str) -> Portrait:
+        """The person in a camera under all lights: under one light no detector finds a face."""
+        if camera not in self._lit:
+            image = self.header(camera).source
+            self._lit[camera] = self._portrait(image, camera, f"{self.name}/{camera}")
+        return self._lit[camera]
+
+    def header(self, camera: str) -> StackHeader:
+        """The header of a camera's stack."""
+        return read_olat_header(self.dataset.stack_path(self.name, camera))
+
+    def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
+        header = self.header(camera)
+        if self.geometry is None:
+            face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
+        else:
+            face = find_for(self.geometry, image, name)[0]
+        return Portrait(LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
 
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
@@ -79,15 +136,9 @@ class Person:
             return read_image(path).pixels
         return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
 
-    def head(self, pair: Pair, image: np.ndarray) -> Head:
-        """The head of a pair's source image [S, S, 3], by the fit of its crop."""
-        crop = self.crop(pair.source_camera)
-        face = unwrap_face(self.model, crop.view.fit, image, TEXTURE_SIDE, image.shape)
-        return Head(image, crop.view.fit, face).without(self.model, crop.header.seen)
-
     def light(self, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """The true light of a pair's source: camera-space directions [L, 3], rgb weights [L, 3]."""
-        directions = self.crop(pair.source_camera).header.directions
+        directions = self.header(pair.source_camera).directions
         if not weights_path(self.dataset).is_file():  # nothing is written into a dataset that is measured on
             return directions, pair_weights(self.dataset, pair).numpy()
         pairs, weights = load_pairs(self.dataset)[self.name]
@@ -117,11 +168,6 @@ class Person:
         return float(value)
 
 
-def refitted(model: MorphableModel, fit: FaceFit) -> FaceFit:
-    """The fit of the same crop to its own landmarks alone."""
-    return fit_landmarks(model, fit.landmarks_px.double().numpy(), fit.crop)
-
-
 def _in_own_frame(fit: FaceFit) -> FaceFit:
     """The fit with its crop as a separate image: the crop's pixels are the photo's."""
     side_px = fit.crop.size_px
@@ -135,31 +181,6 @@ def evenly(groups: Mapping[str, Sequence[T]], most: int) -> dict[str, list[T]]:
     for place, name in rounds[:most]:
         chosen[name].append(groups[name][place])
     return {name: members for name, members in chosen.items() if members}
-
-
-@dataclass(frozen=True, eq=False)
-class Portrait:
-    """One face of a photo: its head, and its view, which leaves out what the photo's alpha leaves out."""
-
-    photo: LinearImage
-    landmarks_px: np.ndarray  # [68, 2] in the photo's pixels
-    head: Head
-    view: CropView
-    keep_eyes: bool
-
-    @staticmethod
-    def of(
-        model: MorphableModel, photo: LinearImage, landmarks_px: np.ndarray, head: Head, keep_eyes: bool
-    ) -> "Portrait":
-        """The face of a photo that was fitted with `model`."""
-        shown = _shown(head.fit.crop, photo)
-        view = CropView.of(model, head.fit, shown, keep_eyes)
-        return Portrait(photo, landmarks_px, head.without(model, shown), view, keep_eyes)
-
-    def fitted_by(self, models: Models) -> "Portrait":
-        """The same face fitted to the same landmarks with another face model."""
-        head = fit_photo(models, self.photo.pixels, self.landmarks_px)
-        return Portrait.of(models.face, self.photo, self.landmarks_px, head, self.keep_eyes)
 
 
 def _shown(crop: Crop, photo: LinearImage) -> np.ndarray:

@@ -13,6 +13,10 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LANDMARKS_M, TOP_M
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
 
+Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's pixels
+# A detector's box in `from_landmarks` crops (benchmarks/crop_boxes.py): the crop's side in sides of the box,
+# and how far above the box's centre the crop's lies.
+_PER_BOX, _ABOVE_BOX = 1.5, 0.04
 MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
 _SMALLEST_FACE_PX = 4.0  # landmarks within fewer pixels cannot be a face
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)
@@ -87,6 +91,17 @@ def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
     side_px = MARGIN * float((high - low).max())
     x0_px, y0_px = (low + high - side_px) / 2
     return Crop(float(x0_px), float(y0_px), side_px, size_px)
+
+
+def from_box(box_px: Box, size_px: int) -> Crop:
+    """The crop around a detector's box, about that of `from_landmarks` for the same face."""
+    left, top, right, bottom = box_px
+    box_side_px = (right - left + bottom - top) / 2
+    if not 0 < box_side_px < math.inf:
+        raise InputError(f"box {box_px}: not a box of a face; give left, top, right and bottom in pixels")
+    side_px = _PER_BOX * box_side_px
+    x_px, y_px = (left + right) / 2, (top + bottom) / 2 - _ABOVE_BOX * box_side_px
+    return Crop(x_px - side_px / 2, y_px - side_px / 2, side_px, size_px)
 
 
 def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:

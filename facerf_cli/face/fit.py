@@ -4,6 +4,7 @@ The camera is fixed; pose (rotation, translation), identity alpha and expression
 alone constrain identity little and most of the surface not at all, so the priors are strong.
 """
 
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks
-from facerf_cli.face.fit_start import FitStart, better_start, weak_perspective
+from facerf_cli.face.fit_start import FitStart, better_start, seeded_state, weak_perspective
 from facerf_cli.face.gauss_newton import (
     INNER_COUNT,
     FitBasis,
@@ -27,10 +28,10 @@ from facerf_cli.face.gauss_newton import (
     minimise,
     residuals,
 )
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import BUILTIN, MorphableModel
 from facerf_cli.face.silhouette import CONTOUR_RAYS, NOSE, POINTS_PER_RAY
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
-from facerf_cli.raster.camera import Camera
+from facerf_cli.raster.camera import Camera, project
 
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # the largest mean landmark errors of a good and of a fair fit
 IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
@@ -39,7 +40,8 @@ _BORDER = 0.01  # share of the crop's side: contour landmarks closer to the phot
 _LARGEST_CROP_PX = 8192
 _TENSORS = ("rotation", "translation_m", "alpha", "beta", "landmarks_px")  # of a FaceFit, in its file
 
-Quality = Literal["good", "fair", "poor"]
+Quality = Literal["good", "fair", "poor", "unknown"]
+Geometry = Literal["landmarks", "network"]  # fitted to landmarks, or regressed by the Geometry Network
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FaceFit:
-    """The fit of one photo's face; tensors float32."""
+    """The head of one photo's face, fitted to landmarks or regressed from the crop; tensors float32."""
 
     model: str
     crop: Crop
@@ -64,8 +66,9 @@ class FaceFit:
     translation_m: Tensor  # [3]
     alpha: Tensor  # [Ki]
     beta: Tensor  # [Ke]
-    landmarks_px: Tensor  # [68, 2], the fitted landmarks' targets in the crop's pixels
-    error_iod: float  # mean error of the trusted landmarks over the distance of the outer eye corners
+    landmarks_px: Tensor  # [68, 2] in the crop's pixels: the targets of the fit, or the regressed head's own
+    # mean error of the trusted landmarks over the distance of the outer eye corners; NaN without landmarks
+    error_iod: float
 
     @property
     def camera(self) -> Camera:
@@ -74,7 +77,10 @@ class FaceFit:
 
     @property
     def quality(self) -> Quality:
-        """'good' up to an error of `GOOD_ERROR_IOD`, 'fair' up to `FAIR_ERROR_IOD`, else 'poor'."""
+        """'good' up to an error of `GOOD_ERROR_IOD`, 'fair' up to `FAIR_ERROR_IOD`, else 'poor'.
+
+        'unknown' if the head was regressed, without landmarks to compare it with.
+        """
         return quality_of(self.error_iod)
 
     def turn_to(self, rotation: Tensor) -> Tensor:
@@ -112,7 +118,9 @@ class FitBatch:
 
 
 def quality_of(error_iod: float) -> Quality:
-    """The quality of a fit with this mean landmark error."""
+    """The quality of a fit with this mean landmark error; see `FaceFit.quality`."""
+    if math.isnan(error_iod):
+        return "unknown"
     if error_iod <= GOOD_ERROR_IOD:
         return "good"
     return "fair" if error_iod <= FAIR_ERROR_IOD else "poor"
@@ -143,6 +151,33 @@ def fit_landmarks(
         landmarks_px=target_px.float(),
         error_iod=float(fit.error_iod[0]),
     )
+
+
+def regressed_fit(model: MorphableModel, regressed: FitStart, crop: Crop) -> FaceFit:
+    """The head that a Geometry Network regressed [1, ...] from a crop (paper, 'Network Architecture').
+
+    The network's coefficients are those of the built-in model; another model gets the head closest to it by
+    least squares over the mesh.
+    """
+    if model.name == BUILTIN:
+        missing = (
+            len(model.identity) - regressed.alpha.shape[1],
+            len(model.expression) - regressed.beta.shape[1],
+        )
+        alpha, beta = (
+            torch.nn.functional.pad(tensor[0].float(), (0, count))
+            for tensor, count in zip((regressed.alpha, regressed.beta), missing, strict=True)
+        )
+        rotation, translation_m = regressed.rotation[0].float(), regressed.translation_m[0].float()
+    else:
+        basis = fit_basis(model, FitSettings())
+        state = seeded_state(basis, regressed)
+        coefficients = (state.coordinates @ basis.spread.mT)[0].float()
+        alpha, beta = coefficients[: len(model.identity)], coefficients[len(model.identity) :]
+        rotation, translation_m = state.rotation[0].float(), state.translation_m[0].float()
+    vertices = model.vertices(alpha[None], beta[None])[0] @ rotation.mT + translation_m
+    landmarks_px = project(model.landmarks(vertices[None])[0], crop.camera)
+    return FaceFit(model.name, crop, rotation, translation_m, alpha, beta, landmarks_px, math.nan)
 
 
 def fit_batch(

@@ -36,6 +36,12 @@ class Head:
     fit: FaceFit
     face: FaceTexture
 
+    @property
+    def landmarks_px(self) -> np.ndarray:
+        """Landmarks [68, 2] in the crop's pixels; see `FaceFit`."""
+        landmarks_px: np.ndarray = self.fit.landmarks_px.numpy()
+        return landmarks_px
+
     def without(self, model: MorphableModel, mask: np.ndarray) -> "Head":
         """The head without the texels that a mask [S, S] of the crop, 0..1, does not show.
 

@@ -1,16 +1,17 @@
-"""The 68 landmarks (Multi-PIE order) of the faces in a photo, detected with dlib or read from a file.
+"""Faces in a photo: their boxes, and 68 landmarks (Multi-PIE order), detected with dlib or read from a file.
 
 Positions are in the photo's pixels with pixel centres at index + `PIXEL_CENTRE` (`raster/camera.py`); in
 dlib's positions and boxes the centre of a pixel is a whole number.
 """
 
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import dlib
 import numpy as np
@@ -18,7 +19,7 @@ import torch
 
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.face.crop import Crop, check_landmarks
+from facerf_cli.face.crop import Box, Crop, check_landmarks
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -36,16 +37,16 @@ _JITTER = ((0.0, 0.0, 0.0), (0.03, 0.03, 0.0), (-0.03, -0.03, 0.0), (0.0, 0.0, 0
 # no other one has a much higher score.
 _DOUBTFUL_SCORE = 0.3
 
+_NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _MAX_BYTES = 1 << 20  # of a landmark file
 _PTS_FIRST_PIXEL = 0.5  # .pts counts pixels from 1: the first pixel's centre is 1.0 there and 0.5 here
 
 
 @dataclass(frozen=True)
-class Face:
-    """A face in a photo: landmarks [68, 2] and box (left, top, right, bottom) in the photo's pixels."""
+class FaceBox:
+    """A face in a photo: its box (left, top, right, bottom) in the photo's pixels."""
 
-    landmarks_px: np.ndarray
-    box_px: tuple[float, float, float, float]
+    box_px: Box
     score: float
 
     @property
@@ -53,6 +54,13 @@ class Face:
         """The area of the box."""
         left, top, right, bottom = self.box_px
         return (right - left) * (bottom - top)
+
+
+@dataclass(frozen=True)
+class Face(FaceBox):
+    """A face with its landmarks [68, 2] in the photo's pixels."""
+
+    landmarks_px: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -74,6 +82,15 @@ _ATTEMPTS = (
 )
 
 
+def face_at(landmarks_px: np.ndarray) -> Face:
+    """The face of given landmarks [68, 2], in their bounds."""
+    (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
+    return Face((left, top, right, bottom), math.inf, landmarks_px)
+
+
+Found = TypeVar("Found", bound=FaceBox)
+
+
 def find_faces(pixels_linear: np.ndarray, name: str, which: str = "largest") -> list[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
@@ -81,14 +98,20 @@ def find_faces(pixels_linear: np.ndarray, name: str, which: str = "largest") -> 
     """
     faces = detect_landmarks(to_display(pixels_linear))
     if not faces:
-        raise InputError(
-            f"{name}: no face found; try a larger or brighter image that shows the whole face, "
-            "or give its landmarks with --landmarks FILE"
-        )
+        raise InputError(f"{name}: {_NO_FACE}, or give its landmarks with --landmarks FILE")
     return choose_face(faces, which, name)
 
 
-def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
+def find_boxes(pixels_linear: np.ndarray, name: str, which: str = "largest") -> list[FaceBox]:
+    """Find upright faces as `find_faces` does, without their landmarks: the predictor is not loaded."""
+    image = to_display(pixels_linear)
+    for attempt in _ATTEMPTS:
+        if attempt.turns == 0 and (boxes := _trusted([found.box for found in _detect(image, attempt)])):
+            return choose_face(boxes, which, name)
+    raise InputError(f"{name}: {_NO_FACE}, or give --geometry landmarks with --landmarks FILE")
+
+
+def choose_face(faces: list[Found], which: str, name: str) -> list[Found]:
     """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
 
     'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
@@ -120,15 +143,37 @@ def detect_landmarks(image_srgb: np.ndarray) -> list[Face]:
     if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
         raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
     for attempt in _ATTEMPTS:
-        faces = list(_detect(image_srgb, attempt))
-        if faces:
-            doubtful = min(_DOUBTFUL_SCORE, max(face.score for face in faces) / 3)
-            return sorted((f for f in faces if f.score >= doubtful), key=lambda face: face.box_px[0])
+        if faces := _trusted([found.face() for found in _detect(image_srgb, attempt)]):
+            return faces
     return []
 
 
-def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[Face]:
-    """Run the detector and the predictor on one copy of the image; positions in the image's pixels."""
+def _trusted(faces: list[Found]) -> list[Found]:
+    """Faces from left to right, without doubtful ones."""
+    doubtful = min(_DOUBTFUL_SCORE, max((face.score for face in faces), default=0.0) / 3)
+    return sorted((face for face in faces if face.score >= doubtful), key=lambda face: face.box_px[0])
+
+
+@dataclass(frozen=True, eq=False)
+class _Detection:
+    """A box that the detector found in a turned copy of an image, and what the predictor needs."""
+
+    box: FaceBox
+    turned: np.ndarray
+    centre_px: np.ndarray  # in the turned image
+    side_px: float
+    curve: np.ndarray
+    turns: int
+    shape: tuple[int, ...]  # of the image
+
+    def face(self) -> Face:
+        """The face with its landmarks."""
+        landmarks = _predict(self.turned, self.centre_px, self.side_px, self.curve)
+        return Face(self.box.box_px, self.box.score, _turn_back(landmarks, self.turns, self.shape))
+
+
+def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[_Detection]:
+    """Run the detector on one copy of the image; positions in the image's pixels."""
     turned = np.rot90(image, attempt.turns)
     height, width = turned.shape[:2]
     small = _resize(turned, min(attempt.side_px / max(height, width), attempt.enlarge))
@@ -142,11 +187,16 @@ def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[Face]:
         high = (np.array([rectangle.right(), rectangle.bottom()]) + 1 - pad) * to_photo
         if ((low + high) / 2 < 0).any() or ((low + high) / 2 > (width, height)).any():
             continue
-        landmarks = _predict(turned, (low + high) / 2, float((high - low).mean()), curve)
         corners = _turn_back(np.array([low, high]), attempt.turns, image.shape[:2])
         (left, top), (right, bottom) = corners.min(0).tolist(), corners.max(0).tolist()
-        yield Face(
-            _turn_back(landmarks, attempt.turns, image.shape[:2]), (left, top, right, bottom), float(score)
+        yield _Detection(
+            FaceBox((left, top, right, bottom), float(score)),
+            turned,
+            (low + high) / 2,
+            float((high - low).mean()),
+            curve,
+            attempt.turns,
+            image.shape[:2],
         )
 
 

@@ -53,12 +53,11 @@ _SHEET_ROWS, _SHEET_PX = 8, 256
 
 @dataclass(frozen=True)
 class JointSettings:
-    """The paper's settings, and switches of its ablations."""
+    """The paper's settings."""
 
     crop_px: int = 512
     texture_side: int = 512
     photos_share: float = 0.2  # of the batches, if photos are given
-    mean_face: bool = False  # pose alone: alpha = beta = 0 (paper, 'Ablative Study')
     weights: PaperWeights = _PAPER
     validation_pairs: int = 12  # of each kind: same pose as the source, other pose
     seed: int = 0
@@ -111,6 +110,8 @@ class JointObjective(Objective):
         self._model = model
         self._train = open_pairs(dataset, "train", settings.crop_px)
         self._held_out = open_pairs(dataset, "validation", settings.crop_px)
+        sides = {"texture_side": settings.texture_side, "crop_px": settings.crop_px}
+        self.inputs = {"geometry": "network", **sides}
         self.source_colours = SourceColours.of(self._train.source_colours(_COLOURS_MEASURED))
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
@@ -155,7 +156,7 @@ class JointObjective(Objective):
         estimate = GeometryEstimate(*(tensor.float() for tensor in raw))
         if self._model.mean.device != crops.device:
             self._model = self._model.to(crops.device)
-        return estimate, pose_heads(self._model, estimate, self.settings.mean_face)
+        return estimate, pose_heads(self._model, estimate)
 
     def _geometry_terms(
         self, estimate: GeometryEstimate, heads: PosedHeads, detected_px: Tensor
@@ -165,7 +166,7 @@ class JointObjective(Objective):
         found_px = heads.landmarks_px(detected_px, self.camera)
         landmarks = landmark_loss(found_px, detected_px[:, list(LANDMARKS)], self.settings.crop_px)
         terms = {"landmarks": weights.landmarks * landmarks}
-        if not self.settings.mean_face:
+        if estimate.alpha.shape[1] + estimate.beta.shape[1]:  # none with the mean face
             prior = regularisation(estimate.alpha, estimate.beta, weights)
             terms["regularisation"] = weights.regularisation * prior
         return terms

@@ -23,7 +23,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.training.objective import Batch, Objective, seeded
+from facerf_cli.training.objective import INPUTS, Batch, Objective, seeded
 from facerf_cli.training.processes import (
     broadcast_from_first,
     distributed,
@@ -260,7 +260,7 @@ def _metadata(run: _Run, row: Row) -> dict[str, Any]:
     if "provenance" in start:
         provenance["started_from"] = start["provenance"]
     colours = run.objective.source_colours
-    kept = {"source_colours": start["source_colours"]} if "source_colours" in start else {}
+    inputs = {name: start[name] for name in INPUTS if name in start} | run.objective.inputs
     leg = {
         "objective": type(run.objective).__name__,
         "networks": sorted(run.objective.networks),
@@ -270,7 +270,8 @@ def _metadata(run: _Run, row: Row) -> dict[str, Any]:
         **asdict(run.settings),
     }
     return {
-        **({"source_colours": colours.as_metadata()} if colours else kept),
+        **inputs,
+        **({"source_colours": colours.as_metadata()} if colours else {}),
         "layout_version": LAYOUT_VERSION,
         "licence": "; ".join(dict.fromkeys(words for words in licences if words)),
         "provenance": provenance,

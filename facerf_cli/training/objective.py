@@ -10,6 +10,9 @@ from torch import Tensor, nn
 
 from facerf_cli.network.inputs import SourceColours
 
+# Entries of a checkpoint's metadata that say what its networks expect at test time (`models.py`).
+INPUTS = ("source_colours", "geometry", "texture_side", "crop_px")
+
 
 @dataclass(frozen=True)
 class Validation:
@@ -36,9 +39,14 @@ class Objective(nn.Module):
     networks: nn.ModuleDict  # trained, averaged, saved: by the names of network.saved.FORMS
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; 'licence' is that of the whole
+    inputs: dict[str, Any]  # entries of `INPUTS`
     source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.inputs = {}
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:
         """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.

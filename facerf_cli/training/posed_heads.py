@@ -43,13 +43,10 @@ class PosedHeads:
         return torch.cat([contour_px, project(self.fixed_landmarks, camera)], 1)
 
 
-def pose_heads(model: MorphableModel, estimate: GeometryEstimate, mean_face: bool = False) -> PosedHeads:
-    """v^c = R v(alpha, beta) + t, with the leading shapes of the model; with `mean_face`, without shapes."""
+def pose_heads(model: MorphableModel, estimate: GeometryEstimate) -> PosedHeads:
+    """v^c = R v(alpha, beta) + t, with as many leading shapes of the model as there are coefficients."""
     head = leading(model, estimate.alpha.shape[1], estimate.beta.shape[1])
-    alpha, beta = estimate.alpha, estimate.beta
-    if mean_face:
-        alpha, beta = torch.zeros_like(alpha), torch.zeros_like(beta)
-    turned = head.vertices(alpha, beta) @ estimate.rotation.mT
+    turned = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
     vertices = turned + estimate.translation_m[:, None]
     return PosedHeads(vertices, estimate.rotation, head.landmarks(vertices)[:, list(FIXED_LANDMARKS)])
 

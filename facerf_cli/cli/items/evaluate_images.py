@@ -60,7 +60,9 @@ class _YaleB:
     network_alone: bool
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
-        return compare_sitter(self.database, item.name, load_methods(self.methods), self.network_alone)
+        methods = load_methods(self.methods)
+        geometry = self.methods.photo.geometry or methods[0].models.default_geometry
+        return compare_sitter(self.database, item.name, methods, self.network_alone, geometry)
 
 
 def run_pairs(

@@ -12,6 +12,7 @@ from facerf_cli.cli.items.evaluation import (
     every_nth,
     load_methods,
     people_items,
+    person_of,
     prepare_methods,
     read_split,
     require_enough,
@@ -21,7 +22,7 @@ from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Comparison
-from facerf_cli.evaluation.people import Person, evenly
+from facerf_cli.evaluation.people import evenly
 from facerf_cli.evaluation.protocols.olat import compare_olats
 from facerf_cli.evaluation.published import TABLE_1, TABLE_3
 from facerf_cli.evaluation.summary import Layout
@@ -35,33 +36,31 @@ def run_olat(
     photo: PhotoOptions,
     split: str,
     every: int,
-    refit: bool,
+    joint_fit: bool,
     network_alone: bool,
 ) -> int:
     """Measure a dataset's split; the exit code."""
-    prepared, pairs = read_split(dataset, split, photo.face_model, refit)
+    prepared, pairs = read_split(dataset, split, photo.face_model, joint_fit)
     chosen = _paper_pairs(dataset, pairs) if options.preset else every_nth(pairs, every)
     methods = MethodOptions.of(photo, options)
-    work = _Olat(methods, prepared, chosen, options.keep_eyes, refit, network_alone)
+    work = _Olat(methods, prepared, chosen, options.keep_eyes, joint_fit, network_alone)
     layout = Layout(
         name="olat",
         title="Single lights of held-out people",
         metrics=("si_mse", "si_mse_clipped", "ssim", "tone_drift_deg"),
         by=("pose", "turn", "angle", "tone"),
         published=TABLE_1 + (TABLE_3 if options.against else ()),
-        notes=_notes(split, refit, network_alone),
+        notes=_notes(split, joint_fit, network_alone),
     )
     items = people_items(dataset, list(chosen), options.output)
     prepare = partial(prepare_methods, methods, options)
     return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
-def _notes(split: str, refit: bool, network_alone: bool) -> tuple[str, ...]:
+def _notes(split: str, joint_fit: bool, network_alone: bool) -> tuple[str, ...]:
     """Notes below the figures."""
     field = "the network alone" if network_alone else "corrected by its source image"
-    fits = (
-        "Each image is fitted to its own landmarks." if refit else "A person's images are fitted all at once."
-    )
+    fits = "A person's images are fitted all at once." if joint_fit else "Each image is fitted alone."
     return (
         f"Split {split}. The field is {field}. {fits}",
         "si_mse_clipped clips the truth at white, as a camera does; otherwise a glint outweighs a face.",
@@ -97,10 +96,10 @@ class _Olat:
     dataset: Dataset
     pairs: Mapping[str, list[Pair]]
     keep_eyes: bool
-    refit: bool
+    joint_fit: bool
     network_alone: bool
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
-        person = Person(methods[0].models.face, self.dataset, item.name, self.keep_eyes, self.refit)
+        person = person_of(item, self.dataset, self.methods, self.keep_eyes, self.joint_fit)
         return compare_olats(person, self.pairs[item.name], methods, self.network_alone)

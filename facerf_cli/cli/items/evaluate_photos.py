@@ -12,6 +12,7 @@ from facerf_cli.cli.items.evaluation import (
     chosen_sources,
     load_methods,
     people_items,
+    person_of,
     photo_items,
     portraits,
     prepare_methods,
@@ -23,8 +24,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Person
-from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, Form, compare_geometries
+from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, compare_geometries
 from facerf_cli.evaluation.protocols.reconstruction import reconstruct, reconstruct_person
 from facerf_cli.evaluation.published import TABLE_2_RECONSTRUCTION, TABLE_4
 from facerf_cli.evaluation.summary import Layout
@@ -40,7 +40,7 @@ def run_reconstruction(
     photo: PhotoOptions,
     split: str,
     every: int,
-    refit: bool,
+    joint_fit: bool,
 ) -> int:
     """Measure photos, or the split of a dataset's folder; the exit code."""
     methods = MethodOptions.of(photo, options)
@@ -49,10 +49,10 @@ def run_reconstruction(
         items = photo_items(inputs, options, _PAPER_PHOTOS)
         work = _ReconstructPhotos(methods, options.keep_eyes)
     else:
-        dataset, pairs = read_split(folder, split, photo.face_model, refit)
+        dataset, pairs = read_split(folder, split, photo.face_model, joint_fit)
         chosen = chosen_sources(folder, pairs, options, every, _PAPER_PHOTOS)
         items = people_items(folder, list(chosen), options.output)
-        work = _ReconstructPeople(methods, dataset, chosen, options.keep_eyes, refit)
+        work = _ReconstructPeople(methods, dataset, chosen, options.keep_eyes, joint_fit)
     layout = Layout(
         name="reconstruction",
         title="Photos explained and rendered again",
@@ -77,8 +77,8 @@ class _ReconstructPhotos:
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
-        for case, portrait in portraits(item, self.methods.photo, self.keep_eyes):
-            yield reconstruct(case, portrait.view, portrait.head, methods)
+        for case, portrait in portraits(item, self.methods, self.keep_eyes):
+            yield reconstruct(case, portrait, methods)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +89,11 @@ class _ReconstructPeople:
     dataset: Dataset
     pairs: Mapping[str, list[Pair]]
     keep_eyes: bool
-    refit: bool
+    joint_fit: bool
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
-        person = Person(methods[0].models.face, self.dataset, item.name, self.keep_eyes, self.refit)
+        person = person_of(item, self.dataset, self.methods, self.keep_eyes, self.joint_fit)
         return reconstruct_person(person, self.pairs[item.name], methods)
 
 
@@ -113,7 +113,7 @@ def run_geometry(
         items = photo_items(inputs, options, _PAPER_PHOTOS)
         work = _CompareOnPhotos(forms)
     else:
-        dataset, pairs = read_split(folder, split, photo.face_model, refit=True)
+        dataset, pairs = read_split(folder, split, photo.face_model, joint_fit=False)
         chosen = chosen_sources(folder, pairs, options, every, _PAPER_PHOTOS)
         items = people_items(folder, list(chosen), options.output)
         work = _CompareOnPeople(forms, dataset, chosen)
@@ -152,9 +152,12 @@ def _mean_methods(options: _FormOptions) -> tuple[Method, ...]:
         models = method.models
         if options.mean_checkpoint is not None and method.kind == "field":
             models = load_models(options.mean_checkpoint, options.methods.photo.face_model, models.device)
-        mean = replace(models, face=models.face.pose_only(), geometry=None)  # the network regresses shapes
-        found.append(replace(method, models=mean))
+        found.append(replace(method, models=replace(models, face=models.face.pose_only())))
     return tuple(found)
+
+
+def _forms(options: _FormOptions) -> dict[str, tuple[Method, ...]]:
+    return {FULL: load_methods(options.methods), MEAN: _mean_methods(options)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,14 +167,9 @@ class _CompareOnPhotos:
     options: _FormOptions
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
-        methods, means = load_methods(self.options.methods), _mean_methods(self.options)
-        for case, portrait in portraits(item, self.options.methods.photo, self.options.keep_eyes):
-            mean = portrait.fitted_by(means[0].models)
-            forms = {
-                FULL: Form(portrait.view, portrait.head, methods),
-                MEAN: Form(mean.view, mean.head, means),
-            }
-            yield compare_geometries(case, portrait.head.cropped, forms)
+        forms = _forms(self.options)
+        for case, portrait in portraits(item, self.options.methods, self.options.keep_eyes):
+            yield compare_geometries(case, portrait, forms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,16 +181,8 @@ class _CompareOnPeople:
     pairs: Mapping[str, list[Pair]]
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
-        both = load_methods(self.options.methods), _mean_methods(self.options)
-        people = [
-            Person(methods[0].models.face, self.dataset, item.name, self.options.keep_eyes, refit=True)
-            for methods in both
-        ]
-        for pair in self.pairs[item.name]:
-            case = Case(f"{pair.subject}/{pair.index:05d}", pair.subject, people[0].facts)
-            image = people[0].source(pair)
-            forms = {
-                name: Form(person.crop(pair.source_camera).view, person.head(pair, image), methods)
-                for name, person, methods in zip((FULL, MEAN), people, both, strict=True)
-            }
-            yield compare_geometries(case, image, forms)
+        options, forms = self.options, _forms(self.options)
+        person = person_of(item, self.dataset, options.methods, options.keep_eyes, joint_fit=False)
+        for pair, portrait in person.portraits(self.pairs[item.name]):
+            case = Case(f"{pair.subject}/{pair.index:05d}", pair.subject, person.facts)
+            yield compare_geometries(case, portrait, forms)

@@ -12,6 +12,7 @@ from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     load_methods,
     people_items,
+    person_of,
     portraits,
     prepare_methods,
     read_split,
@@ -23,7 +24,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.people import Person, evenly
+from facerf_cli.evaluation.people import evenly
 from facerf_cli.evaluation.protocols.transfer import Side, couples_of, transfer, transfer_person
 from facerf_cli.evaluation.published import TABLE_2_TRANSFER
 from facerf_cli.evaluation.summary import Layout
@@ -40,7 +41,7 @@ def run_transfer(
     photo: PhotoOptions,
     split: str,
     every: int,
-    refit: bool,
+    joint_fit: bool,
     network_alone: bool,
 ) -> int:
     """Measure couples of photos, or of the split of a dataset's folder; the exit code."""
@@ -51,10 +52,10 @@ def run_transfer(
         items = list(couples)
         work = _TransferPhotos(methods, couples, options.keep_eyes, network_alone)
     else:
-        dataset, pairs = read_split(folder, split, photo.face_model, refit)
+        dataset, pairs = read_split(folder, split, photo.face_model, joint_fit)
         chosen = _chosen_couples(folder, pairs, options, every)
         items = people_items(folder, list(chosen), options.output)
-        work = _TransferPeople(methods, dataset, chosen, options.keep_eyes, refit, network_alone)
+        work = _TransferPeople(methods, dataset, chosen, options.keep_eyes, joint_fit, network_alone)
     layout = Layout(
         name="transfer",
         title="Reflectances of two images of a person exchanged",
@@ -190,8 +191,7 @@ class _TransferPhotos:
         couple = self.couples[item]
         for own, other in ((couple.first, couple.second), (couple.second, couple.first)):
             case = Case(f"{own.name}_by_{Path(other.name).name}", couple.person)
-            portrait = next(portraits(own, self.methods.photo, self.keep_eyes))[1]
-            sides.append(Side(case, portrait.view, portrait.head))
+            sides.append(Side(case, next(portraits(own, self.methods, self.keep_eyes))[1]))
         yield from transfer((sides[0], sides[1]), methods, self.network_alone)
 
 
@@ -203,10 +203,10 @@ class _TransferPeople:
     dataset: Dataset
     couples: Mapping[str, list[tuple[Pair, Pair]]]
     keep_eyes: bool
-    refit: bool
+    joint_fit: bool
     network_alone: bool
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
-        person = Person(methods[0].models.face, self.dataset, item.name, self.keep_eyes, self.refit)
+        person = person_of(item, self.dataset, self.methods, self.keep_eyes, self.joint_fit)
         return transfer_person(person, self.couples[item.name], methods, self.network_alone)

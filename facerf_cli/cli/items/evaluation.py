@@ -9,7 +9,6 @@ from pathlib import Path
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.cli.items.photos import face_model as face_model_of
 from facerf_cli.cli.items.photos import fit_faces, load_models_once, prepare_photos, read_photo
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset, read_dataset
@@ -17,7 +16,7 @@ from facerf_cli.dataset.pairs import Pair, read_pairs
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.case import Case
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Portrait, evenly
+from facerf_cli.evaluation.people import Person, Portrait, evenly
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.models import load_models
 
@@ -58,12 +57,17 @@ def prepare_methods(methods: MethodOptions, options: EvaluateOptions) -> None:
 
 
 def read_split(
-    folder: Path, split: str, face_model: str, refit: bool
+    folder: Path, split: str, face_model: str, joint_fit: bool
 ) -> tuple[Dataset, dict[str, list[Pair]]]:
-    """A dataset and a split's pairs by person; UsageError if there are none, or for another face model."""
+    """A dataset and a split's pairs by person.
+
+    Raises UsageError if there are none, or for the joint fit of another face model.
+    """
     dataset = read_dataset(folder)
-    if not refit and load_face_model(face_model).name != dataset.face_model:
-        raise UsageError(f"{folder}: fitted with {dataset.face_model}; give that as --face-model, or --refit")
+    if joint_fit and load_face_model(face_model).name != dataset.face_model:
+        raise UsageError(
+            f"--joint-fit: {folder} has fits of {dataset.face_model}; give it as --face-model"
+        )
     pairs: dict[str, list[Pair]] = {}
     for pair in read_pairs(dataset):
         if split in ("all", pair.split):
@@ -117,13 +121,25 @@ def photo_items(inputs: Sequence[str], options: EvaluateOptions, preset: int) ->
     return items[:preset]
 
 
-def portraits(item: Item, photo: PhotoOptions, keep_eyes: bool) -> Iterator[tuple[Case, Portrait]]:
+def person_of(
+    item: Item, dataset: Dataset, options: MethodOptions, keep_eyes: bool, joint_fit: bool
+) -> Person:
+    """The person of an item, fitted as the options say, by default as the first method's networks expect."""
+    models, photo = load_methods(options)[0].models, options.photo
+    geometry = None if joint_fit else photo.geometry or models.default_geometry
+    sides = models.sides(photo.texture_side)
+    return Person(dataset, item.name, geometry, sides, keep_eyes)
+
+
+def portraits(item: Item, options: MethodOptions, keep_eyes: bool) -> Iterator[tuple[Case, Portrait]]:
     """Yield the chosen faces of a photo; each counts as a person."""
+    photo, models = options.photo, load_methods(options)[0].models
     image = read_photo(item, photo)
     for face in fit_faces(item, image, photo):
         name = f"{item.name}{face.tag}"
+        portrait = Portrait(image, face.found, models.sides(photo.texture_side), keep_eyes)
         try:
-            portrait = Portrait.of(face_model_of(photo), image, face.landmarks_px, face.head, keep_eyes)
+            portrait.by(models)
         except InputError as error:
             raise InputError(f"{item.input_path}: {error}") from None
         yield Case(name, name, {"quality": face.fit.quality}), portrait

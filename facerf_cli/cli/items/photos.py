@@ -1,6 +1,7 @@
 """Photos of a batch: read, their faces found and fitted, and the models loaded once a process."""
 
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -15,16 +16,16 @@ from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.colour import named_space
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import find_faces, read_landmarks
+from facerf_cli.face.landmarks import FaceBox, face_at, read_landmarks
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.logs import LOGGER_NAME, Provenance
-from facerf_cli.models import Models, load_models
-from facerf_cli.pipeline import fit_photo
+from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
+from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
 _LANDMARK_SUFFIXES = (".pts", ".json")
@@ -36,7 +37,7 @@ class FittedFace:
     """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'."""
 
     tag: str
-    landmarks_px: np.ndarray  # [68, 2] in the photo's pixels
+    found: FaceBox
     head: Head
 
     @property
@@ -47,7 +48,7 @@ class FittedFace:
     def facts(self) -> dict[str, Any]:
         """The face's entries in the report."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {"error_iod": round(self.fit.error_iod, 5), "quality": self.fit.quality, "pose_deg": pose_deg}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg}
 
 
 def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
@@ -56,7 +57,9 @@ def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
         named_space(options.colourspace)
     face_model(options)
     if with_networks:
-        load_models_once(options)
+        models = load_models_once(options)
+        if options.geometry == "network" and models.geometry is None:
+            raise UsageError(f"--geometry network: {models.checkpoint_name} is {NO_GEOMETRY_NETWORK}")
 
 
 @cache
@@ -78,12 +81,18 @@ def read_photo(item: Item, options: PhotoOptions) -> LinearImage:
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
-    found = list(_landmarks_px(item, image, options))
+    found = list(_find(item, image, options))
     tags = [f"_face{index}" for index in range(len(found))] if options.face == "all" else [""]
     return [
-        FittedFace(tag, landmarks_px, _fit_one(item, image, landmarks_px, options))
-        for landmarks_px, tag in zip(found, tags, strict=True)
+        FittedFace(tag, face, _fit_one(item, image, face, options))
+        for face, tag in zip(found, tags, strict=True)
     ]
+
+
+def fit_facts(fit: FaceFit) -> dict[str, Any]:
+    """A fit's error and quality for the report; a regressed head has no error."""
+    error = {} if math.isnan(fit.error_iod) else {"error_iod": round(fit.error_iod, 5)}
+    return {**error, "quality": fit.quality}
 
 
 def facts_of(faces: list[FittedFace]) -> dict[str, Any]:
@@ -96,14 +105,15 @@ def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> 
     return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
 
 
-def _landmarks_px(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[np.ndarray]:
-    if options.landmarks is None:
-        faces = find_faces(image.pixels, str(item.input_path), options.face)
-        yield from (face.landmarks_px for face in faces)
-    elif options.landmarks.is_dir():
-        yield read_landmarks(_landmark_file(item, options.landmarks))
+def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FaceBox]:
+    """Find the faces that the options choose; with their landmarks where the fit needs them."""
+    if options.landmarks is not None:
+        single = not options.landmarks.is_dir()
+        path = options.landmarks if single else _landmark_file(item, options.landmarks)
+        yield face_at(read_landmarks(path))
     else:
-        yield read_landmarks(options.landmarks)
+        geometry = options.geometry or load_models_once(options).default_geometry
+        yield from find_for(geometry, image.pixels, str(item.input_path), options.face)
 
 
 def _landmark_file(item: Item, folder: Path) -> Path:
@@ -116,9 +126,10 @@ def _landmark_file(item: Item, folder: Path) -> Path:
     raise InputError(f"{item.input_path}: no {item.name}.pts or .json in {folder}; add it there")
 
 
-def _fit_one(item: Item, image: LinearImage, landmarks_px: np.ndarray, options: PhotoOptions) -> Head:
+def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
     try:
-        head = fit_photo(load_models_once(options), image.pixels, landmarks_px, options.texture_side)
+        models = load_models_once(options)
+        head = head_of(models, image.pixels, face, models.sides(options.texture_side))
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
     if head.fit.quality == "poor":

@@ -17,6 +17,7 @@ from facerf_cli.cli.items.photos import (
     face_model,
     facts_of,
     fit_faces,
+    fit_facts,
     load_models_once,
     provenance,
     read_matte,
@@ -156,7 +157,7 @@ def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Compos
         composition = Composition(face_model(work.photo), None, head, Target(composite="face"))
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
-    return composition, {"error_iod": round(fit.error_iod, 5), "quality": fit.quality}
+    return composition, fit_facts(fit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ def _joint(options: TrainOptions, networks: Networks) -> Objective:
         _load_appearance(options, side),
         _load_light_features(options, side),
         _photos(options, side),
-        JointSettings(side, side, mean_face=options.mean_face, seed=options.settings.seed),
+        JointSettings(side, side, seed=options.settings.seed),
     )
 
 
@@ -259,8 +259,13 @@ def _reflectance_network(options: TrainOptions, side: int) -> Any:
 
 
 def _geometry_network(options: TrainOptions, mean_translation_m: tuple[float, float, float]) -> nn.Module:
-    form: Any = "paper" if options.preset == "paper" else "default"
-    return GeometryNetwork(GeometryNetworkSettings(form, mean_translation_m=mean_translation_m))
+    """Make an untrained network; with --mean-face it regresses the pose alone (paper, 'Ablative Study')."""
+    settings = GeometryNetworkSettings(
+        "paper" if options.preset == "paper" else "default", mean_translation_m=mean_translation_m
+    )
+    if options.mean_face:
+        settings = replace(settings, identity=0, expression=0)
+    return GeometryNetwork(settings)
 
 
 def _samples(options: TrainOptions) -> SampleSource:

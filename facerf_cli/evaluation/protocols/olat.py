@@ -1,11 +1,12 @@
 """OLATs of held-out people from images in natural light, in the same pose and in others (paper, Table 1).
 
-Each pair of a prepared dataset is a user's photo: its source is unwrapped by its fit and relit by one light
-of the target camera's stack. In the same pose the image is that of `facerf relight`, the photo with its face
-relit; in another pose it is the face alone, as with `--pose`. The naive method 'lambert' is the source's own
-texture under the cosine of the light.
+The source of each pair of a prepared dataset is a user's photo: the face is found in it, fitted or regressed,
+and relit by one light of the target camera's stack. In the same pose the image is that of `facerf relight`,
+the photo with its face relit; in another pose it is the face alone, as with `--pose`. The naive method
+'lambert' is the source's own texture under the cosine of the light.
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,28 +16,37 @@ from torch import Tensor
 
 from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.dataset.pairs import Pair
+from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.crop_view import angle_class, angle_of, turn_class
+from facerf_cli.evaluation.crop_view import CropView, angle_class, angle_of, turn_class
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import CameraCrop, Person
+from facerf_cli.evaluation.people import Person, Portrait, common_mask
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight, direction_to_azel
+from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_drift_deg
+from facerf_cli.models import Models
 
 LAMBERT = "lambert"
 _NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shape
+log = logging.getLogger(LOGGER_NAME)
 _WHITE = torch.ones(1, 1, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class _Question:
-    """A pair's target: its light [3], the turn [3, 3] of the head to its pose, and its crop."""
+    """A pair's source and its target: a light [3] in the target's camera, and its pose, if it is another."""
 
+    pair: Pair
+    source: Portrait
     light: Tensor
-    turn: Tensor
-    crop: CameraCrop
-    same_pose: bool
+    target: Portrait | None
+
+    def view(self, models: Models) -> CropView:
+        """The source's head, by a method's models, in the pose that is asked for."""
+        sitting = self.source.by(models)
+        return sitting.view if self.target is None else self.target.posed_as(sitting.view.fit, models)
 
 
 @torch.no_grad()
@@ -44,55 +54,61 @@ def compare_olats(
     person: Person, pairs: Iterable[Pair], methods: Sequence[Method], network_alone: bool
 ) -> Iterator[Comparison]:
     """The person's pairs: each method's image under one light next to the stack's own, unclipped."""
-    for pair in pairs:
-        fit = person.crop(pair.source_camera).view.fit
-        crop = person.posed_as(fit, pair.target_camera)
-        light = torch.from_numpy(crop.header.directions[pair.target_light]).float()
+    for pair, source in person.portraits(pairs):
+        light = torch.from_numpy(person.header(pair.target_camera).directions[pair.target_light]).float()
         same_pose = pair.source_camera == pair.target_camera
-        asked = _Question(light, fit.turn_to(crop.view.fit.rotation), crop, same_pose)
-        yield _compare(person, pair, asked, methods, network_alone)
+        try:
+            target = None if same_pose else person.lit(pair.target_camera)
+            yield _compare(person, _Question(pair, source, light, target), methods, network_alone)
+        except InputError as error:
+            log.warning("%s/%05d: %s; left out", pair.subject, pair.index, error)
 
 
-def _compare(
-    person: Person, pair: Pair, asked: _Question, methods: Sequence[Method], network_alone: bool
-) -> Comparison:
-    image = person.source(pair)
-    head, view = person.head(pair, image), asked.crop.view
-    photo = image if asked.same_pose else None
-    target = Target() if asked.same_pose else Target(view.fit, "face")
-    directions = asked.light[None]
-    predictions = {
-        method.name: next(method.images(photo, head, directions, _WHITE, target, network_alone))
-        for method in methods
-    }
-    predictions[LAMBERT] = _lambert(person, head, asked)
+def _compare(person: Person, asked: _Question, methods: Sequence[Method], network_alone: bool) -> Comparison:
+    pair, photo = asked.pair, asked.source.photo.pixels
     stack = person.dataset.stack_path(pair.subject, pair.target_camera)
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
+    predictions, views = {}, []
+    for method in methods:
+        head, view = asked.source.by(method.models).head, asked.view(method.models)
+        directions = asked.light[None]
+        if asked.target is None:  # the image of `facerf relight`, cropped as the truth is
+            of_photo = method.images(photo, head, directions, _WHITE, Target(), network_alone)
+            image = view.fit.crop.apply(next(of_photo))
+        else:
+            target = Target(view.fit, "face")
+            image = next(method.images(None, head, directions, _WHITE, target, network_alone))
+        predictions[method.name] = image
+        views.append(view)
+    first, models = views[0], methods[0].models
+    head = asked.source.by(models).head
+    predictions[LAMBERT] = _lambert(models, head, asked.light, first)
     comparison = Comparison(
-        Case(f"{pair.subject}/{pair.index:05d}", pair.subject, _facts(person, pair, asked)),
-        truth.permute(1, 2, 0).numpy(),
-        view.mask,
+        Case(f"{pair.subject}/{pair.index:05d}", pair.subject, _facts(person, asked, head, first)),
+        first.fit.crop.apply(truth.permute(1, 2, 0).numpy()),
+        common_mask(views),
         predictions,
-        source=image,
+        source=head.cropped,
     )
-    return _with_drift(comparison, person.albedo, view.region("skin"))
+    return _with_drift(comparison, person.albedo, first.region("skin"))
 
 
-def _lambert(person: Person, head: Head, asked: _Question) -> np.ndarray:
-    """The source's texture under the light's cosine, rendered in the target's crop."""
-    cosine = torch.einsum("c,cd,dij->ij", asked.light, asked.turn, head.face.normals).clamp_min(0)
-    composition = Composition(person.model, None, head, Target(asked.crop.view.fit, "face"))
+def _lambert(models: Models, head: Head, light: Tensor, view: CropView) -> np.ndarray:
+    """The source's texture under the cosine of a light [3], rendered in the target's crop."""
+    turn = head.fit.turn_to(view.fit.rotation)
+    cosine = torch.einsum("c,cd,dij->ij", light, turn, head.face.normals).clamp_min(0)
+    composition = Composition(models.face, None, head, Target(view.fit, "face"))
     relit = Relit(head.face.texture * cosine)
-    return composition.image(RigLight(asked.light[None], _WHITE[0]), relit).pixels
+    return composition.image(RigLight(light[None], _WHITE[0]), relit).pixels
 
 
-def _facts(person: Person, pair: Pair, asked: _Question) -> dict[str, str | float]:
+def _facts(person: Person, asked: _Question, head: Head, view: CropView) -> dict[str, str | float]:
     light = asked.light
-    turn_deg = angle_of(asked.turn)
+    turn_deg = angle_of(head.fit.turn_to(view.fit.rotation))
     angle_deg = float(torch.rad2deg(light[2].clamp(-1, 1).acos()))
     azimuth_deg, elevation_deg = direction_to_azel(light)
     return {
-        "pose": "same pose" if asked.same_pose else "different pose",
+        "pose": "same pose" if asked.target is None else "different pose",
         "angle": angle_class(angle_deg),
         "turn": turn_class(turn_deg),
         **person.facts,

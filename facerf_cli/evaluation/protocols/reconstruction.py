@@ -13,9 +13,8 @@ from facerf_cli.colour import luminance
 from facerf_cli.composite import Target
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.crop_view import CropView
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Person
+from facerf_cli.evaluation.people import Person, Portrait, common_mask
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.metrics import light_error_deg
@@ -24,21 +23,21 @@ from facerf_cli.metrics import light_error_deg
 @torch.no_grad()
 def reconstruct(
     case: Case,
-    view: CropView,
-    head: Head,
+    portrait: Portrait,
     methods: Sequence[Method],
     true_light: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Comparison:
-    """A head's crop next to each method's reconstruction.
+    """A portrait's crop next to each method's reconstruction.
 
     `true_light`, directions [L, 3] and weights [L, 3], gives each the error of its brightest direction.
     """
     predictions, extra = {}, {}
     for method in methods:
-        predictions[method.name], light = reconstruction(method, head)
+        predictions[method.name], light = reconstruction(method, portrait.by(method.models).head)
         extra[method.name] = light_errors(light, true_light)
-    image = head.cropped
-    return Comparison(case, image, view.mask, predictions, image, view.fit.landmarks_px.numpy(), extra)
+    mask = common_mask(portrait.by(method.models).view for method in methods)
+    head = portrait.by(methods[0].models).head
+    return Comparison(case, head.cropped, mask, predictions, head.cropped, head.landmarks_px, extra)
 
 
 def reconstruction(method: Method, head: Head) -> tuple[np.ndarray, RigLight]:
@@ -52,11 +51,9 @@ def reconstruct_person(
     person: Person, pairs: Iterable[Pair], methods: Sequence[Method]
 ) -> Iterator[Comparison]:
     """The sources of a person's pairs."""
-    for pair in pairs:
+    for pair, portrait in person.portraits(pairs):
         case = Case(f"{pair.subject}/{pair.index:05d}", pair.subject, person.facts | {"map": pair.envmap})
-        head = person.head(pair, person.source(pair))
-        view = person.crop(pair.source_camera).view
-        yield reconstruct(case, view, head, methods, person.light(pair))
+        yield reconstruct(case, portrait, methods, person.light(pair))
 
 
 def light_errors(light: RigLight, truth: tuple[np.ndarray, np.ndarray] | None) -> dict[str, float]:

@@ -4,6 +4,7 @@ Image A is rendered from B's reflectance, turned to A's pose, on A's fitted mesh
 method estimates that light with A's own reflectance. So a reflectance is measured where it was not read.
 """
 
+import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -12,30 +13,33 @@ import torch
 from facerf_cli.baselines.base import Explained
 from facerf_cli.composite import Target
 from facerf_cli.dataset.pairs import Pair
+from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.crop_view import CropView, angle_of, turn_class
+from facerf_cli.evaluation.crop_view import angle_of, turn_class
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Person
-from facerf_cli.face.head import Head
+from facerf_cli.evaluation.people import Person, Portrait, common_mask
+from facerf_cli.logs import LOGGER_NAME
 
+log = logging.getLogger(LOGGER_NAME)
 Sides = tuple["Side", "Side"]
 
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of two images: the name of its comparison, its view and its head."""
+    """One of two images, and the name of its comparison."""
 
     case: Case
-    view: CropView
-    head: Head
+    portrait: Portrait
+
+    def explained(self, methods: Sequence[Method], network_alone: bool) -> dict[str, Explained]:
+        """Reflectance and light that each method reads from it."""
+        return {m.name: m.explained(self.portrait.by(m.models).head, network_alone) for m in methods}
 
 
 @torch.no_grad()
 def transfer(sides: Sides, methods: Sequence[Method], network_alone: bool = True) -> Iterator[Comparison]:
     """Both images, each by the other's reflectance."""
-    explained = [
-        {method.name: method.explained(side.head, network_alone) for method in methods} for side in sides
-    ]
+    explained = [side.explained(methods, network_alone) for side in sides]
     for side, own, other, others in zip(sides, explained, sides[::-1], explained[::-1], strict=True):
         yield _rendered(side, own, other, others, methods)
 
@@ -48,20 +52,23 @@ def _rendered(
     methods: Sequence[Method],
 ) -> Comparison:
     """An image from its own light and the other's reflectance."""
-    view, target = side.view, Target(side.view.fit, "face")
-    predictions = {
-        method.name: method.image(other.head, others[method.name].reflectance, own[method.name].light, target)
-        for method in methods
-    }
-    turn_deg = angle_of(other.view.fit.turn_to(view.fit.rotation))
+    predictions, views = {}, []
+    for method in methods:
+        mine, theirs = side.portrait.by(method.models), other.portrait.by(method.models)
+        target = Target(mine.view.fit, "face")
+        reflectance = others[method.name].reflectance
+        predictions[method.name] = method.image(theirs.head, reflectance, own[method.name].light, target)
+        views.append(mine.view)
+    first, source = (portrait.by(methods[0].models).head for portrait in (side.portrait, other.portrait))
+    turn_deg = angle_of(source.fit.turn_to(first.fit.rotation))
     facts = {**side.case.facts, "turn": turn_class(turn_deg), "turn_deg": turn_deg}
     return Comparison(
         replace(side.case, facts=facts),
-        side.head.cropped,
-        view.mask,
+        first.cropped,
+        common_mask(views),
         predictions,
-        other.head.cropped,
-        view.fit.landmarks_px.numpy(),
+        source.cropped,
+        first.landmarks_px,
     )
 
 
@@ -73,14 +80,18 @@ def transfer_person(
 ) -> Iterator[Comparison]:
     """Couples of the sources of a person's pairs."""
     for first, second in couples:
-        sides = _side(person, first, second), _side(person, second, first)
+        try:
+            sides = _side(person, first, second), _side(person, second, first)
+        except InputError as error:
+            log.warning("%s; its couple is left out", error)
+            continue
         yield from transfer(sides, methods, network_alone)
 
 
 def _side(person: Person, pair: Pair, other: Pair) -> Side:
     name = f"{pair.subject}/{pair.index:05d}_by_{other.index:05d}"
     case = Case(name, pair.subject, person.facts | {"map": pair.envmap})
-    return Side(case, person.crop(pair.source_camera).view, person.head(pair, person.source(pair)))
+    return Side(case, person.portrait(pair))
 
 
 def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:

@@ -27,9 +27,10 @@ from facerf_cli.evaluation.protocols.yale_b_cases import (
 )
 from facerf_cli.evaluation.published import PublishedFigure
 from facerf_cli.evaluation.summary import Layout
+from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import find_faces
-from facerf_cli.pipeline import fit_photo
+from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.pipeline import find_for, head_of
 
 COLUMNS = ("frontal", "soft", "environment")
 PEERS = ("DPR", "GeomConsistentFR")
@@ -124,21 +125,25 @@ def published() -> tuple[PublishedFigure, ...]:
 
 
 def compare_sitter(
-    database: YaleB, subject: str, methods: Sequence[Method], network_alone: bool = False
+    database: YaleB,
+    subject: str,
+    methods: Sequence[Method],
+    network_alone: bool = False,
+    geometry: Geometry = "landmarks",
 ) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
-    A subject's sources share the landmarks of its frontal image. Raises InputError where no face is found in
-    that, or an image cannot be read.
+    A subject's sources share the landmarks, or the box, of its frontal image. Raises InputError where no face
+    is found in that, or an image cannot be read.
     """
     sitter = Sitter(database, subject)
     questions = list(sitter.questions())
     frontal = sitter.image("frontal")
-    landmarks_px = find_faces(_rgb(frontal), str(database.folder / subject))[0].landmarks_px
+    face = find_for(geometry, _rgb(frontal), str(database.folder / subject))[0]
     for source in dict.fromkeys(question.source for question in questions):
         asked = [question for question in questions if question.source == source]
         photo = sitter.image(source)
-        relit = _relit_by_all(sitter, photo, landmarks_px, asked, methods, network_alone)
+        relit = _relit_by_all(sitter, photo, face, asked, methods, network_alone)
         for row, question in enumerate(asked):
             yield Comparison(
                 case=_case(subject, question),
@@ -168,7 +173,7 @@ def _rgb(grey: np.ndarray) -> np.ndarray:
 def _relit_by_all(
     sitter: Sitter,
     photo: np.ndarray,
-    landmarks_px: np.ndarray,
+    face: FaceBox,
     asked: Sequence[Question],
     methods: Sequence[Method],
     network_alone: bool,
@@ -183,7 +188,7 @@ def _relit_by_all(
     for method in methods:
         key = id(method.models)  # methods over the same networks share the fit
         if key not in heads:
-            heads[key] = fit_photo(method.models, pixels, landmarks_px)
+            heads[key] = head_of(method.models, pixels, face)
         images = method.images(pixels, heads[key], directions, rgb_weights, Target(), network_alone)
         relit[method.name] = [image.mean(-1).clip(min=0) for image in images]
     return relit
