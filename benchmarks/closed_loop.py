@@ -11,7 +11,7 @@ in which the face is detected and fitted again; where another face is found, the
   skin cannot be told apart, so there is a second figure after the best single scale (scaled).
 - SH: the same for the coefficients of spherical harmonics up to order 2, about what a diffuse face shows.
 
-Twin, on the same evidence in the same run: the paper's plain least squares, whose weights may be negative.
+Twin, on the same evidence in the same run: the paper's least squares, whose weights may be negative.
 """
 
 import tempfile
@@ -34,7 +34,7 @@ from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direc
 from facerf_cli.metrics import light_error_deg
 from facerf_cli.models import DEFAULT_CHECKPOINT, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
-from facerf_cli.pipeline import estimate_light, fit_photo, reflectance_of, relit_by
+from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.training.pretrained import load_features
 
 TURNS_DEG = (0, 120)  # of each map
@@ -71,7 +71,7 @@ def main() -> None:
         for light, (source, method, weights) in estimates(models, photo, lights, features):
             row = compare(weights, light)
             rows.setdefault((source, method), []).append(row)
-            if method != "plain least squares":
+            if method != "least squares":
                 print(source, photo.stem, light.name, *(f"{row[name]:.3g}" for name in MEASURES), flush=True)
     print("\nmedian / mean / 90th percentile")
     print_header("estimated from", "by", "n", *MEASURES)
@@ -135,10 +135,10 @@ def through_png(image: np.ndarray) -> np.ndarray:
 
 
 def by_both(models: Models, head: Head, features: FeatureNetwork | None) -> Iterator[tuple[str, Tensor]]:
-    """Estimate weights [150, 3] by the method of `facerf estimate-light` and by plain least squares."""
-    found = estimate_light(models, head, features=features)
+    """Estimate weights [150, 3] by the method of `facerf estimate-light` and by the paper's least squares."""
+    found = estimate_light(models, head, estimator=Estimator(features=features))
     yield "facerf", found.light.weights
-    yield "plain least squares", found.evidence.least_squares(non_negative=False)
+    yield "least squares", found.evidence.least_squares(non_negative=False)
 
 
 def compare(found: Tensor, light: KnownLight) -> dict[str, float]:

@@ -110,12 +110,32 @@ def reflectance_of(
     return Field(models, head.face, quotient, memory_bytes)
 
 
-def explain(models: Models, head: Head, kind: Kind = "field", network_alone: bool = True) -> Explained:
+@dataclass(frozen=True, eq=False)
+class Estimator:
+    """How the light of a photo is estimated over a rig.
+
+    Without `non_negative` by the paper's least squares, whose weights may be negative. `features` (V_f or
+    S_f) refines the weights (paper, 'Light Estimation').
+    """
+
+    non_negative: bool = True
+    features: FeatureNetwork | None = None
+
+
+DEFAULT_ESTIMATOR = Estimator()
+
+
+def explain(
+    models: Models,
+    head: Head,
+    kind: Kind = "field",
+    network_alone: bool = True,
+    estimator: Estimator = DEFAULT_ESTIMATOR,
+) -> Explained:
     """Read both reflectance and light of a head's photo, as far as the model can separate them."""
     if kind == "field":
-        return Explained(
-            reflectance_of(models, head, kind, network_alone), estimate_light(models, head).light
-        )
+        light = estimate_light(models, head, estimator=estimator).light
+        return Explained(reflectance_of(models, head, kind, network_alone), light)
     baselines = {
         "diffuse-sh": explain_by_diffuse_sh,
         "specular-sh": explain_by_specular_sh,
@@ -162,14 +182,12 @@ def estimate_light(
     head: Head,
     kind: Kind = "field",
     rig: Tensor | None = None,
-    non_negative: bool = True,
-    features: FeatureNetwork | None = None,
+    estimator: Estimator = DEFAULT_ESTIMATOR,
     keep_eyes: bool = False,
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
 
-    Without `non_negative` the paper's plain least squares are solved. `features` (V_f or S_f) refines the
-    weights. The models other than the field estimate their own light. Eyes are left out, as in the paper,
+    The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
     """
     evidence = photo_evidence(head.face, keep_eyes)
@@ -181,11 +199,11 @@ def estimate_light(
     rig = rig_directions() if rig is None else rig
     olats = torch.cat(list(Field(models, shrunk(head.face)).olats(rig)))
     evidence = replace(evidence, directions=rig, olats=olats)
-    weights = evidence.least_squares(non_negative)
+    weights, features = evidence.least_squares(estimator.non_negative), estimator.features
     if features is None:
         return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
-    refined = refine_light(evidence, weights, lambda x: features.layers(x / exposure), non_negative)
+    refined = refine_light(evidence, weights, lambda x: features.layers(x / exposure), estimator.non_negative)
     light = RigLight(rig, refined.weights)
     return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
 

@@ -10,7 +10,7 @@ import typer
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.light_options import LightOptions, Refine
+from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -72,17 +72,8 @@ def estimate_light(
             help="Solve for the light of a rig of N lights, or of a file of directions.",
         ),
     ] = "150",
-    non_negative: Annotated[
-        bool,
-        typer.Option(
-            "--non-negative/--signed",
-            help="Solve for weights from 0 up, robust to highlights, hair and glasses; or for the paper's "
-            "plain least squares, whose weights may be negative and huge.",
-        ),
-    ] = True,
-    refine: Annotated[
-        Refine, typer.Option(help="Refine the least squares by comparing features of the texture.")
-    ] = "none",
+    non_negative: NonNegativeOption = True,
+    refine: RefineOption = "none",
     vgg_weights: Annotated[
         str | None,
         typer.Option(

@@ -19,6 +19,7 @@ from facerf_cli.cli.evaluation_options import (
     refuse_without_field,
     with_shared_options,
 )
+from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.options import (
     EPILOG,
     HELP_NAMES,
@@ -76,6 +77,8 @@ def reconstruction(
     geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    non_negative: NonNegativeOption = True,
+    refine: RefineOption = "none",
 ) -> int:
     """Explain photos by reflectance and light, and render them again (the paper's Table 2).
 
@@ -91,9 +94,16 @@ def reconstruction(
         settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
     )
     photo.check()
+    light = LightOptions(
+        photo,
+        non_negative=non_negative,
+        refine=refine,
+        vgg_weights=options.vgg_weights if refine == "features" else None,
+    )
+    light.check()
     from facerf_cli.cli.items.evaluate_photos import run_reconstruction
 
-    return run_reconstruction(inputs, folder, options, photo, split, every, joint_fit)
+    return run_reconstruction(inputs, folder, options, photo, light, split, every, joint_fit)
 
 
 def transfer(
@@ -124,6 +134,8 @@ def transfer(
     geometry: GeometryOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    non_negative: NonNegativeOption = True,
+    refine: RefineOption = "none",
 ) -> int:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
@@ -138,12 +150,19 @@ def transfer(
         settings_of(context), input_colourspace, face_model, landmarks=landmarks, geometry=geometry
     )
     photo.check()
+    light = LightOptions(
+        photo,
+        non_negative=non_negative,
+        refine=refine,
+        vgg_weights=options.vgg_weights if refine == "features" else None,
+    )
+    light.check()
     from facerf_cli.cli.items.evaluate_transfer import run_transfer
 
     folder = None if photos else only_dataset(inputs)
     if not photos and folder is None:
         raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    return run_transfer(inputs, folder, options, photo, split, every, joint_fit, not held_to_photo)
+    return run_transfer(inputs, folder, options, photo, light, split, every, joint_fit, not held_to_photo)
 
 
 def geometry(

@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import typer
 
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.photo_options import PhotoOptions
@@ -10,6 +12,17 @@ from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
 Refine = Literal["none", "features"]
+NonNegativeOption = Annotated[
+    bool,
+    typer.Option(
+        "--non-negative/--signed",
+        help="Solve for weights from 0 up, robust to highlights, hair and glasses; or for the paper's least "
+        "squares, whose weights may be negative.",
+    ),
+]
+RefineOption = Annotated[
+    Refine, typer.Option(help="Refine the least squares by comparing features of the texture.")
+]
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 
 

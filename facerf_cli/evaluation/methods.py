@@ -12,7 +12,7 @@ from facerf_cli.composite import Composition, Target
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models
-from facerf_cli.pipeline import explain, reflectance_of, relight, relit_by
+from facerf_cli.pipeline import DEFAULT_ESTIMATOR, Estimator, explain, reflectance_of, relight, relit_by
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,10 +22,11 @@ class Method:
     name: str
     kind: Kind
     models: Models
+    estimator: Estimator = DEFAULT_ESTIMATOR
 
     def explained(self, head: Head, network_alone: bool = True) -> Explained:
         """Reflectance and light; a field with the photo's correction gives the photo back by construction."""
-        return explain(self.models, head, self.kind, network_alone)
+        return explain(self.models, head, self.kind, network_alone, self.estimator)
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""

@@ -24,6 +24,7 @@ _WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their 
 _LEAST_TEXELS = 200  # fewer do not determine where light comes from
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
 _RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
+_CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
 _ROUNDS, _ROUNDS_GREY = 3, 5  # of reweighting
 # Weights of smoothness and of shortness, as shares of the photo's norm: of the grey light that all channels
@@ -117,10 +118,12 @@ def _channel_weights(olats: Tensor, image: Tensor) -> np.ndarray:
 def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
     """Solve Eq. (leastsq) as the paper states it: signed weights [L, C], all elements weighted alike.
 
-    Where several solutions exist, it is the one of least norm.
+    It is the solution of least norm among the combinations of lights that change the image noticeably:
+    singular values below `_CONDITION` of the largest are left out, for they are noise of the field (truncated
+    singular value decomposition; Hansen, *Rank-deficient and discrete ill-posed problems*, 1998).
     """
     channels = [
-        np.linalg.lstsq(lights.double().T.numpy(), target.double().numpy())[0]
+        np.linalg.lstsq(lights.double().T.numpy(), target.double().numpy(), rcond=_CONDITION)[0]
         for lights, target in zip(olats.unbind(1), image, strict=True)
     ]
     return torch.from_numpy(np.stack(channels, -1)).float()

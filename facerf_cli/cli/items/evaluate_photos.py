@@ -19,6 +19,7 @@ from facerf_cli.cli.items.evaluation import (
     read_split,
 )
 from facerf_cli.cli.items.evaluation_run import run_protocol
+from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
@@ -38,12 +39,13 @@ def run_reconstruction(
     folder: Path | None,
     options: EvaluateOptions,
     photo: PhotoOptions,
+    light: LightOptions,
     split: str,
     every: int,
     joint_fit: bool,
 ) -> int:
     """Measure photos, or the split of a dataset's folder; the exit code."""
-    methods = MethodOptions.of(photo, options)
+    methods = MethodOptions.of(photo, options, light)
     work: _ReconstructPhotos | _ReconstructPeople
     if folder is None:
         items = photo_items(inputs, options, _PAPER_PHOTOS)

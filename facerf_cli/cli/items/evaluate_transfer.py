@@ -19,6 +19,7 @@ from facerf_cli.cli.items.evaluation import (
     require_enough,
 )
 from facerf_cli.cli.items.evaluation_run import run_protocol
+from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
@@ -39,13 +40,14 @@ def run_transfer(
     folder: Path | None,
     options: EvaluateOptions,
     photo: PhotoOptions,
+    light: LightOptions,
     split: str,
     every: int,
     joint_fit: bool,
     network_alone: bool,
 ) -> int:
     """Measure couples of photos, or of the split of a dataset's folder; the exit code."""
-    methods = MethodOptions.of(photo, options)
+    methods = MethodOptions.of(photo, options, light)
     work: _TransferPhotos | _TransferPeople
     if folder is None:
         couples = _preset_couples(_photo_couples(inputs, options.output), options)

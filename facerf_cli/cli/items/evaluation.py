@@ -9,7 +9,9 @@ from pathlib import Path
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.items.photo_lights import feature_network
 from facerf_cli.cli.items.photos import fit_faces, load_models_once, prepare_photos, read_photo
+from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, read_pairs
@@ -19,6 +21,7 @@ from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person, Portrait, evenly
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.models import load_models
+from facerf_cli.pipeline import Estimator
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,14 @@ class MethodOptions:
     photo: PhotoOptions
     reflectance: tuple[Kind, ...]
     against: tuple[Path, ...]
+    light: LightOptions
 
     @staticmethod
-    def of(photo: PhotoOptions, options: EvaluateOptions) -> "MethodOptions":
-        """The methods of the shared options."""
-        return MethodOptions(photo, options.reflectance, options.against)
+    def of(
+        photo: PhotoOptions, options: EvaluateOptions, light: LightOptions | None = None
+    ) -> "MethodOptions":
+        """The methods of the shared options; `light` tells how the field's light is estimated."""
+        return MethodOptions(photo, options.reflectance, options.against, light or LightOptions(photo))
 
 
 @cache
@@ -40,9 +46,13 @@ def load_methods(options: MethodOptions) -> tuple[Method, ...]:
     """The methods, in the order of their names, once a process."""
     models = load_models_once(options.photo)
     against = (load_models(path, options.photo.face_model, models.device) for path in options.against)
+    light = options.light
+    features = feature_network(light.vgg_weights)[0] if light.refine == "features" else None
+    estimator = Estimator(light.non_negative, features)
+    others = zip(options.against, against, strict=True)
     return (
-        *(Method(kind, kind, models) for kind in options.reflectance),
-        *(Method(path.stem, "field", other) for path, other in zip(options.against, against, strict=True)),
+        *(Method(kind, kind, models, estimator) for kind in options.reflectance),
+        *(Method(path.stem, "field", other, estimator) for path, other in others),
     )
 
 
@@ -65,9 +75,7 @@ def read_split(
     """
     dataset = read_dataset(folder)
     if joint_fit and load_face_model(face_model).name != dataset.face_model:
-        raise UsageError(
-            f"--joint-fit: {folder} has fits of {dataset.face_model}; give it as --face-model"
-        )
+        raise UsageError(f"--joint-fit: {folder} has fits of {dataset.face_model}; give it as --face-model")
     pairs: dict[str, list[Pair]] = {}
     for pair in read_pairs(dataset):
         if split in ("all", pair.split):

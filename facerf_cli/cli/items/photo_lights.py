@@ -27,7 +27,7 @@ from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.feature_networks import FeatureNetwork
-from facerf_cli.pipeline import LightEstimate, estimate_light
+from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
 from facerf_cli.training.pretrained import load_features, load_vgg
 
 LIGHT_FEATURES = Path(__file__).parents[2] / "assets" / "light_features.safetensors"
@@ -39,7 +39,7 @@ def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
     """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
     prepare_photos(options.photo, with_networks)
     if with_networks and options.refine == "features":
-        _feature_network(options.vgg_weights)
+        feature_network(options.vgg_weights)
 
 
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
@@ -64,15 +64,14 @@ def _estimate(
 ) -> tuple[LightEstimate, dict[str, Any]]:
     """The light of one fitted face, and facts for the report."""
     models = load_models_once(options.photo)
-    features, name = _feature_network(options.vgg_weights) if options.refine == "features" else (None, None)
+    features, name = feature_network(options.vgg_weights) if options.refine == "features" else (None, None)
     try:
         estimate = estimate_light(
             models,
             _unmasked(image, head, options),
             options.reflectance,
             directions_of(options.rig),
-            options.non_negative,
-            features,
+            Estimator(options.non_negative, features),
             options.keep_eyes,
         )
     except InputError as error:
@@ -125,7 +124,7 @@ def _facts(
 
 
 @cache
-def _feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
+def feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
     """V_f if its weights were given, else the shipped S_f; and its name for the report."""
     if vgg_weights is not None:
         return load_vgg(vgg_weights), "V_f (VGG-16, ImageNet)"
