@@ -24,6 +24,7 @@ _WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their 
 _LEAST_TEXELS = 200  # fewer do not determine where light comes from
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
 _RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
+_REACHES = 0.1  # mean radiance of the face under a light, as a share of the largest: below, it is not solved for
 _CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
 _ROUNDS, _ROUNDS_GREY = 3, 5  # of reweighting
@@ -135,18 +136,37 @@ def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, cl
     The lights have directions [L, 3] and images [L, 3, N], which are to sum to an image [3, N]. A face
     determines few of the hundreds of weights, and a solution for each channel alone has coloured specks. So
     all channels first share one grey light, tinted, that is smooth except for lone bright lights; then each
-    channel differs from it by weights that are smooth over the sphere. Covered and misfitted elements lose
-    weight; where `clipped` [3, N] bool, only too dark a result is an error.
+    channel differs from it by weights that are smooth over the sphere. Lights that hardly reach the face are
+    not solved for: their weights continue those around them. Covered and misfitted elements lose weight;
+    where `clipped` [3, N] bool, only too dark a result is an error.
     """
+    from_near = _difference_from_neighbours(directions.double().numpy())
+    radiance = olats.double().mean((1, 2)).numpy()
+    continued = _continuation(from_near, radiance > _REACHES * radiance.max())  # [L, S]
     channels = [
-        _Channel(lights.double().T.numpy(), target.double().numpy(), white.numpy())
+        _Channel(lights.double().T.numpy() @ continued, target.double().numpy(), white.numpy())
         for lights, target, white in zip(olats.unbind(1), image, clipped, strict=True)
     ]
-    from_near = _difference_from_neighbours(directions.double().numpy())
+    from_near = from_near @ continued
     grey, colour = _grey_light(channels, from_near)
     roughness = from_near.T @ from_near
     own = [channel.near(gain * grey, roughness) for channel, gain in zip(channels, colour, strict=True)]
-    return torch.from_numpy(np.stack(own, -1)).float()
+    return torch.from_numpy(continued @ np.stack(own, -1)).float()
+
+
+def _continuation(from_near: np.ndarray, reaches: np.ndarray) -> np.ndarray:
+    """Weights of all lights [L, S] from those of the lights that reach the face, [L] bool.
+
+    Each of the others is the mean of its neighbours (a discrete harmonic function), so it lies between the
+    weights around it and is never negative.
+    """
+    continued = np.zeros((len(reaches), int(reaches.sum())))
+    continued[reaches] = np.eye(continued.shape[1])
+    if not reaches.all():
+        hidden = ~reaches
+        inner, border = from_near[np.ix_(hidden, hidden)], from_near[np.ix_(hidden, reaches)]
+        continued[hidden] = np.linalg.solve(inner, -border)
+    return continued
 
 
 class _Channel:
@@ -188,14 +208,14 @@ class _Channel:
 
 
 def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the light [L] that all channels share, and its gain in each [3].
+    """Estimate the light [S] that all channels share, and its gain in each [3].
 
     The more a light stands out from its neighbours, the less smoothness is demanded of it (Cauchy weights);
     otherwise a lone bright light would be spread over its neighbours.
     """
-    lights = len(from_near)
+    lights = from_near.shape[1]
     power = sum(channel.power for channel in channels)
-    hold = np.ones(lights)
+    hold = np.ones(len(from_near))
     colour = np.array([channel.gain_of(np.ones(lights)) for channel in channels])
     colour /= max(colour.mean(), _TINY)
     for _ in range(_ROUNDS_GREY):

@@ -8,24 +8,19 @@ from torch import Tensor, nn
 
 from facerf_cli.dataset.crops import CropPairs
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import draw_pairs
 from facerf_cli.dataset.photos import PhotoCrops
-from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
-from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.training.joint_objective import JointObjective, JointSettings
 from facerf_cli.training.losses import PaperWeights
 from facerf_cli.training.objective import seeded
 from facerf_cli.training.posed_heads import pose_heads, render_textures, unwrap_images
-from tests.dataset.dataset_fixture import write_small_dataset
+from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
-CROP_PX, SIDE = 48, 32
 SETTINGS = JointSettings(crop_px=CROP_PX, texture_side=SIDE, validation_pairs=2)
 PAPER = PaperReflectanceSettings(side=SIDE, widths=(8, 8, 16, 16), features=8)
 DEFAULT = DefaultReflectanceSettings(
@@ -60,12 +55,7 @@ class FakePhotos:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    dataset = write_small_dataset(tmp_path_factory.mktemp("dataset"), lights=20, crop_px=CROP_PX)
-    maps = envmap_names(ProceduralMaps(3, 0, 32))
-    write_pairs(dataset, draw_pairs(dataset, maps, 6, 0), overwrite=False)
-    for rows, weights in load_pairs(dataset).values():
-        relight_subject(dataset, rows, weights)
-    return dataset
+    return write_joint_dataset(tmp_path_factory.mktemp("dataset"))
 
 
 def objective_of(
