@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
@@ -15,7 +16,8 @@ from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import estimate_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.models import Models, load_models
-from facerf_cli.pipeline import estimate_light, fit_photo, predict_olat, reflectance_of, relight
+from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
+from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
 from facerf_cli.raster.camera import pose_to_rotation
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
@@ -34,7 +36,7 @@ def photo() -> np.ndarray:
 @pytest.fixture(scope="module")
 def head(models: Models, photo: np.ndarray) -> Head:
     landmarks_px = find_faces(photo, "astronaut")[0].landmarks_px
-    return fit_photo(models, photo, landmarks_px, 128)
+    return fit_photo(models, photo, landmarks_px, models.sides(128))
 
 
 def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head) -> None:
@@ -114,3 +116,64 @@ def test_a_mask_that_hides_nothing_changes_nothing(models: Models, head: Head) -
     assert torch.equal(head.without(models.face, whole).face.texture, head.face.texture)
     whole[: len(whole) // 2] = 0
     assert head.without(models.face, whole).face.visible.sum() < 0.8 * head.face.visible.sum()
+
+
+class WritesDown(nn.Module):
+    """A Reflectance Network that keeps what it is given; its OLATs are grey."""
+
+    rig_lights, has_mean_face = 0, False
+
+    def encode(self, *given: Tensor) -> None:
+        self.encoded = given
+
+    def decode(self, encoded: None, *given: Tensor) -> Tensor:
+        self.normals, self.lights = given
+        side = self.encoded[0].shape[-1]
+        return torch.full((1, self.lights.shape[1], 3, side, side), 0.2)
+
+    def bytes_per_light(self, texels: int) -> int:
+        return 1
+
+
+def test_the_network_gets_what_the_paper_says(models: Models, head: Head) -> None:
+    """T_s without a strange cast, N_s, N_t = the turned N_s, and the lights as they were asked for."""
+    network, face = WritesDown(), head.face
+    blue = torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1)
+    lit = replace(head, face=replace(face, texture=face.texture * blue))
+    lights = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
+    rotation = pose_to_rotation(40.0, 0.0, 0.0)
+    list(predict_olat(replace(models, network=network), lit, lights, rotation, network_alone=True))
+    texture, normals, visible = network.encoded
+    assert models.source_colours is not None
+    cast = colour_cast(lit.face.texture[None], face.visible[None, None], models.source_colours)
+    assert cast[0, 2] > 3 * cast[0, 0]
+    torch.testing.assert_close(texture, lit.face.texture[None] / cast)
+    assert torch.equal(normals, face.normals[None]) and torch.equal(visible, face.visible[None, None])
+    assert torch.equal(network.lights, lights[None])
+    turned = torch.einsum("dc,cij->dij", rotation @ head.fit.rotation.T, face.normals)
+    torch.testing.assert_close(network.normals[0], turned)
+
+
+def test_without_colours_of_training_no_cast_is_removed(models: Models, head: Head) -> None:
+    network = WritesDown()
+    blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))
+    unknown = replace(models, network=network, source_colours=None)
+    list(predict_olat(unknown, replace(head, face=blue), rig_directions(4), network_alone=True))
+    assert torch.equal(network.encoded[0], blue.texture[None])
+
+
+def test_features_see_the_exposure_of_their_training(models: Models, head: Head) -> None:
+    """Whatever the photo's brightness, S_f and V_f see a face whose mean is `MEAN_RADIANCE`."""
+    seen: list[Tensor] = []
+
+    class Features:
+        def layers(self, linear: Tensor) -> list[Tensor]:
+            seen.append(linear.detach())
+            return [linear]
+
+    dark = replace(head, face=replace(head.face, texture=head.face.texture / 16))
+    mask = photo_evidence(dark.face).mask
+    estimate_light(models, dark, rig=rig_directions(20), estimator=Estimator(features=Features()))
+    photo = seen[0][0]  # what the explanations are compared with
+    assert abs(float(photo[:, mask].mean()) - MEAN_RADIANCE) < 1e-4
+    assert not photo[:, ~mask].any()

@@ -1,11 +1,16 @@
+from dataclasses import replace
+
 import torch
+from torch import Tensor
 
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.heads_bank import Bank
+from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
 from facerf_cli.training.objective import seeded
+from tests.toy_faces import ToyFaces
 
 SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_views=3)
 
@@ -66,3 +71,24 @@ def test_the_heads_turn_is_found_from_its_normals() -> None:
     turn = pose_to_rotation(30.0, -10.0, 5.0)
     turned = torch.einsum("dc,cij->dij", turn, mean)
     assert torch.allclose(head_rotation(mean, turned[None])[0], turn, atol=1e-5)
+
+
+def test_directions_are_learnt_in_the_frame_of_the_head() -> None:
+    """R^T of the light in camera space: a texture does not show how its head is turned."""
+    turn = pose_to_rotation(35.0, -10.0, 5.0)
+
+    class TurnedFaces(ToyFaces):
+        def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+            sample = super().draw(heads, lights, generator)
+            return replace(sample, normals_target=torch.einsum("dc,bcij->bdij", turn, sample.normals_source))
+
+    stage = LightFeaturesObjective(TurnedFaces(), LightNetwork(LightSettings(1 / 16, 4, 8)), SETTINGS)
+    batch = stage.draw(2, lambda i: seeded(5, i), 0)
+    drawn = torch.cat([TurnedFaces().draw(*_drawn(stage, seeded(5, i))).lights for i in range(2)])
+    torch.testing.assert_close(batch.lights_head, drawn @ turn, rtol=0, atol=1e-4)
+
+
+def _drawn(stage: LightFeaturesObjective, generator: torch.Generator) -> tuple[Tensor, int, torch.Generator]:
+    """The arguments with which the stage draws a sample."""
+    head = stage.heads[torch.randint(len(stage.heads), (1,), generator=generator)]
+    return head, SETTINGS.lights, generator
