@@ -1,18 +1,26 @@
-"""The arrow from crop to fit, with and without a Geometry Network."""
+"""The arrow from crop to head: fitted to landmarks, or regressed by the Geometry Network alone."""
 
+import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
-from facerf_cli.face.crop import from_landmarks
+from facerf_cli.errors import UsageError
+from facerf_cli.face import landmarks
+from facerf_cli.face.crop import from_box, from_landmarks
+from facerf_cli.face.landmarks import FaceBox, find_boxes, find_faces
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.models import Models, load_models
-from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.pipeline import fit_photo, regress_head
+from facerf_cli.files.images import read_image
+from facerf_cli.models import Models, Sides, load_models
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.pipeline import fit_photo, head_of, regress_head, regress_photo
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
+SIDES = Sides(64, 128)
 PHOTO = np.full((300, 300, 3), 0.2, np.float32)
 
 
@@ -38,8 +46,8 @@ def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: 
     )
     start = regress_head(seeing, from_landmarks(landmarks_px, 128).apply(PHOTO))
     assert start and start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)
-    cold = fit_photo(replace(models, geometry=None), PHOTO, landmarks_px, 64).fit
-    warm = fit_photo(seeing, PHOTO, landmarks_px, 64).fit
+    cold = fit_photo(replace(models, geometry=None), PHOTO, landmarks_px, SIDES).fit
+    warm = fit_photo(seeing, PHOTO, landmarks_px, SIDES).fit
     assert warm.error_iod == pytest.approx(cold.error_iod, abs=5e-4)
     moved_m = warm.vertices_camera(models.face) - cold.vertices_camera(models.face)
     assert moved_m.norm(dim=-1).max() < 2e-3
@@ -48,4 +56,79 @@ def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: 
 def test_the_default_network_on_a_blank_photo_does_not_spoil_the_fit(
     models: Models, landmarks_px: np.ndarray
 ) -> None:
-    assert fit_photo(models, PHOTO, landmarks_px, 64).fit.error_iod < 0.02
+    assert fit_photo(models, PHOTO, landmarks_px, SIDES).fit.error_iod < 0.02
+
+
+BOX = (80.0, 70.0, 220.0, 210.0)
+ASTRONAUT = Path(__file__).parents[1] / "examples/astronaut.jpg"
+
+
+class Knows(nn.Module):
+    """A Geometry Network that regresses the same head from every crop."""
+
+    def __init__(self, yaw_deg: float) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(1)
+        alpha, beta = (0.5 * torch.randn(1, count, generator=generator) for count in (5, 3))
+        rotation = pose_to_rotation(yaw_deg, 4.0, 2.0)[None]
+        self.head = GeometryEstimate(rotation, torch.tensor([[0.01, -0.02, -1.1]]), alpha, beta)
+
+    def forward(self, crops: torch.Tensor) -> GeometryEstimate:
+        return self.head
+
+
+def vertices_of(models: Models, head: GeometryEstimate) -> torch.Tensor:
+    """v^c = R (mean + M_id alpha + M_exp beta) + t, by the paper's formula."""
+    model = models.face
+    shape = model.mean + torch.einsum("k,kvc->vc", head.alpha[0], model.identity[:5])
+    shape = shape + torch.einsum("k,kvc->vc", head.beta[0], model.expression[:3])
+    return shape @ head.rotation[0].T + head.translation_m[0]
+
+
+def test_one_forward_pass_gives_the_head(models: Models) -> None:
+    network = Knows(15.0)
+    head = regress_photo(replace(models, geometry=network), PHOTO, BOX, SIDES)
+    assert head.fit.crop == from_box(BOX, SIDES.crop_px) and head.cropped.shape == (128, 128, 3)
+    wanted = vertices_of(models, network.head)
+    torch.testing.assert_close(head.fit.vertices_camera(models.face), wanted)
+    landmarks_px = project(models.face.landmarks(wanted[None])[0], head.fit.camera)
+    torch.testing.assert_close(head.fit.landmarks_px, landmarks_px)
+    assert math.isnan(head.fit.error_iod) and head.fit.quality == "unknown"
+
+
+def test_another_network_gives_another_head(models: Models) -> None:
+    """A fit to landmarks would undo the difference."""
+    one, other = (
+        regress_photo(replace(models, geometry=Knows(yaw)), PHOTO, BOX, SIDES).fit for yaw in (0.0, 20.0)
+    )
+    assert (one.rotation - other.rotation).abs().max() > 0.3
+
+
+def test_another_face_model_gets_the_same_surface(models: Models) -> None:
+    """The regressed coefficients are the built-in model's; vertices are matched by least squares."""
+    network, face = Knows(15.0), models.face
+    twice = replace(face, name="other", identity=2 * face.identity[:20], expression=face.expression[:12])
+    other = replace(models, geometry=network, face=twice)
+    found = regress_photo(other, PHOTO, BOX, SIDES).fit.vertices_camera(twice)
+    assert (found - vertices_of(models, network.head)).norm(dim=-1).max() < 1e-3
+
+
+def test_without_a_geometry_network_there_is_nothing_to_regress(models: Models) -> None:
+    with pytest.raises(UsageError, match="without a Geometry Network"):
+        head_of(replace(models, geometry=None), PHOTO, FaceBox(BOX, 1.0), SIDES)
+
+
+def test_boxes_are_found_without_the_landmark_predictor(monkeypatch: pytest.MonkeyPatch) -> None:
+    photo = read_image(ASTRONAUT).pixels
+    whole = find_faces(photo, "astronaut")[0]
+
+    def never() -> None:
+        raise AssertionError("the predictor was loaded")
+
+    monkeypatch.setattr(landmarks, "_predictor", never)
+    box = find_boxes(photo, "astronaut")[0]
+    assert box.box_px == whole.box_px and box.score == whole.score
+    by_box, by_landmarks = from_box(box.box_px, 64), from_landmarks(whole.landmarks_px, 64)
+    assert by_box.side_px == pytest.approx(by_landmarks.side_px, rel=0.15)
+    off_px = [by_box.x0_px - by_landmarks.x0_px, by_box.y0_px - by_landmarks.y0_px]
+    assert np.abs(off_px).max() < 0.12 * by_landmarks.side_px

@@ -160,13 +160,9 @@ def regressed_fit(model: MorphableModel, regressed: FitStart, crop: Crop) -> Fac
     least squares over the mesh.
     """
     if model.name == BUILTIN:
-        missing = (
-            len(model.identity) - regressed.alpha.shape[1],
-            len(model.expression) - regressed.beta.shape[1],
-        )
         alpha, beta = (
-            torch.nn.functional.pad(tensor[0].float(), (0, count))
-            for tensor, count in zip((regressed.alpha, regressed.beta), missing, strict=True)
+            torch.nn.functional.pad(found[0].float(), (0, len(basis) - found.shape[1]))
+            for found, basis in ((regressed.alpha, model.identity), (regressed.beta, model.expression))
         )
         rotation, translation_m = regressed.rotation[0].float(), regressed.translation_m[0].float()
     else:
