@@ -1,7 +1,7 @@
 """Methods without networks that record what the protocols ask of them, and a person of known albedo."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
 from facerf_cli.composite import Target
 from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Person
+from facerf_cli.evaluation.people import Person, Portrait
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
@@ -88,13 +88,14 @@ class PersonOfAlbedo(Person):
         albedo = np.where(cosine[..., None] > 0.02, lit / np.maximum(cosine, 0.02)[..., None], 0)
         return albedo.astype(np.float32)
 
-    def head(self, pair: Any, image: np.ndarray) -> Head:
-        seen = self.crop(pair.source_camera).header.seen
+    def portrait(self, pair: Any) -> Portrait:
+        portrait = super().portrait(pair)
         lit = self._frontal(pair.source_camera)[1] > 0.02
-        return super().head(pair, image).without(self.model, seen * lit)
+        assert portrait.photo.alpha is not None
+        return replace(portrait, photo=replace(portrait.photo, alpha=portrait.photo.alpha * lit))
 
     def _frontal(self, camera: str) -> tuple[int, np.ndarray]:
         """The light nearest to the camera's axis, and its cosine to each pixel's normal."""
-        header = self.crop(camera).header
+        header = self.header(camera)
         front = int(header.directions[:, 2].argmax())
         return front, header.normals @ header.directions[front]

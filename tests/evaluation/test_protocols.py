@@ -4,7 +4,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +12,20 @@ import torch
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
+from facerf_cli.evaluation import people
 from facerf_cli.evaluation.case import Case
 from facerf_cli.evaluation.crop_view import CropView, angle_class, angle_of, turn_class
 from facerf_cli.evaluation.people import Person, evenly
-from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, Form, compare_geometries
+from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, compare_geometries
 from facerf_cli.evaluation.protocols.olat import LAMBERT, compare_olats
 from facerf_cli.evaluation.protocols.reconstruction import brightest, reconstruct
 from facerf_cli.evaluation.protocols.transfer import Side, couples_of, transfer
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
+from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.metrics import si_mse, si_mse_channels
+from facerf_cli.models import Sides
 from facerf_cli.raster.camera import pose_to_rotation
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
@@ -34,27 +38,35 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 @pytest.fixture(scope="module")
 def person(dataset: Dataset) -> Person:
-    return PersonOfAlbedo(load_face_model(), dataset, "0000")
+    return person_of(dataset)
+
+
+def person_of(dataset: Dataset, geometry: Geometry | None = None) -> PersonOfAlbedo:
+    """Of the joint fit, which is the true one here, unless another geometry is given."""
+    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96))
 
 
 def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
     return Pair("0000", index, "test", source, envmap, 0.0, 0, target, light)
 
 
-def unlit(person: Person, gain: float = 1.0) -> Double:
-    return Double("unlit", models=FaceModelOnly(person.model), gain=gain)
+FACE_ONLY = FaceModelOnly(load_face_model())
+
+
+def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
+    return Double("unlit", models=models, gain=gain)
 
 
 def side_light(person: Person, camera: str) -> int:
     """A light from the side that the camera sees."""
-    directions = person.crop(camera).header.directions
+    directions = person.header(camera).directions
     return int(np.abs(directions @ np.array([0.7, 0.1, 0.7]) - 1).argmin())
 
 
 @pytest.mark.parametrize("target", ["C0", "C1"])
 def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, target: str) -> None:
     asked = pair(3, "C0", target, side_light(person, target))
-    (found,) = compare_olats(person, [asked], [unlit(person)], network_alone=False)
+    (found,) = compare_olats(person, [asked], [unlit()], network_alone=False)
     truth, mask = found.truth, found.mask
     right = si_mse(found.predictions[LAMBERT], truth, mask)
     wrong = si_mse(found.predictions["unlit"], truth, mask)
@@ -70,45 +82,45 @@ def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, ta
 
 def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, dataset: Dataset) -> None:
     traits = {"ita_deg": 30.0, "melanin": 0.05, "haemoglobin": 0.02, "random_texture": False}
-    known = PersonOfAlbedo(person.model, replace(dataset, traits={"0000": traits}), "0000")
-    front = int(known.crop("C0").header.directions[:, 2].argmax())
+    known = person_of(replace(dataset, traits={"0000": traits}))
+    front = int(known.header("C0").directions[:, 2].argmax())
     asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
-    near, aside = compare_olats(known, asked, [unlit(known)], network_alone=True)
+    near, aside = compare_olats(known, asked, [unlit()], network_alone=True)
     assert near.case.facts["tone"] == "intermediate"
     assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
     assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
     assert not aside.extra
     painted = replace(dataset, traits={"0000": traits | {"random_texture": True}})
-    assert PersonOfAlbedo(person.model, painted, "0000").facts == {"tone": "unknown"}
+    assert person_of(painted).facts == {"tone": "unknown"}
 
 
 def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) -> None:
     asked = pair(0, "C0", "C0", 0)
     image = person.source(asked)
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
-    view = person.crop("C0").view
-    found = reconstruct(Case("a", "0000"), view, person.head(asked, image), [unlit(person, 0.5)], truth)
+    portrait = person.portrait(asked)
+    found = reconstruct(Case("a", "0000"), portrait, [unlit(0.5)], truth)
     error = si_mse(found.predictions["unlit"], image, found.mask)
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
     assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
-    np.testing.assert_allclose(found.landmarks_px, person.crop("C0").view.fit.landmarks_px)
+    np.testing.assert_allclose(found.landmarks_px, portrait.by(FACE_ONLY).head.fit.landmarks_px)
 
 
 def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
-    method = unlit(person)
+    method = unlit()
     sides = []
     for camera in ("C0", "C1"):
         asked = pair(0, camera, camera, 0)
-        head = person.head(asked, person.source(asked))
-        sides.append(Side(Case(f"by {camera}", "0000"), person.crop(camera).view, head))
+        sides.append(Side(Case(f"by {camera}", "0000"), person.portrait(asked)))
     first, second = transfer((sides[0], sides[1]), [method])
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
     assert torch.equal(light_of_a[0], a.light.weights)
-    fits = [side.view.fit for side in sides]
+    heads = [side.portrait.by(FACE_ONLY).head for side in sides]
+    fits = [head.fit for head in heads]
     torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
-    assert first.truth is sides[0].head.cropped and first.source is sides[1].head.cropped
+    assert first.truth is heads[0].cropped and first.source is heads[1].cropped
     assert second.case.facts["turn"] == "30 to 60 deg"
     for found in (first, second):  # the same face in another image: its texture fits where it is visible
         energy = np.square(found.truth[found.mask > 0.5]).mean()
@@ -121,37 +133,93 @@ def test_a_scale_a_channel_forgives_colour_alone() -> None:
     assert si_mse_channels(truth[::-1], truth, mask) > 0.01
 
 
-def test_the_mean_face_is_compared_where_both_see_the_face(person: Person) -> None:
-    model = person.model
-    people = {FULL: replace(person, refit=True, _crops={})}
-    people[MEAN] = replace(people[FULL], model=model.pose_only(), _crops={})
-    asked = pair(0, "C1", "C1", 0)
-    image = person.source(asked)
-    forms = {name: Form(p.crop("C1").view, p.head(asked, image), [unlit(p)]) for name, p in people.items()}
-    assert not forms[MEAN].view.fit.alpha.any() and forms[FULL].view.fit.alpha.any()
-    found = compare_geometries(Case("a", "0000"), image, forms)
+def test_the_mean_face_is_compared_where_both_see_the_face(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person = found_by_truth(dataset, monkeypatch)
+    mean = FaceModelOnly(FACE_ONLY.face.pose_only())
+    portrait = person.portrait(pair(0, "C1", "C1", 0))
+    views = [portrait.by(models).view for models in (FACE_ONLY, mean)]
+    assert views[0].fit.alpha.any() and not views[1].fit.alpha.any()
+    forms = {FULL: [unlit()], MEAN: [unlit(models=mean)]}
+    found = compare_geometries(Case("a", "0000"), portrait, forms)
     assert list(found.predictions) == [FULL, MEAN]
-    assert (found.mask <= forms[MEAN].view.mask).all() and (found.mask <= forms[FULL].view.mask).all()
-    two: dict[str, Any] = {
-        name: replace(form, methods=[replace(form.methods[0], name=method) for method in "xy"])
-        for name, form in forms.items()
-    }
-    names = list(compare_geometries(Case("a", "0000"), image, two).predictions)
+    assert np.array_equal(found.mask, np.minimum(views[0].mask, views[1].mask))
+    two = {name: [replace(methods[0], name=method) for method in "xy"] for name, methods in forms.items()}
+    names = list(compare_geometries(Case("a", "0000"), portrait, two).predictions)
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
+def found_by_truth(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, blind: str = "") -> PersonOfAlbedo:
+    """A person in whose images faces are found where they are; in those of the camera `blind` none is."""
+    joint = person_of(dataset)
+    cameras = {camera: joint.lit(camera).face for camera in ("C0", "C1")}
+
+    def find(geometry: Geometry, image: np.ndarray, name: str, which: str = "largest") -> list[Face]:
+        assert geometry == "landmarks"
+        camera = name.rpartition("/")[2]
+        if camera not in cameras:  # a source, of C0 if its index is even
+            camera = f"C{int(camera) % 2}"
+        if camera == blind:
+            raise InputError(f"{name}: no face found")
+        fit = cameras[camera]
+        assert isinstance(fit, FaceFit)
+        return [face_at(fit.landmarks_px.double().numpy())]
+
+    monkeypatch.setattr(people, "find_for", find)
+    return person_of(dataset, "landmarks")
+
+
+def test_each_image_is_a_photo_of_its_own(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its head is fitted to the landmarks that are found in it, in the crop that they give."""
+    asked = pair(0, "C0", "C0", 0)
+    alone = found_by_truth(dataset, monkeypatch).portrait(asked).by(FACE_ONLY)
+    joint = person_of(dataset).portrait(asked).by(FACE_ONLY)
+    assert isinstance(joint.head.fit, FaceFit) and joint.head.fit.crop.side_px == 96
+    landmarks_px = joint.head.fit.landmarks_px.double().numpy()
+    assert alone.head.fit.crop == from_landmarks(landmarks_px, 96)
+    assert not torch.equal(alone.head.fit.alpha, joint.head.fit.alpha)
+    own = fit_landmarks(FACE_ONLY.face, alone.head.fit.crop.to_crop(landmarks_px), alone.head.fit.crop)
+    torch.testing.assert_close(alone.head.fit.alpha, own.alpha, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("target", ["C0", "C1"])
+def test_monocular_predictions_lie_on_the_truth(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    person = found_by_truth(dataset, monkeypatch)
+    asked = pair(2, "C0", target, side_light(person, target))
+    (found,) = compare_olats(person, [asked], [unlit()], network_alone=False)
+    right = si_mse(found.predictions[LAMBERT], found.truth, found.mask)
+    wrong = si_mse(found.predictions["unlit"], found.truth, found.mask)
+    assert found.truth.shape == found.predictions["unlit"].shape == (96, 96, 3)
+    assert right < 0.2 * wrong  # the fit to landmarks is not the true shape
+
+
+def test_images_without_a_face_are_left_out_and_named(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    person = found_by_truth(dataset, monkeypatch, blind="C1")
+    light = side_light(person, "C0")
+    asked = [pair(0, "C0", "C0", light), pair(1, "C1", "C1", light), pair(2, "C0", "C1", light)]
+    with caplog.at_level("WARNING"):
+        found = list(compare_olats(person, asked, [unlit()], network_alone=False))
+    assert [comparison.case.name for comparison in found] == ["0000/00000"]
+    assert sum("left out" in record.message for record in caplog.records) == 2
+
+
 def test_open_eyes_are_left_out_unless_they_are_kept(person: Person) -> None:
-    crop = person.crop("C0")
-    kept = CropView.of(person.model, crop.view.fit, crop.header.seen, keep_eyes=True)
-    eyes = crop.view.region("eyes") > 0.9
-    assert eyes.sum() > 10 and crop.view.mask[eyes].max() < 0.11
-    assert kept.mask[eyes].min() > 0.5 and (kept.mask >= crop.view.mask).all()
+    view, header = person.lit("C0").by(FACE_ONLY).view, person.header("C0")
+    kept = CropView.of(FACE_ONLY.face, view.fit, header.seen, keep_eyes=True)
+    eyes = view.region("eyes") > 0.9
+    assert eyes.sum() > 10 and view.mask[eyes].max() < 0.11
+    assert kept.mask[eyes].min() > 0.5 and (kept.mask >= view.mask).all()
 
 
 def test_a_face_of_which_nothing_is_seen_is_named(person: Person) -> None:
-    crop = person.crop("C0")
+    fit = person.lit("C0").by(FACE_ONLY).view.fit
     with pytest.raises(InputError, match="nothing of the fitted face"):
-        CropView.of(person.model, crop.view.fit, 0 * crop.header.seen)
+        CropView.of(FACE_ONLY.face, fit, 0 * person.header("C0").seen)
 
 
 def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> None:
@@ -188,7 +256,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     from facerf_cli.dataset.pairs import image_path, read_pairs
     from facerf_cli.dataset.weights import weights_path
 
-    person, (first, second) = Person(load_face_model(), dataset, "0000"), read_pairs(dataset)
+    person, (first, second) = Person(dataset, "0000", None, Sides(128, 32)), read_pairs(dataset)
     directions, weights = person.light(second)
     assert directions.shape == (12, 3)
     weights_path(dataset).unlink()
@@ -207,7 +275,7 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
         if traits is None:
             del content["subjects"]["0000"]["traits"]
         (folder / "dataset.json").write_text(json.dumps(content))
-        assert Person(load_face_model(), read_dataset(folder), "0000").facts["tone"] == tone
+        assert Person(read_dataset(folder), "0000", None, Sides(128, 96)).facts["tone"] == tone
     content["subjects"]["0000"]["traits"] = ["dark"]
     (folder / "dataset.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="traits"):
