@@ -1,7 +1,7 @@
 """Random moves of training crops: at test time a crop is cut around a detector's box, not around landmarks.
 
-The spreads are those of `face.crop.from_box` against `face.crop.from_landmarks`, measured by
-`benchmarks/crop_boxes.py`.
+The spreads are those of `face.crop.from_box` against `face.crop.from_landmarks` on synthetic people in eight
+cameras (`benchmarks/crop_boxes.py`): a detector's box is off to the side where a head is turned.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from facerf_cli.network.inputs import resize
 
-_LOG_SCALE, _SHIFT = 0.06, (0.055, 0.025)  # standard deviations; shifts right and down in sides of the crop
+_LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
 _MOST = 2.0  # standard deviations
 
 
