@@ -4,12 +4,14 @@ import csv
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
 from facerf_cli.cli.items.evaluation import MethodOptions, portraits
@@ -18,6 +20,9 @@ from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
+from facerf_cli.evaluation import people
+from facerf_cli.face.fit import load_fit
+from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from tests.dataset.dataset_fixture import write_small_dataset
@@ -62,14 +67,14 @@ def images(folder: Path) -> list[dict[str, str]]:
 
 def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone") == 0
+    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone", "--joint-fit") == 0
     assert "lambert" in capsys.readouterr().out
     found = json.loads((out / "summary.json").read_text())
     assert (found["pictures"], found["persons"], found["methods"]) == (3, 2, ["field", "lambert"])
     held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::4]
     assert {row["case"] for row in images(out)} == {f"{p.subject}/{p.index:05d}" for p in held_out}
     assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
-    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone") == 0
+    assert run("olat", folder, "-o", out, "--every", "4", "--network-alone", "--joint-fit") == 0
     assert "already finished" in capsys.readouterr().err
 
 
@@ -104,11 +109,11 @@ def test_options_that_would_do_nothing_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = "-o", tmp_path / "out"
-    for words in (["--every", "1"], ["--split", "all"], ["--refit"]):
+    for words in (["--every", "1"], ["--split", "all"], ["--joint-fit"]):
         line = refused(capsys, "reconstruction", PHOTO, *out, *words)
         assert words[0] in line and "prepared dataset" in line
     assert "--every" in refused(capsys, "geometry", PHOTO, *out, "--every", "2")
-    assert "--refit" in refused(capsys, "transfer", "--photos", PHOTO, PHOTO, *out, "--refit")
+    assert "--joint-fit" in refused(capsys, "transfer", "--photos", PHOTO, PHOTO, *out, "--joint-fit")
     assert "is for photos" in refused(capsys, "reconstruction", folder, *out, "--face", "all")
     assert "--landmarks" in refused(capsys, "transfer", folder, *out, "--landmarks", tmp_path)
     alone = "--reflectance", "prt"
@@ -143,14 +148,17 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(
     path = tmp_path / "half.png"
     Image.fromarray(np.dstack([photo, shown])).save(path)
     options = PhotoOptions(Settings(device="cpu"))
-    (_, whole), (_, half) = (next(portraits(Item(x, x, x.stem), options, False)) for x in (PHOTO, path))
-    crop = half.view.fit.crop
+    methods, models = MethodOptions.of(options, EvaluateOptions(tmp_path)), load_models_once(options)
+    (_, whole), (_, half) = (next(portraits(Item(x, x, x.stem), methods, False)) for x in (PHOTO, path))
+    seen, part = whole.by(models), half.by(models)
+    crop = part.view.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
     left, right = column < 215, column > 225
-    assert whole.view.mask[:, left].max() == 1 and half.view.mask[:, left].max() == 0
-    np.testing.assert_allclose(half.view.mask[:, right], whole.view.mask[:, right], atol=0.01)
-    assert half.head.face.visible.sum() < 0.8 * whole.head.face.visible.sum()
-    assert half.fitted_by(load_models_once(options)).view.mask[:, left].max() == 0
+    assert seen.view.mask[:, left].max() == 1 and part.view.mask[:, left].max() == 0
+    np.testing.assert_allclose(part.view.mask[:, right], seen.view.mask[:, right], atol=0.01)
+    assert part.head.face.visible.sum() < 0.8 * seen.head.face.visible.sum()
+    mean = replace(models, face=models.face.pose_only())
+    assert half.by(mean).view.mask[:, left].max() == 0
     Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
     assert run("reconstruction", path, "-o", tmp_path / "out") == 1
     assert f"{path}: " in capsys.readouterr().err
@@ -185,11 +193,20 @@ def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("doubles")
-def test_people_of_a_dataset_by_every_protocol(folder: Path, tmp_path: Path) -> None:
-    assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6") == 0
+def test_people_of_a_dataset_by_every_protocol(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6", "--joint-fit") == 0
     assert all(float(row["light_error_deg"]) <= 180 for row in images(tmp_path / "r"))
-    assert run("transfer", folder, "-o", tmp_path / "t", "--every", "9") == 0
+    assert run("transfer", folder, "-o", tmp_path / "t", "--every", "9", "--joint-fit") == 0
     assert {row["person"] for row in images(tmp_path / "t")} <= {"0001", "0002"}
+    dataset = read_dataset(folder)
+    cameras = {f"{p.subject}/{p.index:05d}": (p.subject, p.source_camera) for p in read_pairs(dataset)}
+
+    def find(geometry: str, image: np.ndarray, name: str) -> list[Face]:
+        return [face_at(load_fit(dataset.fit_path(*cameras[name])).landmarks_px.double().numpy())]
+
+    monkeypatch.setattr(people, "find_for", find)
     assert run("geometry", folder, "-o", tmp_path / "g", "--every", "12", "--jobs", "1") == 0
     assert len(images(tmp_path / "g")) == 2
 

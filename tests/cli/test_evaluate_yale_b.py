@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.yale_b import Flash, read_yale_b
+from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items import evaluate_images
 from facerf_cli.cli.items.evaluation import MethodOptions
 from facerf_cli.cli.options import Settings
@@ -35,7 +36,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
     monkeypatch.setattr(evaluate_images, "load_methods", lambda _: (Lambert("field", models),))
-    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
 
 
 @pytest.mark.usefixtures("toys")
@@ -118,7 +119,7 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
-    methods = MethodOptions(PhotoOptions(Settings()), ("field", "prt"), ())
+    methods = MethodOptions.of(PhotoOptions(Settings()), EvaluateOptions(Path("out"), ("field", "prt")))
     sent = pickle.loads(pickle.dumps(evaluate_images._YaleB(methods, read_yale_b(folder), False)))
     assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

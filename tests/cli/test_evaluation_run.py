@@ -16,6 +16,7 @@ from facerf_cli.cli.items.evaluate_transfer import _Couple, _TransferPhotos
 from facerf_cli.cli.items.evaluation import MethodOptions
 from facerf_cli.cli.items.evaluation_key import evaluation_key, item_key
 from facerf_cli.cli.items.evaluation_run import keep_images
+from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
@@ -101,7 +102,7 @@ def test_a_key_is_of_what_a_path_leads_to(tmp_path: Path, monkeypatch: pytest.Mo
         photo = PhotoOptions(Settings(), face_model=f"{folder}/a.npz", landmarks=Path(folder))
         item = Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a")
         couples = {item: _Couple("ann", item, item)}
-        methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),))
+        methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),), LightOptions(photo))
         options = EvaluateOptions(Path("out"), (), compare=(Path(folder),))
         return evaluation_key("toy", _TransferPhotos(methods, couples, False, False), options, Settings())
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.dataset.crop_move import UNMOVED, CropMove
 from facerf_cli.dataset.crops import PairReader, mean_translation_m, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path
@@ -68,15 +69,40 @@ def test_light_is_in_the_targets_camera_space(dataset: Dataset, reader: PairRead
 
 def test_landmarks_follow_the_crop(dataset: Dataset, reader: PairReader) -> None:
     pair = next(pair for pair in reader.pairs if pair.source_camera != pair.target_camera)
-    larger = open_pairs(dataset, "train", 2 * CROP_PX).read(pair)
     smaller = open_pairs(dataset, "train", CROP_PX // 2).read(pair)
     for name, camera in (("source", pair.source_camera), ("target", pair.target_camera)):
         expected = load_fit(dataset.fit_path(pair.subject, camera)).landmarks_px
-        for crops, scale in ((larger, 2), (smaller, 0.5)):
-            assert torch.allclose(getattr(crops, f"{name}_landmarks_px")[0], expected * scale, atol=1e-3)
-            assert getattr(crops, name).shape == (1, 3, CROP_PX * scale, CROP_PX * scale)
+        assert torch.allclose(getattr(smaller, f"{name}_landmarks_px")[0], expected / 2, atol=1e-3)
+        assert getattr(smaller, name).shape == (1, 3, CROP_PX // 2, CROP_PX // 2)
     same = reader.read(pair)
     assert torch.allclose(torch.nn.functional.avg_pool2d(same.target, 2), smaller.target, atol=1e-5)
+
+
+def test_crops_are_never_enlarged(dataset: Dataset) -> None:
+    with pytest.raises(InputError, match=f"{CROP_PX} px, the networks need {2 * CROP_PX}.*--texture-size"):
+        open_pairs(dataset, "train", 2 * CROP_PX)
+
+
+def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: PairReader) -> None:
+    """As far as a detector's box may be off; the content follows the landmarks."""
+    pair, move = reader.pairs[0], CropMove(1.25, (0.1, -0.05))
+    plain, moved = reader.read(pair), reader.read(pair, (move, UNMOVED))
+    assert torch.equal(moved.target, plain.target)
+    middle = torch.full((2,), CROP_PX / 2)
+    wanted_px = (plain.source_landmarks_px - middle) * 1.25 + middle + CROP_PX * torch.tensor([0.1, -0.05])
+    torch.testing.assert_close(moved.source_landmarks_px, wanted_px)
+    rows, columns = torch.meshgrid(*[torch.arange(CROP_PX) + 0.5] * 2, indexing="ij")
+
+    def centre_px(image: torch.Tensor) -> torch.Tensor:
+        weight = image[0].mean(0)
+        return torch.stack([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+
+    still = CropMove(1.0, (0.04, 0.02)).image(plain.source, CROP_PX)
+    off_px = centre_px(still) - centre_px(plain.source)
+    assert (off_px - CROP_PX * torch.tensor([0.04, 0.02])).abs().max() < 0.5
+    draws = [CropMove.draw(torch.Generator().manual_seed(seed)) for seed in range(200)]
+    spread = torch.tensor([draw.shift for draw in draws]).std(0)
+    assert (spread / torch.tensor([0.1, 0.03]) - 0.9).abs().max() < 0.15  # normal, cut at two deviations
 
 
 def test_sources_that_were_not_written_are_weighed(

@@ -13,10 +13,12 @@ from facerf_cli.baselines.base import Explained
 from facerf_cli.composite import Target
 from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person, Portrait
+from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.models import Sides
 from facerf_cli.pipeline import relight
 
 LIGHTS = torch.eye(3)
@@ -42,6 +44,10 @@ class FaceModelOnly:
 
     face: MorphableModel
     geometry: None = None
+    default_geometry: Geometry = "landmarks"
+
+    def sides(self) -> Sides:
+        return Sides(256, 512)
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,4 +49,4 @@ def someone() -> Face:
     model = load_face_model("builtin")
     points = model.landmarks(model.mean[None])[0] + torch.tensor([0, 0, -0.9])
     landmarks_px = project(points, Camera(4.0 * WIDTH_PX, WIDTH_PX, HEIGHT_PX, WIDTH_PX / 2, HEIGHT_PX / 2))
-    return Face(landmarks_px.numpy(), (0, 0, WIDTH_PX, HEIGHT_PX), 1.0)
+    return Face((0, 0, WIDTH_PX, HEIGHT_PX), 1.0, landmarks_px.numpy())

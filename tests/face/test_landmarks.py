@@ -76,7 +76,7 @@ def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(landmarks_px):
 
 
 def test_of_two_faces_of_one_size_the_surer_is_the_largest(landmarks_px):
-    doubtful, sure = (Face(landmarks_px, (0, 0, side, side), score) for side, score in ((50, 0.4), (49, 1.2)))
+    doubtful, sure = (Face((0, 0, side, side), score, landmarks_px) for side, score in ((50, 0.4), (49, 1.2)))
     assert choose_face([doubtful, sure], "largest", "p") == [sure]
 
 

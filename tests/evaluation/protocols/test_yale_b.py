@@ -27,10 +27,11 @@ from facerf_cli.evaluation.protocols.yale_b_cases import (
     environment_weights,
     face_mask,
 )
+from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import load_models
-from facerf_cli.pipeline import fit_photo, relight
+from facerf_cli.pipeline import fit_photo, head_of, relight
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly
@@ -102,7 +103,7 @@ def test_scores_are_the_benchmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
-    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
     comparisons = list(compare_sitter(databases[0], "yaleB05", []))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
@@ -115,10 +116,10 @@ def test_scores_are_the_benchmarks(
 
 
 def too_bright_sources(
-    sitter: Sitter, photo: np.ndarray, landmarks_px: np.ndarray, asked: list[Any], *_: Any
+    sitter: Sitter, photo: np.ndarray, face: Face, asked: list[Any], *_: Any
 ) -> dict[str, np.ndarray]:
     """In the place of methods: the source itself, twice as bright, so that scale and clipping count."""
-    assert landmarks_px.shape == (68, 2)
+    assert face.landmarks_px.shape == (68, 2)
     return {"copy": np.stack([2 * photo] * len(asked))}
 
 
@@ -141,8 +142,8 @@ def small(tmp_path: Path) -> YaleB:
 
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
-    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
-    monkeypatch.setattr(yale_b, "fit_photo", lambda *given: fits.update(["fitted"]) or fit_photo(*given))
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
+    monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
     models = FaceModelOnly(load_face_model("builtin"))
@@ -186,7 +187,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yale_b, "find_faces", lambda image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
     models = load_models(None, "builtin", torch.device("cpu"))
     sitter = Sitter(small, "yaleB07")
     photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
