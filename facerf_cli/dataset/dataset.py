@@ -330,9 +330,3 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "negative": "set to 0 after the crop",
         },
     }
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, in hex."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,7 +1,6 @@
 """Keys of all that figures depend on, so that one table never mixes two ways of measuring."""
 
 import dataclasses
-import hashlib
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -11,13 +10,15 @@ from facerf_cli import __version__
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.errors import InputError
+from facerf_cli.files.documents import digest
+from facerf_cli.files.downloads import file_sha256
 from facerf_cli.logs import json_line
 from facerf_cli.models import DEFAULT_CHECKPOINT
 
 # Fields that change no figure; and fields that hold a name or a file's path.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
 _WITHOUT_EFFECT |= {"shard", "ray", "output_base"}
-_MEASURING = 2  # raised when the same options give other figures
+_MEASURING = 3  # raised when the same options give other figures
 _NAME_OR_PATH = {"face_model", "vgg_weights"}
 
 
@@ -34,12 +35,12 @@ def evaluation_key(
         "networks": networks_of(options, settings),
         "others": [_files_of(folder) for folder in options.compare],
     }
-    return hashlib.sha256(json_line(facts).encode("utf-8", "backslashreplace")).hexdigest()[:16]
+    return digest(json_line(facts).encode("utf-8", "backslashreplace"))
 
 
 def item_key(key: str, path: Path) -> str:
     """The key of one item, which differs for another file of the same name."""
-    return hashlib.sha256(json_line({"run": key, "item": _plain(path)}).encode()).hexdigest()[:16]
+    return digest(json_line({"run": key, "item": _plain(path)}).encode())
 
 
 def networks_of(options: EvaluateOptions, settings: Settings) -> dict[str, str]:
@@ -59,8 +60,7 @@ def _files_of(folder: Path) -> list[Any]:
 @cache
 def _sha256(path: Path) -> str:
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return file_sha256(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
 

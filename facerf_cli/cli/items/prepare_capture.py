@@ -37,7 +37,6 @@ from facerf_cli.dataset.dataset import (
     describe_dataset,
     preparation_key,
     record_path,
-    sha256_of,
 )
 from facerf_cli.dataset.pages import index_page
 from facerf_cli.dataset.prepare import prepare_subject, prepared_subjects, subject_outputs
@@ -45,6 +44,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
+from facerf_cli.files.downloads import file_sha256
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.synth.threads import one_thread
 
@@ -174,7 +174,7 @@ def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
 
 def _model_digest(name: str) -> str:
     _face_model(name)  # reports a wrong file before it is hashed
-    return sha256_of(BUILTIN_PATH if name == BUILTIN else Path(name))
+    return file_sha256(BUILTIN_PATH if name == BUILTIN else Path(name))
 
 
 @cache
