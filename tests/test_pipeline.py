@@ -177,3 +177,10 @@ def test_features_see_the_exposure_of_their_training(models: Models, head: Head)
     photo = seen[0][0]  # what the explanations are compared with
     assert abs(float(photo[:, mask].mean()) - MEAN_RADIANCE) < 1e-4
     assert not photo[:, ~mask].any()
+
+
+def test_sums_of_lights_do_not_depend_on_how_they_are_batched() -> None:
+    generator = torch.Generator().manual_seed(0)
+    olats, weights = torch.rand(7, 3, 4, 5, generator=generator), torch.rand(2, 7, 3, generator=generator)
+    whole = torch.einsum("mlc,lcij->mcij", weights, olats)
+    torch.testing.assert_close(weighted_sum(torch.split(olats, 3), weights), whole)

@@ -210,6 +210,17 @@ def test_a_fit_knows_its_model_and_its_quality(model):
         fit.vertices_camera(replace(model, name="other"))
 
 
+def test_a_turn_leads_from_this_pose_to_the_other(model):
+    """Vectors in camera space, as normals are: N_t = turn N_s."""
+    source, target = pose_to_rotation(30.0, 10.0, 5.0), pose_to_rotation(-20.0, 0.0, 15.0)
+    fit = replace(
+        fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP), rotation=source
+    )
+    normals_head = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
+    turned = normals_head @ source.T @ fit.turn_to(target).T
+    torch.testing.assert_close(turned, normals_head @ target.T)
+
+
 def test_a_file_does_not_hold_what_depends_on_memory(model):
     fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
     error_iod = 0.03456789123

@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from facerf_cli.colour import linear_to_srgb
+from facerf_cli.network.appearance_network import AppearanceNetwork, AppearanceSettings
 from facerf_cli.network.feature_networks import (
     LightNetwork,
     LightSettings,
@@ -111,3 +112,23 @@ def test_the_light_network_gives_unit_directions_and_is_built_again_from_its_met
 def test_metadata_that_make_no_network_are_refused(change: dict[str, float]) -> None:
     with pytest.raises((ValueError, TypeError)):
         LightNetwork.from_metadata(LightNetwork().as_metadata() | change)
+
+
+@pytest.mark.parametrize("kind", ["light", "appearance"])
+def test_features_are_those_of_the_side_of_training(kind: str) -> None:
+    """A texture of another side is resampled: its features would be those of another scale."""
+    light = LightSettings(width=1 / 16, grid=2, hidden=4, side=32)
+    appearance = AppearanceSettings(people=3, side=32, width=1 / 16, grid=2, hidden=4)
+    network = LightNetwork(light) if kind == "light" else AppearanceNetwork(appearance)
+    small = torch.rand(1, 3, 32, 32)
+    large = small.repeat_interleave(2, -1).repeat_interleave(2, -2)
+    for found, wanted in zip(network.layers(large), network.layers(small), strict=True):
+        torch.testing.assert_close(found, wanted)
+
+
+def test_the_appearance_network_tells_people_and_lights() -> None:
+    network = AppearanceNetwork(AppearanceSettings(people=3, side=32, width=1 / 16, grid=2, hidden=4))
+    scores, lights = network(torch.rand(5, 3, 40, 40))
+    assert scores.shape == (5, 3) and torch.allclose(lights.norm(dim=-1), torch.ones(5), atol=1e-6)
+    again = AppearanceNetwork.from_metadata(network.as_metadata())
+    assert again.settings == network.settings

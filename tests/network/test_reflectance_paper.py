@@ -50,6 +50,22 @@ def test_structure_is_the_papers() -> None:
 
 
 @torch.no_grad()
+def test_a_smaller_side_has_the_same_layers() -> None:
+    """At 128 texels the eighth halving finds a single texel; the weights are those of 512."""
+    with torch.device("meta"):
+        network = PaperReflectanceNetwork(PaperReflectanceSettings(side=128))
+        whole = PaperReflectanceNetwork()
+        texture = torch.zeros(1, 3, 128, 128)
+        encoded = network.encode(texture, texture, texture[:, :1])
+        olat = network.decode(encoded, texture, torch.zeros(1, 2, 3))
+    assert [f.shape[-1] for f in encoded.features] == [64, 32, 16, 8, 4, 2, 1, 1]
+    assert olat.shape == (1, 2, 3, 128, 128)
+    assert {k: v.shape for k, v in network.state_dict().items()} == {
+        k: v.shape for k, v in whole.state_dict().items()
+    }
+
+
+@torch.no_grad()
 def test_what_each_input_reaches() -> None:
     """The skips carry the finest source, the light comes in below, the target's normals above."""
     torch.manual_seed(0)
@@ -115,6 +131,17 @@ def test_skips_are_convolved_as_if_stacked(network: PaperReflectanceNetwork) -> 
     stacked = F.interpolate(torch.cat([x, skip], 1), scale_factor=2.0)
     expected = F.leaky_relu(up.norm(up.convolution(stacked)), 0.2)
     assert torch.allclose(up(x, skip, 8), expected, atol=1e-5)
+
+
+@torch.no_grad()
+def test_both_normal_maps_matter(network: PaperReflectanceNetwork) -> None:
+    texture, normals, visible = _face(32)
+    turned, light = normals.roll(1, 1), _lights(1)
+    plain = network.decode(network.encode(texture, normals, visible), normals, light)
+    by_source = network.decode(network.encode(texture, turned, visible), normals, light)
+    by_target = network.decode(network.encode(texture, normals, visible), turned, light)
+    for other in (by_source, by_target):
+        assert (other - plain).abs().max() > 1e-3 * plain.max()
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from facerf_cli.network.inputs import SourceColours, colour_cast
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.texture import normal_map
 from facerf_cli.training.joint_objective import JointObjective, JointSettings
-from facerf_cli.training.posed_heads import PosedHeads, pose_heads, render_textures, unwrap_images
+from facerf_cli.training.posed_heads import PosedHeads, render_textures, unwrap_images
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
 MODEL = load_face_model()
@@ -112,8 +112,16 @@ def _asked(dataset: Dataset, batch: CropPairs | None = None) -> Asked:
         batch = CropPairs(
             crops[:1], crops[1:], landmarks_px[:1], landmarks_px[1:], light, torch.zeros(1).long()
         )
-    terms = objective(batch)
-    return Asked(objective, network, batch, terms, pose_heads(MODEL, _estimate()))
+    return Asked(objective, network, batch, objective(batch), _heads())
+
+
+def _heads() -> PosedHeads:
+    """v^c = R (mean + M_id alpha + M_exp beta) + t of both heads, by the paper's formula."""
+    known = _estimate()
+    shape = MODEL.mean + torch.einsum("bk,kvc->bvc", known.alpha, MODEL.identity[:6])
+    shape = shape + torch.einsum("bk,kvc->bvc", known.beta, MODEL.expression[:4])
+    vertices = torch.einsum("bij,bvj->bvi", known.rotation, shape) + known.translation_m[:, None]
+    return PosedHeads(vertices, known.rotation, MODEL.landmarks(vertices)[:, INNER])
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +130,8 @@ def asked(dataset: Dataset) -> Asked:
 
 
 def _close(found: Tensor, wanted: Tensor) -> None:
-    torch.testing.assert_close(found.detach(), wanted.detach(), rtol=1e-5, atol=1e-6)
+    """Compare in single precision, in which a mesh and its normals are summed in another order."""
+    torch.testing.assert_close(found.detach(), wanted.detach(), rtol=1e-3, atol=1e-4)
 
 
 def _landmarks(asked: Asked, which: int) -> Tensor:

@@ -1,20 +1,26 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor, nn
 
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.inputs import colour_cast
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.heads_bank import Bank
+from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.loop import train
+from facerf_cli.training.losses import root_loss
 from facerf_cli.training.objective import concatenate, seeded
 from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
-from tests.toy_faces import ToyFaces, toy_objective
+from tests.toy_faces import SIDE, ToyFaces, toy_objective
 
 NETWORK = DefaultReflectanceSettings(
     side=32, encoder_widths=(8, 12, 16), decoder_widths=(8, 12, 16), template_channels=2, rig_lights=20
@@ -99,3 +105,48 @@ def test_without_normals_the_network_does_not_see_them(normals: bool) -> None:
         encoded = network.encode(sample.source, maps, sample.visible)
         seen.append(network.decode(encoded, maps, sample.lights))
     assert torch.equal(seen[0], seen[1]) != normals
+
+
+class ColouredFaces(ToyFaces):
+    """Toys of which one in eight is in strongly blue light."""
+
+    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        sample = super().draw(heads, lights, generator)
+        blue = torch.where((heads % 8 == 0)[:, None], torch.tensor([0.1, 0.5, 3.0]), torch.ones(3))
+        return replace(sample, source=sample.source * blue[..., None, None])
+
+
+class WritesDown(nn.Module):
+    """A Reflectance Network that predicts one root, and keeps what it is given."""
+
+    rig_lights = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.root = nn.Parameter(torch.full((1, 1, 3, SIDE, SIDE), 0.4))
+
+    def encode(self, *given: Tensor) -> Any:
+        self.encoded = given
+        return SimpleNamespace(exposure=torch.full((len(given[0]), 1, 1, 1), 0.5))
+
+    def decode_root(self, encoded: Any, normals: Tensor, lights: Tensor) -> Tensor:
+        self.decoded = normals, lights
+        return self.root.expand(*lights.shape[:2], -1, -1, -1)
+
+
+def test_the_network_sees_what_it_sees_at_test_time() -> None:
+    """Strange colours of light are removed by the colours that the checkpoint keeps; targets are exposed."""
+    network = WritesDown()
+    settings = TextureObjectiveSettings(lights=2, held_out_heads=3)
+    objective = TextureObjective(ColouredFaces(), network, settings=settings)
+    colours = objective.source_colours
+    assert colours is not None
+    batches = (objective.draw(1, lambda i, k=k: seeded(k, i), 1) for k in range(99))
+    batch = next(found for found in batches if int(found.heads) % 8 == 0)
+    sample, terms = batch.sample, objective(batch)
+    cast = colour_cast(sample.source, sample.visible, colours)
+    assert cast[0, 2] > 1.5 * cast[0, 0]
+    torch.testing.assert_close(network.encoded[0], sample.source / cast)
+    assert torch.equal(network.decoded[1], sample.lights)
+    expected = root_loss(network.decode_root(None, *network.decoded), sample.target / 0.5, sample.weight)
+    torch.testing.assert_close(terms["root"], expected)

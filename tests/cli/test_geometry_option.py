@@ -1,0 +1,100 @@
+"""`--geometry network` of the verbs on photos: heads regressed without landmarks."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.face import landmarks
+from facerf_cli.face.crop import from_box
+from facerf_cli.face.fit import load_fit
+from facerf_cli.face.landmarks import find_boxes
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.images import read_image
+from facerf_cli.main import main
+from facerf_cli.models import DEFAULT_CHECKPOINT, Models, Sides, load_models
+from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint, save_networks
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+
+
+@pytest.fixture
+def no_predictor(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never() -> None:
+        raise AssertionError("the landmark predictor was loaded")
+
+    monkeypatch.setattr(landmarks, "_predictor", never)
+
+
+def fit(output: Path, *words: str) -> int:
+    return main(["--device", "cpu", "fit-geometry", str(PHOTO), "-o", str(output), *words])
+
+
+@pytest.mark.usefixtures("no_predictor")
+def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
+    assert fit(tmp_path, "--geometry", "network") == 0
+    found = load_fit(tmp_path / "astronaut_fit.npz")
+    photo = read_image(PHOTO).pixels
+    assert found.crop == from_box(find_boxes(photo, "astronaut")[0].box_px, 512)
+    models = load_models(None, "builtin", torch.device("cpu"))
+    assert models.geometry is not None
+    crop = torch.from_numpy(found.crop.apply(photo)).permute(2, 0, 1)[None]
+    with torch.no_grad():
+        estimate = models.geometry(crop)
+    torch.testing.assert_close(found.rotation, estimate.rotation[0])
+    torch.testing.assert_close(found.translation_m, estimate.translation_m[0])
+    torch.testing.assert_close(found.alpha[: estimate.alpha.shape[1]], estimate.alpha[0])
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert row["quality"] == "unknown" and "error_iod" not in row
+
+
+@pytest.mark.usefixtures("no_predictor")
+def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> None:
+    tensors, metadata = load_checkpoint(DEFAULT_CHECKPOINT)
+    joint = tmp_path / "joint.safetensors"
+    save_checkpoint(joint, tensors, metadata | {"geometry": "network", "texture_side": 128, "crop_px": 192})
+    assert fit(tmp_path / "out", "--checkpoint", str(joint)) == 0
+    assert load_fit(tmp_path / "out/astronaut_fit.npz").crop.size_px == 192
+    texture = read_image(tmp_path / "out/astronaut_texture.exr").pixels
+    assert texture.shape == (128, 128, 3)
+
+
+def test_what_contradicts_the_network_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = tmp_path / "points.json"
+    points.write_text(json.dumps(np.zeros((68, 2)).tolist()))
+    assert fit(tmp_path / "out", "--geometry", "network", "--landmarks", str(points)) == 2
+    assert "--landmarks: --geometry network uses none" in capsys.readouterr().err
+    networks, metadata = load_networks(DEFAULT_CHECKPOINT, LAYOUT_VERSION)
+    del networks["geometry"]
+    alone = tmp_path / "alone.safetensors"
+    save_networks(alone, networks, {"layout_version": metadata["layout_version"]})
+    assert fit(tmp_path / "out", "--geometry", "network", "--checkpoint", str(alone)) == 2
+    assert "without a Geometry Network" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"texture_side": 3},
+        {"texture_side": "128"},
+        {"crop_px": 10**9},
+        {"source_colours": {"mean": [0, 0], "covariance": [[0, 0], [0, 0]]}},
+        {"source_colours": 7},
+    ],
+)
+def test_a_checkpoint_that_expects_nonsense_is_refused(
+    tmp_path: Path, wrong: dict[str, object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    tensors, metadata = load_checkpoint(DEFAULT_CHECKPOINT)
+    save_checkpoint(tmp_path / "wrong.safetensors", tensors, metadata | wrong)
+    assert fit(tmp_path / "out", "--checkpoint", str(tmp_path / "wrong.safetensors")) == 1
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if "invalid" in x]
+    assert next(iter(wrong)) in line and "train it again" in line
+
+
+def test_sides_keep_the_proportion_of_training() -> None:
+    models = Models(None, None, None, None, "x", {}, torch.device("cpu"), Sides(128, 192))  # type: ignore[arg-type]
+    assert models.sides() == Sides(128, 192) and models.sides(256) == Sides(256, 384)
