@@ -44,17 +44,30 @@ class FeatureNetwork(Protocol):
         """Features of linear images [B, 3, H, W] after the ReLU of each of `FEATURE_LAYERS`."""
 
 
-def feature_distance(net: FeatureNetwork, prediction: Tensor, target: Tensor) -> Tensor:
+def feature_distance(
+    net: FeatureNetwork, prediction: Tensor, target: Tensor, powers: Tensor | None = None
+) -> Tensor:
     """Squared distance of features, summed over the layers [B]; prediction and target [B, 3, H, W] linear.
 
     It is one term of the paper's L_I (with V_f) or L_L (with S_f). The paper leaves open if a layer's squared
     norm is a sum or a mean: here it is the mean over the layer's elements, so that a weight means the same at
-    every size. No gradient flows to `target`. Mask both images first, with the same mask.
+    every size; over `powers` [layers], if given (`layer_powers`). No gradient flows to `target`. Mask both
+    images first, with the same mask.
     """
     with torch.no_grad():
         wanted = net.layers(target)
     differences = [a.float() - b.float() for a, b in zip(net.layers(prediction), wanted, strict=True)]
-    return torch.stack([d.square().mean((1, 2, 3)) for d in differences]).sum(0)
+    squared = torch.stack([d.square().mean((1, 2, 3)) for d in differences], -1)
+    return (squared if powers is None else squared / powers).sum(-1)
+
+
+@torch.no_grad()
+def layer_powers(net: FeatureNetwork, images: Tensor) -> Tensor:
+    """Mean squares [layers] of a network's features on linear images [B, 3, H, W].
+
+    Distances relative to them weigh every layer and every network alike, whatever the size of its features.
+    """
+    return torch.stack([layer.float().square().mean() for layer in net.layers(images)])
 
 
 class VggFeatures(nn.Module):

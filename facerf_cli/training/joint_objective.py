@@ -20,11 +20,12 @@ from facerf_cli.dataset.photos import PhotoCrops, Photos
 from facerf_cli.dataset.samples import DatasetTextures, provenance_of
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
-from facerf_cli.network.feature_networks import FeatureNetwork, VggFeatures
+from facerf_cli.network.feature_networks import VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import SourceColours, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera
 from facerf_cli.training.losses import (
+    Features,
     MaskedPair,
     PaperWeights,
     appearance_loss,
@@ -47,7 +48,7 @@ from facerf_cli.training.pretrained import VGG16_LICENCE
 
 _PAPER = PaperWeights()
 _DARKEST = 1e-4  # least radiance; networks take square roots, whose slope at 0 is infinite
-_COLOURS_MEASURED = 192  # sources
+_COLOURS_MEASURED, _TARGETS_MEASURED = 192, 24  # sources and targets
 _SHEET_ROWS, _SHEET_PX = 8, 256
 
 
@@ -106,6 +107,7 @@ class JointObjective(Objective):
                 if network is not None
             }
         )
+        self.feature_powers: dict[str, Tensor] = {}
         self.camera = crop_camera(settings.crop_px)
         self._model = model
         self._train = open_pairs(dataset, "train", settings.crop_px)
@@ -113,6 +115,7 @@ class JointObjective(Objective):
         sides = {"texture_side": settings.texture_side, "crop_px": settings.crop_px}
         self.inputs = {"geometry": "network", **sides}
         self.source_colours = SourceColours.of(self._train.source_colours(_COLOURS_MEASURED))
+        self._measure_features()
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
         if network.rig_lights and not network.has_mean_face:
@@ -204,9 +207,18 @@ class JointObjective(Objective):
                 terms["light_features"] = weights.features * light_loss(self._features("light"), texture)
         return terms
 
-    def _features(self, name: str) -> FeatureNetwork:
+    def _measure_features(self) -> None:
+        """Measure the powers of the feature networks' layers, on targets spread over the training pairs."""
+        if self.feature_networks:
+            pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
+            targets = torch.cat([self._train.read(pair).target for pair in pairs])
+            networks: Any = self.feature_networks.items()
+            self.feature_powers = {name: layer_powers(network, targets) for name, network in networks}
+
+    def _features(self, name: str) -> Features:
         network: Any = self.feature_networks[name]
-        return network
+        device = next(self.networks.parameters()).device
+        return Features(network, self.feature_powers[name].to(device))
 
     @torch.no_grad()
     def validate(self) -> Validation:

@@ -108,6 +108,14 @@ def photometric_loss(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor
 
 
 @dataclass(frozen=True)
+class Features:
+    """V_f or S_f, and the mean squares of its layers [layers] on training images (`layer_powers`)."""
+
+    network: FeatureNetwork
+    powers: Tensor
+
+
+@dataclass(frozen=True)
 class MaskedPair:
     """A prediction and its target [B, 3, H, W], linear, compared in the mask [B, 1, H, W]."""
 
@@ -115,16 +123,17 @@ class MaskedPair:
     target: Tensor
     mask: Tensor
 
-    def distance(self, net: FeatureNetwork) -> Tensor:
-        """Distance [B] of the features of both, masked."""
-        return feature_distance(net, self.prediction * self.mask, self.target * self.mask)
+    def distance(self, features: Features) -> Tensor:
+        """Distance [B] of the features of both, masked, relative to the features' powers."""
+        images = (self.prediction * self.mask, self.target * self.mask)
+        return feature_distance(features.network, *images, features.powers)
 
 
-def appearance_loss(net: FeatureNetwork, image: MaskedPair, texture: MaskedPair) -> Tensor:
+def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) -> Tensor:
     """L_I [B]: distance of V_f features, of the image and of the texture."""
-    return image.distance(net) + texture.distance(net)
+    return image.distance(features) + texture.distance(features)
 
 
-def light_loss(net: FeatureNetwork, texture: MaskedPair) -> Tensor:
+def light_loss(features: Features, texture: MaskedPair) -> Tensor:
     """L_L [B]: distance of S_f features, which depend on the light's direction, of the texture."""
-    return texture.distance(net)
+    return texture.distance(features)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
+from facerf_cli.face.crop import Crop, check_landmarks, from_box, from_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
 
 
@@ -98,6 +98,15 @@ def test_the_crop_follows_the_face():
     plain, moved = from_landmarks(frontal_landmarks(), 256), from_landmarks(2 * frontal_landmarks(), 256)
     assert moved.side_px == pytest.approx(2 * plain.side_px)
     assert moved.x0_px == pytest.approx(2 * plain.x0_px)
+
+
+def test_the_crop_around_a_box_is_larger_and_a_little_higher():
+    """A detector's box holds brows to chin; the spans are measured (benchmarks/crop_boxes.py)."""
+    crop = from_box((100.0, 40.0, 200.0, 140.0), 64)
+    assert crop == Crop(150 - 74, 90 - 2 - 74, 148, 64)
+    for bad in ((5.0, 0.0, 5.0, 0.0), (0.0, 0.0, np.inf, 9.0), (0.0, 0.0, np.nan, 9.0)):
+        with pytest.raises(InputError, match="not a box"):
+            from_box(bad, 64)
 
 
 @pytest.mark.parametrize(

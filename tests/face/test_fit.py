@@ -15,13 +15,21 @@ from facerf_cli.face.fit import (
     fit_batch,
     fit_from_arrays,
     fit_landmarks,
+    fit_problem,
     fit_to_arrays,
     load_fit,
     save_fit,
     trust_inside,
 )
 from facerf_cli.face.fit_start import weak_perspective
-from facerf_cli.face.gauss_newton import Problem, apply_step, jacobian, minimise, residuals
+from facerf_cli.face.gauss_newton import (
+    Problem,
+    apply_step,
+    jacobian,
+    minimise,
+    residuals,
+    total_cost,
+)
 from facerf_cli.face.landmarks import detect_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, grid_triangles
@@ -84,6 +92,17 @@ def test_strong_priors_keep_the_shape_at_the_mean(model):
     weak = fit_batch(model, landmarks_px, CAMERA, WEAK)
     strong = fit_batch(model, landmarks_px, CAMERA, FitSettings(identity_std=0.01, expression_std=0.01))
     assert strong.alpha.norm() < 0.02 < 0.1 * weak.alpha.norm()
+
+
+def test_the_cost_is_that_of_landmarks_and_of_priors(model):
+    """Huber's cost of the differences in deviations of their noise, and squared coordinates."""
+    target_px = see(model, *coefficients(model, 0.5), (12, 5, 3))
+    problem, start = fit_problem(model, target_px, CAMERA, FitSettings(), torch.ones(1, 68).double())
+    state = replace(start, coordinates=torch.full_like(start.coordinates, 0.5))
+    distance = residuals(problem, state).difference_px.norm(dim=-1) * problem.inverse_noise
+    robust = torch.where(distance <= 2, distance**2, 2 * (2 * distance - 2)).sum(1)
+    prior = 0.25 * state.coordinates.shape[1]
+    torch.testing.assert_close(total_cost(problem, state), robust + prior)
 
 
 def test_the_jacobian_is_the_derivative(model):

@@ -68,6 +68,33 @@ def test_the_plain_form_is_exact_where_lights_can_be_told_apart_even_if_they_are
     assert (seen.least_squares() >= 0).all()
 
 
+def test_noise_does_not_blow_up_the_plain_form() -> None:
+    """150 images of a ball have a rank of about 9: the others would only fit the noise."""
+    evidence = shaded_ball(150)
+    weights = 0.2 + torch.rand(150, 3, generator=torch.Generator().manual_seed(1))
+    olats, image = flat(lit(evidence, weights))
+    noise = 0.01 * image.mean() * torch.randn(image.shape, generator=torch.Generator().manual_seed(2))
+    found = estimate_signed_weights(olats, image + noise)
+    assert found.norm() < 2 * weights.norm()
+    explained = torch.einsum("lc,lcn->cn", found, olats)
+    assert (explained - image).norm() < 0.02 * image.norm()
+
+
+def test_where_the_face_is_not_reached_the_light_goes_on() -> None:
+    """Weights behind the ball lie between those around them, and none is zero."""
+    evidence = lit(shaded_ball(150), torch.full((150, 3), 0.2))
+    weights = evidence.least_squares()
+    radiance = evidence.olats[..., evidence.mask].mean((1, 2))
+    hidden = radiance < 0.05 * radiance.max()
+    assert hidden.sum() > 10
+    assert weights[hidden].min() > 0.1 and weights[hidden].max() < 0.4
+    turned = evidence.directions[:, 0] + 1.5  # brighter to the right: so it is behind
+    behind = lit(shaded_ball(150), (0.2 * turned)[:, None].expand(-1, 3)).least_squares()[hidden].mean(1)
+    right = evidence.directions[hidden, 0] > 0.2
+    left = evidence.directions[hidden, 0] < -0.2
+    assert right.any() and left.any() and behind[right].mean() > 1.1 * behind[left].mean()
+
+
 def test_a_covered_image_gives_the_same_light() -> None:
     for solve in ("quotient", "smooth"):
         evidence = lit(shaded_ball(), torch.full((LIGHTS, 3), 0.2))

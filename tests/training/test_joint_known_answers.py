@@ -12,7 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs
+from facerf_cli.dataset.crops import CropPairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.face.morphable import load_face_model
@@ -170,8 +170,14 @@ def test_the_photometric_term_compares_the_target(asked: Asked) -> None:
     _close(asked.terms["photometric"], 5 * error)
 
 
-def _raw_distance(a: Tensor, b: Tensor) -> Tensor:
-    return sum((x - y).square().mean() for x, y in zip(Raw().layers(a), Raw().layers(b), strict=True))
+def _raw_distance(asked: Asked, name: str, a: Tensor, b: Tensor) -> Tensor:
+    """Mean squared differences of the layers, over their mean squares on training targets."""
+    pairs = spread_pairs(asked.objective._train, 24, lambda pair: True)
+    targets = torch.cat([asked.objective._train.read(pair).target for pair in pairs])
+    powers = [layer.square().mean() for layer in Raw().layers(targets)]
+    _close(asked.objective.feature_powers[name], torch.stack(powers))
+    layers = zip(Raw().layers(a), Raw().layers(b), powers, strict=True)
+    return sum((x - y).square().mean() / power for x, y, power in layers)
 
 
 def test_features_compare_the_target_s_image_and_texture(asked: Asked) -> None:
@@ -179,8 +185,8 @@ def test_features_compare_the_target_s_image_and_texture(asked: Asked) -> None:
     image, mask = render_textures(asked.network.texture, asked.head(TARGET), CAMERA)
     truth = unwrap_images(asked.batch.target, asked.head(TARGET), CAMERA, SIDE)
     seen = (truth.visible > 0).float()
-    of_image = _raw_distance(image * mask, asked.batch.target * mask)
-    of_texture = _raw_distance(asked.network.texture * seen, truth.texture * seen)
+    of_image = _raw_distance(asked, "appearance", image * mask, asked.batch.target * mask)
+    of_texture = _raw_distance(asked, "light", asked.network.texture * seen, truth.texture * seen)
     _close(asked.terms["appearance_features"], of_image + of_texture)
     _close(asked.terms["light_features"], of_texture)
 
