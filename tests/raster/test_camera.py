@@ -16,6 +16,11 @@ from facerf_cli.raster.camera import (
 NOSE = torch.tensor([0.0, 0.0, 1.0])
 
 
+def test_the_crop_camera_is_the_one_of_every_checkpoint() -> None:
+    """Focal length four sides, centred: networks and fits are useless in another one."""
+    assert crop_camera(100) == Camera(400.0, 100, 100, 50.0, 50.0)
+
+
 def test_projection_by_hand() -> None:
     camera = Camera(focal_px=100, width_px=40, height_px=20, cx_px=21, cy_px=9)
     px = project(torch.tensor([[0.0, 0, -1], [0.1, 0, -1], [0, 0.1, -2]]), camera)

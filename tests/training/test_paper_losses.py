@@ -4,8 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.network.feature_networks import VggFeatures, feature_distance
+from facerf_cli.network.feature_networks import VggFeatures, feature_distance, layer_powers
 from facerf_cli.training.losses import (
+    Features,
     MaskedPair,
     PaperWeights,
     appearance_loss,
@@ -88,6 +89,9 @@ def net() -> VggFeatures:
     return VggFeatures(width=0.1).requires_grad_(False)
 
 
+POWERS = torch.tensor([2.0, 3.0, 5.0])  # of the layers
+
+
 def _seen(side: int) -> MaskedPair:
     mask = torch.zeros(2, 1, side, side)
     mask[..., 2:-2] = 1
@@ -99,17 +103,28 @@ def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
     expected: Tensor = torch.zeros(2)
     for seen in (image, texture):
         one, other = seen.prediction * seen.mask, seen.target * seen.mask
-        layers = zip(net.layers(one), net.layers(other), strict=True)
-        expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) for a, b in layers)
-    assert torch.allclose(appearance_loss(net, image, texture), expected, rtol=1e-4)
-    alone = feature_distance(net, texture.prediction * texture.mask, texture.target * texture.mask)
-    assert torch.allclose(light_loss(net, texture), alone)
+        layers = zip(net.layers(one), net.layers(other), POWERS, strict=True)
+        expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) / power for a, b, power in layers)
+    features = Features(net, POWERS)
+    assert torch.allclose(appearance_loss(features, image, texture), expected, rtol=1e-4)
+    masked = texture.prediction * texture.mask, texture.target * texture.mask
+    assert torch.allclose(light_loss(features, texture), feature_distance(net, *masked, POWERS))
+    ones = torch.ones(3)
+    assert torch.allclose(feature_distance(net, *masked), feature_distance(net, *masked, ones))
+
+
+def test_powers_are_mean_squares_of_the_layers(net: VggFeatures) -> None:
+    images = torch.rand(4, 3, 16, 16)
+    wanted = torch.stack([layer.square().mean() for layer in net.layers(images)])
+    torch.testing.assert_close(layer_powers(net, images), wanted)
 
 
 def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:
     image, texture = _seen(24), _seen(16)
     target = texture.target.requires_grad_()
-    appearance_loss(net, image, MaskedPair(texture.prediction, target, texture.mask)).sum().backward()
+    appearance_loss(
+        Features(net, POWERS), image, MaskedPair(texture.prediction, target, texture.mask)
+    ).sum().backward()
     assert target.grad is None
     for seen in (image, texture):
         grad = seen.prediction.grad
