@@ -29,8 +29,9 @@ LandmarksOption = Annotated[
         show_default="detect them",
     ),
 ]
+Geometry = Literal["landmarks", "network"]
 GeometryOption = Annotated[
-    Literal["landmarks", "network"] | None,
+    Geometry | None,
     typer.Option(
         "--geometry",
         help="Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
@@ -57,7 +58,7 @@ class PhotoOptions:
     face_model: str = "builtin"
     face: str = "largest"
     landmarks: Path | None = None
-    geometry: Literal["landmarks", "network"] | None = None  # None: as the checkpoint was trained
+    geometry: Geometry | None = None  # None: as the checkpoint was trained
     texture_side: int | None = None  # None: the checkpoint's
 
     def check(self) -> None:

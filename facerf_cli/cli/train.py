@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli.cli.options import Settings, flag, settings_of, was_given
+from facerf_cli.cli.photo_options import Geometry
 from facerf_cli.errors import UsageError
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 
@@ -23,6 +24,7 @@ _STAGES = {  # the stages that an option applies to
     "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),
     "mean_face": ("joint", "reflectance"),
+    "geometry": ("joint",),
     "views": _TEXTURE_STAGES,
     "texture_size": (*_TEXTURE_STAGES, *_CROP_STAGES),
     "dataset": (*_TEXTURE_STAGES, *_CROP_STAGES),
@@ -71,6 +73,7 @@ class TrainOptions:
     light_features: Path | None
     without_normals: bool
     mean_face: bool
+    geometry: Geometry
     jobs: int
     workers: int | None  # None: by the device
     settings: Settings
@@ -212,6 +215,13 @@ def train(
     mean_face: Annotated[
         bool, _loss("--mean-face", help="Fit poses alone, with the mean face for everyone (ablation).")
     ] = False,
+    geometry: Annotated[
+        Geometry,
+        _loss(
+            help="Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train "
+            "the Reflectance Network alone."
+        ),
+    ] = "network",
     learning_rate: Annotated[
         float | None,
         _run(
@@ -299,6 +309,7 @@ def train(
             light_features=light_features,
             without_normals=without_normals,
             mean_face=mean_face,
+            geometry=geometry,
             jobs=jobs,
             workers=workers,
             settings=settings,
@@ -320,6 +331,11 @@ def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
         if {name, "dataset"} <= given:
             raise UsageError(
                 f"{flag(name)}: is for synthetic heads, which --dataset replaces; give one of them"
+            )
+    for name in ("photos", "mean_face"):
+        if name in given and context.params["geometry"] == "landmarks":
+            raise UsageError(
+                f"{flag(name)}: is for the Geometry Network, which --geometry landmarks leaves out"
             )
     if "texture_size" in given and "dataset" not in given:
         raise UsageError("--texture-size: applies to a dataset; give --dataset, too")

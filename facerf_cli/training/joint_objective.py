@@ -18,6 +18,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.photos import PhotoCrops, Photos
 from facerf_cli.dataset.samples import DatasetTextures, provenance_of
+from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.feature_networks import VggFeatures, layer_powers
@@ -77,9 +78,10 @@ class _Relit:
 class JointObjective(Objective):
     """The paper's loss on a prepared dataset's pairs, and on photos.
 
-    `model` is the face model of the Geometry Network's coefficients: the built-in one, from which the fit
-    starts (`face/fit.py`). `appearance` is V_f, `light` S_f; the term of one that is missing is left out.
-    They are frozen and not saved.
+    Without `geometry` heads are fitted to the crops' landmarks, and the geometry terms are left out. `model`
+    is the face model of the coefficients: the built-in one, from which the fit starts (`face/fit.py`).
+    `appearance` is V_f, `light` S_f; the term of one that is missing is left out. They are frozen and not
+    saved.
     """
 
     def __init__(
@@ -87,14 +89,15 @@ class JointObjective(Objective):
         dataset: Dataset,
         model: MorphableModel,
         reflectance: nn.Module,
-        geometry: nn.Module,
+        geometry: nn.Module | None,
         appearance: nn.Module | None = None,
         light: nn.Module | None = None,
         photos: Photos | None = None,
         settings: JointSettings = JointSettings(),
     ) -> None:
         super().__init__()
-        self.networks = nn.ModuleDict({"reflectance": reflectance, "geometry": geometry})
+        trained = {"reflectance": reflectance} | ({} if geometry is None else {"geometry": geometry})
+        self.networks = nn.ModuleDict(trained)
         self.chooses_by = "si_mse"
         self.provenance = _provenance(dataset, model, photos, appearance, light)
         self.settings = settings
@@ -109,11 +112,11 @@ class JointObjective(Objective):
         )
         self.feature_powers: dict[str, Tensor] = {}
         self.camera = crop_camera(settings.crop_px)
-        self._model = model
+        self._model = self._fitted = model  # on the device of training, and on the CPU
         self._train = open_pairs(dataset, "train", settings.crop_px)
         self._held_out = open_pairs(dataset, "validation", settings.crop_px)
         sides = {"texture_side": settings.texture_side, "crop_px": settings.crop_px}
-        self.inputs = {"geometry": "network", **sides}
+        self.inputs = {"geometry": "landmarks" if geometry is None else "network", **sides}
         self.source_colours = SourceColours.of(self._train.source_colours(_COLOURS_MEASURED))
         self._measure_features()
         self._validation: dict[str, list[CropPairs]] | None = None
@@ -142,21 +145,29 @@ class JointObjective(Objective):
     def forward(self, batch: CropPairs | PhotoCrops) -> dict[str, Tensor]:
         """Compute the weighted terms: landmarks and regularisation for both, the others for pairs alone."""
         if isinstance(batch, PhotoCrops):
-            estimate, heads = self._heads(batch.crops)
-            terms = self._geometry_terms(estimate, heads, batch.landmarks_px)
+            terms = self._geometry_terms(*self._heads(batch.crops, batch.landmarks_px), batch.landmarks_px)
             return {name: term.mean() for name, term in terms.items()}
-        estimate, heads = self._heads(torch.cat([batch.source, batch.target]))
         detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
-        terms = self._geometry_terms(estimate, heads, detected_px)
+        estimate, heads = self._heads(torch.cat([batch.source, batch.target]), detected_px)
+        terms = self._geometry_terms(estimate, heads, detected_px) if self._regresses else {}
         # Times two, for the mean is over twice the samples: source and target each add their terms.
         result = {name: 2 * term.mean() for name, term in terms.items()}
         relit = self._relit(batch, heads)
         return result | {name: term.mean() for name, term in self._image_terms(batch, relit).items()}
 
-    def _heads(self, crops: Tensor) -> tuple[GeometryEstimate, PosedHeads]:
-        with self.mixed_precision():
-            raw = self.networks["geometry"](crops)
-        estimate = GeometryEstimate(*(tensor.float() for tensor in raw))
+    @property
+    def _regresses(self) -> bool:
+        return "geometry" in self.networks
+
+    def _heads(self, crops: Tensor, detected_px: Tensor) -> tuple[GeometryEstimate, PosedHeads]:
+        """Regress the heads of crops [B, 3, S, S], or fit them to landmarks [B, 68, 2]."""
+        if self._regresses:
+            with self.mixed_precision():
+                raw = self.networks["geometry"](crops)
+        else:
+            fit = fit_batch(self._fitted, detected_px.cpu(), self.camera)
+            raw = (fit.rotation, fit.translation_m, fit.alpha, fit.beta)
+        estimate = GeometryEstimate(*(tensor.float().to(crops.device) for tensor in raw))
         if self._model.mean.device != crops.device:
             self._model = self._model.to(crops.device)
         return estimate, pose_heads(self._model, estimate)
@@ -235,7 +246,8 @@ class JointObjective(Objective):
             of_kind = []
             for index, pair in enumerate(pairs):
                 batch = pair.to(device)
-                _, heads = self._heads(torch.cat([batch.source, batch.target]))
+                landmarks_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
+                _, heads = self._heads(torch.cat([batch.source, batch.target]), landmarks_px)
                 relit = self._relit(batch, heads)
                 of_kind.append(clipped_si_mse(relit.image[:, None], batch.target[:, None], relit.mask))
                 distances.append(_landmark_error(heads, batch, self.camera))

@@ -10,6 +10,7 @@ from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.training.joint_dataset import write_joint_dataset
 
 
 @pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])
@@ -98,6 +99,16 @@ def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
         (
             ["--without-normals", "--start-from", "f"],
             "--without-normals: --start-from fixes",
+        ),
+        (
+            ["--stage", "joint", "--dataset", "d", "--geometry", "landmarks", "--photos", "p"],
+            "--photos: is for the Geometry Network, which --geometry landmarks leaves out",
+        ),
+        (["--geometry", "landmarks"], "--geometry: does not apply to the stage reflectance"),
+        (["--stage", "appearance-features"], "--stage appearance-features: needs a prepared dataset"),
+        (
+            ["--preset", "paper", "--dataset", "d", "--vgg-weights", "v", "--appearance-features", "a"],
+            "--appearance-features: takes the place of --vgg-weights; give one of them",
         ),
         (["--max-time", "0s"], "--max-time 0s: not a time; write a number and s, m or h, such as 45m"),
         (["--heads", "13"], "--heads 13: the mean face and 12 heads are held out; give more"),
@@ -202,3 +213,30 @@ def test_help_has_its_options_in_groups(capsys: pytest.CaptureFixture[str]) -> N
     text = capsys.readouterr().out
     places = [text.index(group) for group in ("The run", "Data", "Length", "Losses and ablations", "Speed")]
     assert places == sorted(places)
+
+
+def test_feature_networks_of_another_scale_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = write_joint_dataset(tmp_path / "data")
+    line = ["train", "--preset", "tiny", "--dataset", str(dataset.folder), "--steps", "1", "--workers", "0"]
+    light = ["--light-features", str(tmp_path / "light/last.safetensors")]
+    looks = ["--appearance-features", str(tmp_path / "looks/last.safetensors")]
+    light_of = ["--stage", "light-features", "--texture-size", "48", "-o", str(tmp_path / "light")]
+    assert main([*line, *light_of]) == 0
+    looks_of = ["--stage", "appearance-features", "--texture-size", "40", "-o", str(tmp_path / "looks")]
+    assert main([*line, *looks_of]) == 0
+    joint = [*line, "--stage", "joint", "-o", str(tmp_path / "joint")]
+    assert main([*joint, *light, "--texture-size", "40"]) == 1
+    assert "was trained on images of 48 px, here they have 40" in capsys.readouterr().err
+    assert main([*joint, *looks, "--texture-size", "48"]) == 1
+    assert "was trained on images of 40 px, here they have 48" in capsys.readouterr().err
+    assert main([*joint, "--texture-size", "64"]) == 1
+    assert "its crops have 48 px, the networks need 64" in capsys.readouterr().err
+    assert main([*joint, *light, "--texture-size", "48", "--geometry", "landmarks"]) == 0
+    _, metadata = load_checkpoint(tmp_path / "joint/last.safetensors")
+    assert (metadata["geometry"], metadata["texture_side"], metadata["crop_px"]) == ("landmarks", 48, 48)
+    assert set(metadata["source_colours"]) == {"mean", "covariance"}
+    again = [*line, "--stage", "light-features", "--start-from", light[1], "-o", str(tmp_path / "again")]
+    assert main([*again, "--texture-size", "40"]) == 1
+    assert "trained on images of 48 px, here they have 40" in capsys.readouterr().err

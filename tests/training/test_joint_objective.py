@@ -206,12 +206,25 @@ def test_mean_face_learns_the_pose_alone(dataset: Dataset) -> None:
     batch = batch_of(objective, photos=False)
     terms = objective(batch)
     assert "regularisation" not in terms
-    _, heads = objective._heads(batch.source)
+    _, heads = objective._heads(batch.source, batch.source_landmarks_px)
     estimate = network(batch.source)
     mean = load_face_model().mean @ estimate.rotation[0].T + estimate.translation_m[0]
     assert torch.allclose(heads.vertices[0], mean, atol=1e-6)
     torch.stack(list(terms.values())).sum().backward()
     assert network.regress.bias.grad.shape == (9,) and (network.regress.bias.grad != 0).any()
+
+
+def test_heads_can_be_fitted_to_landmarks_instead(dataset: Dataset) -> None:
+    """Then the Reflectance Network is trained alone, on the heads that `relight` fits."""
+    network = PaperReflectanceNetwork(PAPER)
+    objective = JointObjective(dataset, load_face_model(), network, None, settings=SETTINGS)
+    batch = batch_of(objective, photos=False)
+    assert isinstance(batch, CropPairs) and set(objective(batch)) == {"photometric"}
+    assert set(objective.networks) == {"reflectance"} and objective.inputs["geometry"] == "landmarks"
+    estimate, _ = objective._heads(batch.source, batch.source_landmarks_px)
+    fit = fit_batch(load_face_model(), batch.source_landmarks_px, objective.camera)
+    torch.testing.assert_close(estimate.alpha, fit.alpha.float())
+    assert objective.validate().metrics["landmarks_iod"] < 0.1
 
 
 def test_terms_whose_networks_are_missing_are_left_out(dataset: Dataset) -> None:

@@ -13,7 +13,7 @@ from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.train import TrainOptions
 from facerf_cli.dataset.crops import mean_translation_m
-from facerf_cli.dataset.dataset import read_dataset
+from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.photos import Photos, open_photos
 from facerf_cli.dataset.samples import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
@@ -136,20 +136,20 @@ def _build_objective(options: TrainOptions, networks: Networks) -> Objective:
 
 
 def _texture(options: TrainOptions, networks: Networks) -> Objective:
-    samples = _samples(options)
-    light = _load_light_features(options, samples.side)
-    network = networks.get("reflectance") or _reflectance_network(options, samples.side)
+    side = _texture_side(options)
+    light = _load_light_features(options, side)
+    network = networks.get("reflectance") or _reflectance_network(options, side)
     settings = TextureObjectiveSettings(held_out_heads=_sizes(options).held_out_heads)
-    return TextureObjective(samples, network, light, settings)
+    return TextureObjective(_samples(options), network, light, settings)
 
 
 def _light_features(options: TrainOptions, networks: Networks) -> Objective:
-    sizes, samples = _sizes(options), _samples(options)
+    sizes, side = _sizes(options), _texture_side(options)
     network: Any = networks.get("light_features")
-    network = network or LightNetwork(LightSettings(width=sizes.light_width, side=samples.side))
-    _require_side(options.start_from, network.settings.side, samples.side)
+    network = network or LightNetwork(LightSettings(width=sizes.light_width, side=side))
+    _require_side(options.start_from, network.settings.side, side)
     settings = LightFeaturesSettings(held_out_heads=sizes.held_out_heads)
-    return LightFeaturesObjective(samples, network, settings)
+    return LightFeaturesObjective(_samples(options), network, settings)
 
 
 def _appearance_features(options: TrainOptions, networks: Networks) -> Objective:
@@ -188,6 +188,7 @@ def _joint(options: TrainOptions, networks: Networks) -> Objective:
     assert options.dataset
     dataset = read_dataset(options.dataset)
     side = _joint_side(options)
+    appearance = _load_appearance(options, side)
     if options.preset == "paper" and options.light_features is None:
         raise UsageError(
             "--preset paper: its loss needs S_f; give --light-features FILE, a checkpoint of "
@@ -197,12 +198,26 @@ def _joint(options: TrainOptions, networks: Networks) -> Objective:
         dataset,
         load_face_model(),  # the built-in one, for the Geometry Network, whatever the dataset is fitted with
         networks.get("reflectance") or _reflectance_network(options, side),
-        networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset)),
-        _load_appearance(options, side),
+        _joint_geometry(options, networks, dataset),
+        appearance,
         _load_light_features(options, side),
         _photos(options, side),
         JointSettings(side, side, seed=options.settings.seed),
     )
+
+
+def _texture_side(options: TrainOptions) -> int:
+    """Side of the textures of the stages that read textures: of a dataset, or of baked heads."""
+    if options.dataset:
+        return options.texture_size or _sizes(options).texture_side
+    return _bake_settings(options).side
+
+
+def _joint_geometry(options: TrainOptions, networks: Networks, dataset: Dataset) -> Any:
+    """The Geometry Network of the stage joint; None where heads are fitted to landmarks."""
+    if options.geometry == "landmarks":
+        return None
+    return networks.get("geometry") or _geometry_network(options, mean_translation_m(dataset))
 
 
 def _joint_side(options: TrainOptions) -> int:
@@ -211,7 +226,7 @@ def _joint_side(options: TrainOptions) -> int:
 
 
 def _load_appearance(options: TrainOptions, side: int) -> Any:
-    """Load V_f, and how a checkpoint names it; None without one."""
+    """Load V_f; None without one."""
     if options.appearance_features:
         return load_features(options.appearance_features, "appearance_features", side)
     if options.vgg_weights is None and options.preset != "paper":
@@ -275,7 +290,7 @@ def _samples(options: TrainOptions) -> SampleSource:
         return open_dataset_textures(
             options.dataset,
             options.fit_with,
-            options.texture_size or _sizes(options).texture_side,
+            _texture_side(options),
             options.jobs,
             rig_lights,
         )
@@ -299,20 +314,31 @@ def _fill_bank(options: TrainOptions, folder: Path) -> Bank:
 
 def _bake(options: TrainOptions, folder: Path) -> dict[str, Any]:
     """Bake the heads that are missing; return their provenance."""
-    sizes, bake = _sizes(options), HeadBakeSettings()
+    sizes = _sizes(options)
     heads, held_out = sizes.heads, sizes.held_out_heads
     if heads < held_out + 2:
         raise UsageError(f"--heads {heads}: the mean face and {held_out} heads are held out; give more")
-    if options.preset == "tiny":
-        bake = HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
     drawn = load_face_model(options.heads_from)
     load_face_model(options.fit_with)  # raises for an invalid model before anything is baked
-    bake_heads(folder / "heads", options.heads_from, heads, options.jobs, options.settings.seed, bake)
+    bake_heads(
+        folder / "heads",
+        options.heads_from,
+        heads,
+        options.jobs,
+        options.settings.seed,
+        _bake_settings(options),
+    )
     found = len(list((folder / "heads").glob("*.safetensors")))
     return {
         "heads": f"{found} synthetic heads drawn from {drawn.credit}",
         "licence": f"MIT; the heads' shapes: {drawn.licence}",
     }
+
+
+def _bake_settings(options: TrainOptions) -> HeadBakeSettings:
+    if options.preset == "tiny":
+        return HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
+    return HeadBakeSettings()
 
 
 def _save_pose_model(options: TrainOptions, folder: Path) -> str:
