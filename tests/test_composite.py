@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, PhotoDetail, Relit, Target
+from facerf_cli.composite import Composition, PhotoDetail, Relit, Surround, Target
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
@@ -184,6 +184,21 @@ def test_no_border_shows_where_the_surroundings_are_skin() -> None:
         return float(np.percentile(np.hypot(*np.gradient(result))[border], 99))
 
     assert steps(FOLLOWING) < 0.5 * steps(KEEPING)
+
+
+def test_a_bright_rim_does_not_glow_beside_the_face() -> None:
+    """The change around the head stays within a twelfth and 1.6 times the mean change of its light."""
+    _, source, _ = unwrapped()
+    model = load_face_model("builtin")
+    vertices = model.mean @ ROTATION.T + TRANSLATION_M
+    surround = Surround(vertices, CROP, source, HEIGHT_PX, WIDTH_PX)
+    rim = torch.zeros_like(source)
+    rim[..., : TEXTURE // 6] = 9.0
+    changes = surround.changes(torch.stack([rim, source]))
+    mean = changes[0, :, :1, :1]  # far from the face all follows the mean
+    assert (changes[0] <= 1.601 * mean).all() and (changes[0] >= mean / 12.01).all()
+    assert (changes[0] > 1.5 * mean).any() and (changes[0] < mean / 4).any()
+    torch.testing.assert_close(changes[1], torch.ones_like(changes[1]), rtol=1e-4, atol=1e-4)
 
 
 def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
