@@ -55,6 +55,21 @@ def test_sums_of_lights(page: dict[str, Any]) -> None:
     np.testing.assert_allclose(apart, both, atol=1e-3 * both.mean(), rtol=1e-3)
 
 
+def test_a_white_map_of_one_gives_the_face_as_bright_as_its_photo(page: dict[str, Any]) -> None:
+    """Output is absolute in the light and relative to the photo's exposure (docs/design.md)."""
+    models, photo, head = page["models"], page["photo"], page["head"]
+    white = facerf.Light.from_envmap(np.ones((32, 64, 3), np.float32), lights=60)
+    seen = head.face.visible.numpy() > 0.9
+    own = head.face.texture.numpy()[:, seen].mean()
+    alone = facerf.relight(models, photo, head, white, alone=True)
+    of_face = alone[alone[..., 3] > 0.9][:, :3].mean()
+    assert abs(of_face / own - 1) < 0.1
+    brighter = facerf.relight(
+        models, photo, head, facerf.Light(white.directions, 3 * white.weights), alone=True
+    )
+    np.testing.assert_allclose(brighter[..., :3], 3 * alone[..., :3], rtol=1e-3, atol=1e-4)
+
+
 def test_what_cannot_be_used_is_said(page: dict[str, Any]) -> None:
     models = page["models"]
     with pytest.raises(InputError, match="no face found"):
