@@ -25,7 +25,10 @@ from facerf_cli.synth.random_fields import Uniform
 _IMAGES = ImageSettings()
 _FACE_DEPTH_M = 0.11  # distance from the face back to the origin of the head frame
 _OCCLUDED, _GREY, _TURNED = 0.3, 0.25, 0.5  # shares of samples that are occluded, grey, rotated
-_TURN_DEG, _SHIFT, _SCALE = 15.0, 0.02, 0.04  # largest turn; std of the shift (sides) and of log scale
+_TURN_DEG = 15.0  # largest turn
+# Standard deviations of the shift to the right and down (sides) and of log scale: a crop is cut around a
+# detector's box, see `dataset/crop_move.py`.
+_SHIFT, _SCALE = (0.1, 0.03), 0.07
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ class _Move:
         turned = bool(torch.rand((), generator=generator) < _TURNED)
         angle = math.radians(_TURN_DEG) * (2 * float(torch.rand((), generator=generator)) - 1) * turned
         scale = math.exp(_SCALE * float(torch.randn((), generator=generator).clamp(-2, 2)))
-        return _Move(angle, scale, _SHIFT * torch.randn(2, generator=generator).clamp(-2, 2))
+        shift = torch.tensor(_SHIFT) * torch.randn(2, generator=generator).clamp(-2, 2)
+        return _Move(angle, scale, shift)
 
     def _matrix(self) -> Tensor:
         """Rotation and scale [2, 2] of (right, down)."""
