@@ -11,6 +11,7 @@ from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     every_nth,
     load_methods,
+    note_of_chosen,
     people_items,
     person_of,
     prepare_methods,
@@ -50,19 +51,19 @@ def run_olat(
         metrics=("si_mse", "si_mse_clipped", "ssim", "tone_drift_deg"),
         by=("pose", "turn", "angle", "tone"),
         published=TABLE_1 + (TABLE_3 if options.against else ()),
-        notes=_notes(split, joint_fit, network_alone),
+        notes=_notes(split, note_of_chosen(chosen, joint_fit), network_alone),
     )
     items = people_items(dataset, list(chosen), options.output)
     prepare = partial(prepare_methods, methods, options)
     return run_protocol(layout, items, work, options, photo.settings, photo, prepare)
 
 
-def _notes(split: str, joint_fit: bool, network_alone: bool) -> tuple[str, ...]:
+def _notes(split: str, chosen: str, network_alone: bool) -> tuple[str, ...]:
     """Notes below the figures."""
     field = "the network alone" if network_alone else "corrected by its source image"
-    fits = "A person's images are fitted all at once." if joint_fit else "Each image is fitted alone."
     return (
-        f"Split {split}. The field is {field}. {fits}",
+        f"Split {split}. The field is {field}.",
+        chosen,
         "si_mse_clipped clips the truth at white, as a camera does; otherwise a glint outweighs a face.",
         "tone_drift_deg is of the skin under lights within 25 degrees of the camera's axis.",
     )

@@ -11,6 +11,8 @@ from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     chosen_sources,
     load_methods,
+    note_of_chosen,
+    note_of_light,
     people_items,
     person_of,
     photo_items,
@@ -47,6 +49,7 @@ def run_reconstruction(
     """Measure photos, or the split of a dataset's folder; the exit code."""
     methods = MethodOptions.of(photo, options, light)
     work: _ReconstructPhotos | _ReconstructPeople
+    of_people = "Each photo counts as a person."
     if folder is None:
         items = photo_items(inputs, options, _PAPER_PHOTOS)
         work = _ReconstructPhotos(methods, options.keep_eyes)
@@ -54,6 +57,7 @@ def run_reconstruction(
         dataset, pairs = read_split(folder, split, photo.face_model, joint_fit)
         chosen = chosen_sources(folder, pairs, options, every, _PAPER_PHOTOS)
         items = people_items(folder, list(chosen), options.output)
+        of_people = note_of_chosen(chosen, joint_fit)
         work = _ReconstructPeople(methods, dataset, chosen, options.keep_eyes, joint_fit)
     layout = Layout(
         name="reconstruction",
@@ -63,7 +67,8 @@ def run_reconstruction(
         published=TABLE_2_RECONSTRUCTION,
         notes=(
             "The field is the network's own: corrected by the photo it would be exact by construction.",
-            *(() if folder else ("Each photo counts as a person.",)),
+            note_of_light(light),
+            of_people,
         ),
     )
     prepare = partial(prepare_methods, methods, options)

@@ -11,6 +11,8 @@ from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_st
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     load_methods,
+    note_of_chosen,
+    note_of_light,
     people_items,
     person_of,
     portraits,
@@ -48,6 +50,7 @@ def run_transfer(
 ) -> int:
     """Measure couples of photos, or of the split of a dataset's folder; the exit code."""
     methods = MethodOptions.of(photo, options, light)
+    notes = (*_notes(folder is None, network_alone), note_of_light(light))
     work: _TransferPhotos | _TransferPeople
     if folder is None:
         couples = _preset_couples(_photo_couples(inputs, options.output), options)
@@ -57,6 +60,7 @@ def run_transfer(
         dataset, pairs = read_split(folder, split, photo.face_model, joint_fit)
         chosen = _chosen_couples(folder, pairs, options, every)
         items = people_items(folder, list(chosen), options.output)
+        notes = (*notes, note_of_chosen(chosen, joint_fit))
         work = _TransferPeople(methods, dataset, chosen, options.keep_eyes, joint_fit, network_alone)
     layout = Layout(
         name="transfer",
@@ -64,7 +68,7 @@ def run_transfer(
         metrics=("si_mse", "face_distance", "si_mse_channels", "ssim"),
         by=("turn", "tone") if folder else ("turn",),
         published=TABLE_2_TRANSFER,
-        notes=_notes(folder is None, network_alone),
+        notes=notes,
     )
     prepare = partial(prepare_methods, methods, options)
     return run_protocol(layout, items, work, options, photo.settings, photo, prepare)

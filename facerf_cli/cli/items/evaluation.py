@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.evaluation_options import EvaluateOptions
@@ -127,6 +128,21 @@ def photo_items(inputs: Sequence[str], options: EvaluateOptions, preset: int) ->
     if len(items) < preset:
         raise UsageError(f"{len(items)} photos, --preset paper measures {preset}; give a folder of more")
     return items[:preset]
+
+
+def note_of_chosen(chosen: Mapping[str, Sequence[Any]], joint_fit: bool) -> str:
+    """How many sources or couples a protocol chose: those without a face are missing in the tables."""
+    count = sum(map(len, chosen.values()))
+    if joint_fit:
+        return f"{count} were chosen; heads are those fitted to all cameras of a person at once."
+    return f"{count} were chosen; those in which no face is found are left out. Each image is fitted alone."
+
+
+def note_of_light(light: LightOptions) -> str:
+    """How the light of each image is estimated."""
+    squares = "non-negative, smooth least squares" if light.non_negative else "signed least squares"
+    refined = "" if light.refine == "none" else ", refined by features"
+    return f"The field's light is estimated by {squares}{refined}."
 
 
 def person_of(
