@@ -18,4 +18,13 @@ def test_there_are_enough_of_every_room() -> None:
     assert len(MUTANTS) >= 60
     assert len({(m.file, m.name) for m in MUTANTS}) == len(MUTANTS)
     rooms = {m.file.split("/")[0] for m in MUTANTS}
-    assert {"training", "network", "pipeline.py", "face", "light", "raster", "composite.py"} <= rooms
+    assert {
+        "training",
+        "network",
+        "pipeline.py",
+        "face",
+        "light",
+        "raster",
+        "composite.py",
+        "evaluation",
+    } <= rooms

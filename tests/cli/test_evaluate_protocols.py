@@ -6,25 +6,32 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from facerf_cli import pipeline
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
-from facerf_cli.cli.items.evaluation import MethodOptions, portraits
+from facerf_cli.cli.items.evaluation import MethodOptions, load_methods, portraits
 from facerf_cli.cli.items.photos import load_models_once
+from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation import people
 from facerf_cli.face.fit import load_fit
+from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
+from facerf_cli.models import Models
+from facerf_cli.network.feature_networks import LightNetwork
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
 
@@ -219,3 +226,24 @@ def test_a_photo_without_a_face_fails_and_no_summary_is_written(
     assert run("reconstruction", tmp_path / "black.exr", "-o", tmp_path / "out") == 1
     assert "black.exr: no face" in capsys.readouterr().err
     assert not (tmp_path / "out" / "summary.json").exists()
+
+
+def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Signed least squares, then features: it reaches every method, and the light of every image."""
+    photo = PhotoOptions(Settings(device="cpu"))
+    light = LightOptions(photo, non_negative=False, refine="features")
+    methods = load_methods(MethodOptions.of(photo, EvaluateOptions(tmp_path), light))
+    (plain,) = load_methods(MethodOptions.of(photo, EvaluateOptions(tmp_path)))
+    (method,) = methods
+    assert not method.estimator.non_negative and isinstance(method.estimator.features, LightNetwork)
+    assert plain.estimator.non_negative and plain.estimator.features is None
+    asked = []
+
+    def estimate(models: Models, head: Head, **given: Any) -> Any:
+        asked.append(given["estimator"])
+        return SimpleNamespace(light=None)
+
+    monkeypatch.setattr(pipeline, "estimate_light", estimate)
+    monkeypatch.setattr(pipeline, "reflectance_of", lambda *given: None)
+    method.explained(None)  # type: ignore[arg-type]
+    assert asked == [method.estimator]

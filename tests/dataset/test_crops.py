@@ -100,6 +100,12 @@ def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: Pair
     still = CropMove(1.0, (0.04, 0.02)).image(plain.source, CROP_PX)
     off_px = centre_px(still) - centre_px(plain.source)
     assert (off_px - CROP_PX * torch.tensor([0.04, 0.02])).abs().max() < 0.5
+    inner = CropMove(0.5).image(torch.ones(1, 1, 8, 8), 8)  # the border repeats beyond the crop
+    assert inner.min() == 1
+    dot = torch.zeros(1, 1, 9, 9)
+    dot[..., 4, 6] = 1.0
+    wide, narrow = (CropMove(scale).image(dot, 9)[0, 0].sum(0).argmax() - 4 for scale in (1.9, 0.6))
+    assert wide > 2 > narrow  # a larger scale moves points away from the centre
     draws = [CropMove.draw(torch.Generator().manual_seed(seed)) for seed in range(200)]
     spread = torch.tensor([draw.shift for draw in draws]).std(0)
     assert (spread / torch.tensor([0.1, 0.03]) - 0.9).abs().max() < 0.15  # normal, cut at two deviations
