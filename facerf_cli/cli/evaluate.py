@@ -19,7 +19,7 @@ from facerf_cli.cli.evaluation_options import (
     refuse_without_field,
     with_shared_options,
 )
-from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
+from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, Refine, RefineOption
 from facerf_cli.cli.options import (
     EPILOG,
     HELP_NAMES,
@@ -65,6 +65,16 @@ def olat(
     return run_olat(dataset, options, photo, split, every, joint_fit, network_alone)
 
 
+def _light_options(
+    photo: PhotoOptions, options: EvaluateOptions, non_negative: bool, refine: Refine
+) -> LightOptions:
+    """How the light of each image is estimated; V_f, if its weights are given, refines it."""
+    vgg_weights = options.vgg_weights if refine == "features" else None
+    light = LightOptions(photo, non_negative=non_negative, refine=refine, vgg_weights=vgg_weights)
+    light.check()
+    return light
+
+
 def reconstruction(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
@@ -94,13 +104,7 @@ def reconstruction(
         settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
     )
     photo.check()
-    light = LightOptions(
-        photo,
-        non_negative=non_negative,
-        refine=refine,
-        vgg_weights=options.vgg_weights if refine == "features" else None,
-    )
-    light.check()
+    light = _light_options(photo, options, non_negative, refine)
     from facerf_cli.cli.items.evaluate_photos import run_reconstruction
 
     return run_reconstruction(inputs, folder, options, photo, light, split, every, joint_fit)
@@ -150,13 +154,7 @@ def transfer(
         settings_of(context), input_colourspace, face_model, landmarks=landmarks, geometry=geometry
     )
     photo.check()
-    light = LightOptions(
-        photo,
-        non_negative=non_negative,
-        refine=refine,
-        vgg_weights=options.vgg_weights if refine == "features" else None,
-    )
-    light.check()
+    light = _light_options(photo, options, non_negative, refine)
     from facerf_cli.cli.items.evaluate_transfer import run_transfer
 
     folder = None if photos else only_dataset(inputs)

@@ -5,14 +5,13 @@ trained by `training/appearance_objective.py` to tell people apart, and the ligh
 which of the two V_f is.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Self
 
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
-from facerf_cli.network.feature_networks import VggFeatures
-from facerf_cli.network.inputs import resize
+from facerf_cli.network.feature_networks import TrainedFeatures
 
 
 @dataclass(frozen=True)
@@ -26,32 +25,16 @@ class AppearanceSettings:
     hidden: int = 256
 
 
-class AppearanceNetwork(nn.Module):
+class AppearanceNetwork(TrainedFeatures):
     """Tell who is shown in an image, and where its light comes from."""
 
     def __init__(self, settings: AppearanceSettings) -> None:
-        super().__init__()
-        self.settings = settings
-        self.trunk = VggFeatures(settings.width)
-        self.pool = nn.AdaptiveAvgPool2d(settings.grid)
-        self.head = nn.Sequential(
-            nn.Linear(self.trunk.out_channels * settings.grid**2, settings.hidden),
-            nn.ReLU(),
-            nn.Linear(settings.hidden, settings.people + 3),
-        )
+        super().__init__(settings, settings.people + 3)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Scores of the people [B, P] and unit directions toward the light [B, 3], camera space."""
-        found = self.head(self.pool(self.layers(images)[-1]).flatten(1)).float()
+        found = self.regressed(images)
         return found[:, :-3], F.normalize(found[:, -3:], dim=-1)
-
-    def layers(self, linear: Tensor) -> list[Tensor]:
-        """Features of the trunk at its own side; see `VggFeatures.layers`."""
-        return self.trunk.layers(resize(linear, self.settings.side))
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "vgg", **asdict(self.settings)}
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:

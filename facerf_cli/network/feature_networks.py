@@ -161,13 +161,11 @@ class LightSettings:
     side: int = 128
 
 
-class LightNetwork(nn.Module):
-    """S_f: regress the direction of the one light on a texture, in the head frame.
+class TrainedFeatures(nn.Module):
+    """The trunk of VGG-16 under a head of `outputs` numbers; the features of the trunk compare images."""
 
-    The head frame, since a texture does not show the head's pose.
-    """
-
-    def __init__(self, settings: LightSettings = LightSettings()) -> None:
+    def __init__(self, settings: Any, outputs: int) -> None:
+        """Make an untrained network; `settings` has the fields of `LightSettings`."""
         super().__init__()
         self.settings = settings
         self.trunk = VggFeatures(settings.width)
@@ -175,13 +173,13 @@ class LightNetwork(nn.Module):
         self.head = nn.Sequential(
             nn.Linear(self.trunk.out_channels * settings.grid**2, settings.hidden),
             nn.ReLU(),
-            nn.Linear(settings.hidden, 3),
+            nn.Linear(settings.hidden, outputs),
         )
 
-    def forward(self, textures: Tensor) -> Tensor:
-        """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where hidden."""
-        deepest = self.layers(textures)[-1]
-        return F.normalize(self.head(self.pool(deepest).flatten(1)).float(), dim=-1)
+    def regressed(self, images: Tensor) -> Tensor:
+        """Outputs of the head [B, outputs] for linear images [B, 3, H, W]."""
+        outputs: Tensor = self.head(self.pool(self.layers(images)[-1]).flatten(1)).float()
+        return outputs
 
     def layers(self, linear: Tensor) -> list[Tensor]:
         """Features of the trunk at its own side; see `VggFeatures.layers`."""
@@ -190,6 +188,20 @@ class LightNetwork(nn.Module):
     def as_metadata(self) -> dict[str, Any]:
         """Form and settings, for a checkpoint."""
         return {"form": "vgg", **asdict(self.settings)}
+
+
+class LightNetwork(TrainedFeatures):
+    """S_f: regress the direction of the one light on a texture, in the head frame.
+
+    The head frame, since a texture does not show the head's pose.
+    """
+
+    def __init__(self, settings: LightSettings = LightSettings()) -> None:
+        super().__init__(settings, 3)
+
+    def forward(self, textures: Tensor) -> Tensor:
+        """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where hidden."""
+        return F.normalize(self.regressed(textures), dim=-1)
 
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
