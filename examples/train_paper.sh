@@ -13,7 +13,7 @@ mkdir -p "$run"
 facerf synth-stage --seed 14 --subjects 36 --face-model "$run/ict.npz" -j 2 -o "$run/capture"
 facerf prepare-dataset "$run/capture" --split 28/2/6 --checks off -j 2 -o "$run/dataset"
 facerf relight-dataset "$run/dataset" --envmaps procedural:400 --per-subject 240 -j 2
-facerf synth-stage --seed 314 --subjects 16 --lights 50 -j 2 -o "$run/capture2"
+facerf synth-stage --seed 314 --subjects 16 --lights 50 --face-model "$run/ict.npz" -j 2 -o "$run/capture2"
 facerf prepare-dataset "$run/capture2" --split 16/0/0 --checks off -j 2 -o "$run/dataset2"
 facerf relight-dataset "$run/dataset2" --envmaps "$maps" --per-subject 25 -j 2
 [ -d "$run/photos" ] || python "$here/natural_photos.py" "$run/dataset2" "$run/photos"

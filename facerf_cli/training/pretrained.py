@@ -37,7 +37,7 @@ def load_vgg(choice: str | Path | None, network: VggFeatures | None = None) -> V
     if choice is None:
         raise UsageError(
             "--vgg-weights: missing, and the feature loss needs VGG-16; give --vgg-weights imagenet "
-            "(downloads 528 MiB once), or --vgg-weights PATH of torchvision's vgg16-397923af.pth; `facerf train` "
+            "(downloads 528 MiB once), or --vgg-weights PATH of torchvision's vgg16-397923af.pth; training "
             "also takes --appearance-features FILE"
         )
     path = fetch(VGG16, "--vgg-weights PATH") if str(choice) == "imagenet" else Path(choice)
