@@ -196,6 +196,18 @@ def test_monocular_predictions_lie_on_the_truth(
     assert right < 0.2 * wrong  # the fit to landmarks is not the true shape
 
 
+def test_in_another_pose_the_shape_stays_the_sources(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    person = found_by_truth(dataset, monkeypatch)
+    source = person.portrait(pair(0, "C0", "C0", 0)).by(FACE_ONLY).view.fit
+    target = person.lit("C1")
+    posed = target.posed_as(source, FACE_ONLY).fit
+    assert torch.equal(posed.alpha, source.alpha) and torch.equal(posed.beta, source.beta)
+    own = target.by(FACE_ONLY).view.fit
+    assert torch.equal(posed.rotation, own.rotation) and not torch.equal(posed.alpha, own.alpha)
+
+
 def test_images_without_a_face_are_left_out_and_named(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
