@@ -93,7 +93,7 @@ def _side(path: Path, metadata: dict[str, Any], name: str, default: int) -> int:
 
 
 def default_geometry(metadata: dict[str, Any]) -> Geometry:
-    """How a checkpoint's heads were made in training, and so are made by default."""
+    """Geometry of a checkpoint's training, by default that of photos, too."""
     return "network" if metadata.get("geometry") == "network" else "landmarks"
 
 

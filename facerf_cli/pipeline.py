@@ -112,7 +112,7 @@ def reflectance_of(
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """How the light of a photo is estimated over a rig.
+    """Settings of estimating the light of a photo over a rig.
 
     Without `non_negative` by the paper's least squares, whose weights may be negative. `features` (V_f or
     S_f) refines the weights (paper, 'Light Estimation').

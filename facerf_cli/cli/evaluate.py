@@ -68,7 +68,7 @@ def olat(
 def _light_options(
     photo: PhotoOptions, options: EvaluateOptions, non_negative: bool, refine: Refine
 ) -> LightOptions:
-    """How the light of each image is estimated; V_f, if its weights are given, refines it."""
+    """Options of the light of each image; V_f, if its weights are given, refines it."""
     vgg_weights = options.vgg_weights if refine == "features" else None
     light = LightOptions(photo, non_negative=non_negative, refine=refine, vgg_weights=vgg_weights)
     light.check()

@@ -2,8 +2,10 @@
 
 import json
 import shutil
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,6 +196,31 @@ def test_monocular_predictions_lie_on_the_truth(
     wrong = si_mse(found.predictions["unlit"], found.truth, found.mask)
     assert found.truth.shape == found.predictions["unlit"].shape == (96, 96, 3)
     assert right < 0.2 * wrong  # the fit to landmarks is not the true shape
+
+
+def test_in_its_own_pose_the_image_is_that_of_relight_in_the_crop(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A reflectance that changes nothing gives the photo back: cropped as the truth and the source are."""
+    person = found_by_truth(dataset, monkeypatch)
+    asked_for = []
+
+    @dataclass(frozen=True, eq=False)
+    class Records(Double):
+        def images(
+            self, photo: Any, head: Any, directions: torch.Tensor, *given: Any
+        ) -> Iterator[np.ndarray]:
+            asked_for.append(directions)
+            return super().images(photo, head, directions, *given)
+
+    light = side_light(person, "C0")
+    records = Records("unlit", models=FACE_ONLY)
+    (found,) = compare_olats(person, [pair(0, "C0", "C0", light)], [records], network_alone=False)
+    assert found.source is not None
+    inside = found.mask > 0.5
+    np.testing.assert_allclose(found.predictions["unlit"][inside], found.source[inside], atol=2e-3)
+    direction = torch.from_numpy(person.header("C0").directions[light]).float()
+    assert torch.equal(asked_for[0], direction[None])
 
 
 def test_in_another_pose_the_shape_stays_the_sources(

@@ -131,7 +131,7 @@ def photo_items(inputs: Sequence[str], options: EvaluateOptions, preset: int) ->
 
 
 def note_of_chosen(chosen: Mapping[str, Sequence[Any]], joint_fit: bool) -> str:
-    """How many sources or couples a protocol chose: those without a face are missing in the tables."""
+    """Note on the number of sources or couples: those without a face are missing in the tables."""
     count = sum(map(len, chosen.values()))
     if joint_fit:
         return f"{count} were chosen; heads are those fitted to all cameras of a person at once."
@@ -139,7 +139,7 @@ def note_of_chosen(chosen: Mapping[str, Sequence[Any]], joint_fit: bool) -> str:
 
 
 def note_of_light(light: LightOptions) -> str:
-    """How the light of each image is estimated."""
+    """Note on the estimate of the light of each image."""
     squares = "non-negative, smooth least squares" if light.non_negative else "signed least squares"
     refined = "" if light.refine == "none" else ", refined by features"
     return f"The field's light is estimated by {squares}{refined}."
