@@ -27,7 +27,7 @@ from facerf_cli.raster.texture import inpaint, normal_map
 from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
 
-_SAME_POSE_SHARE = 0.5  # of samples without pairs, as `pairs.py` draws them
+_SAME_POSE_SHARE = 0.5  # of samples without pairs
 _MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network
 
 

@@ -84,7 +84,7 @@ def common_mask(views: Iterable[CropView]) -> np.ndarray:
 class Person:
     """A subject of a prepared dataset.
 
-    Each source is a photo of its own: the face is found in it, and fitted or regressed as `geometry` says.
+    Each source is a separate photo: the face is found in it, and fitted or regressed as `geometry` says.
     With `geometry` None the head is that which was fitted to all calibrated cameras of the person at once.
     """
 
@@ -94,6 +94,7 @@ class Person:
     sides: Sides
     keep_eyes: bool = False
     _lit: dict[str, Portrait] = field(default_factory=dict)
+    _headers: dict[str, StackHeader] = field(default_factory=dict)
 
     def portraits(self, pairs: Iterable[Pair]) -> Iterator[tuple[Pair, Portrait]]:
         """Yield the pairs with their sources; those in which no face is found are named and left out."""
@@ -118,8 +119,10 @@ class Person:
         return self._lit[camera]
 
     def header(self, camera: str) -> StackHeader:
-        """The header of a camera's stack."""
-        return read_olat_header(self.dataset.stack_path(self.name, camera))
+        """The header of a camera's stack, read once."""
+        if camera not in self._headers:
+            self._headers[camera] = read_olat_header(self.dataset.stack_path(self.name, camera))
+        return self._headers[camera]
 
     def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
         header = self.header(camera)
