@@ -1,31 +1,31 @@
 #!/usr/bin/env bash
-# What facerf's departures from the paper buy: from the paper's form to the shipped one, a departure a row, each
-# trained from scratch for the same time of one core and measured on the same people and on Extended Yale B.
-# RUN is the folder of train_paper.sh. Run it on an idle machine: the time is that of the clock.
-# Usage: examples/departures.sh RUN [TIME] [EXTENDED_YALE_B SHIFTS.csv]
+# What facerf's departures from the paper buy: from the paper's form to the shipped one, a departure a row, and the
+# paper's two ablations, each trained from scratch for the same time of one core and measured on the same people and
+# on Extended Yale B. RUN is the folder of train_paper.sh. Run it on an idle core: the time is that of the clock.
+# Usage: [SUBJECTS=yaleB01,yaleB02] examples/departures.sh RUN [TIME] [EXTENDED_YALE_B SHIFTS.csv]
 set -euo pipefail
-run=$1 time=${2:-20m}
+run=$1 time=${2:-20m} yale=${3:-} shifts=${4:-}
 export OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 dataset=(--dataset "$run/dataset" --texture-size 128)
-features=(--appearance-features "$run/appearance/best.safetensors" --light-features "$run/light/best.safetensors")
+joint=("${dataset[@]}" --preset paper --photos "$run/photos"
+    --appearance-features "$run/appearance/best.safetensors" --light-features "$run/light/best.safetensors")
 heads=(--heads-from "$run/ict.npz" --heads 60 --bank "$run/bank")
 
 train() {  # NAME OPTIONS...: a run, measured
     local name=$1 out=$run/departures/$1
     shift
     facerf train -o "$out" --resume --workers 0 --max-time "$time" "$@"
-    facerf evaluate olat "$run/dataset" --network-alone --checkpoint "$out/last.safetensors" -o "$out/olat"
-    facerf evaluate olat "$run/dataset" --network-alone --joint-fit --checkpoint "$out/last.safetensors" \
-        -o "$out/olat-joint-fit"
-    if [ -n "${yale:-}" ]; then
-        facerf evaluate yale-b "$yale" --shifts "$shifts" --network-alone --checkpoint "$out/last.safetensors" \
-            -o "$out/yale-b"
+    facerf --checkpoint "$out/last.safetensors" evaluate olat "$run/dataset" --network-alone --every 20 -o "$out/olat"
+    if [ -n "$yale" ]; then
+        facerf --checkpoint "$out/last.safetensors" evaluate yale-b "$yale" --shifts "$shifts" --network-alone \
+            ${SUBJECTS:+--subjects "$SUBJECTS"} -o "$out/yale-b"
     fi
 }
 
-yale=${3:-} shifts=${4:-}
-train paper --preset paper "${dataset[@]}" "${features[@]}" --photos "$run/photos"
-train geometry --preset paper "${dataset[@]}" "${features[@]}" --geometry landmarks
+train paper "${joint[@]}"
+train without-normals "${joint[@]}" --without-normals
+train mean-face "${joint[@]}" --mean-face
+train geometry "${joint[@]}" --geometry landmarks
 train loss --preset paper --stage reflectance "${dataset[@]}"
 train data --preset paper --stage reflectance "${heads[@]}"
 train optimizer --form paper "${heads[@]}"

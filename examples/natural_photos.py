@@ -53,7 +53,7 @@ def main(folder: Path, out: Path) -> None:
     for pair in read_pairs(dataset):
         person = read_image(image_path(dataset, *pair.key)).pixels
         stack = read_olat_header(dataset.stack_path(pair.subject, pair.source_camera))
-        shown = (stack.source.max(-1) > COVERED) & (stack.seen > 0)
+        shown = stack.source.max(-1) > COVERED
         alpha = gaussian_filter(shown.astype(np.float32), 0.7)[..., None]
         photo = person * alpha + background(pair, len(person)) * (1 - alpha)
         out.mkdir(parents=True, exist_ok=True)
