@@ -20,6 +20,7 @@ _BLUR_NEIGHBOURS = 24  # vertices over which bounced light is smoothed
 _SAME_SURFACE_COSINE = 0.6  # of two normals, from which on near vertices share bounced light
 _NO_WEIGHT = 1e-4  # below it an entry of a mean is left out
 _STRAND_STRIDE = 5  # of this many vertices of hair one is traced
+_THROUGH_HAIR = 0.12  # share of light that hair between a point and a light lets through
 _STRAND_NEAR = 4  # traced vertices of which the visibility of a vertex of hair is a mean
 _CURVE_BITS = 10  # of a position along each axis, by which vertices are ordered
 _R2 = np.array([0.7548776662466927, 0.5698402909980532], np.float32)  # 1 / p, 1 / p^2 with p^3 = p + 1
@@ -115,6 +116,7 @@ class MeshSurface:
     """
 
     scene: rtcore_scene.EmbreeScene
+    solid: rtcore_scene.EmbreeScene  # without hair
     vertices: np.ndarray
     normals: np.ndarray
     triangles: np.ndarray
@@ -136,6 +138,7 @@ class MeshSurface:
         ones = np.ones(2 * len(edges), np.float32)
         return cls(
             build_scene(vertices, triangles),
+            build_scene(vertices, triangles[~two_sided[triangles[:, 0]]]),
             vertices,
             normals,
             triangles,
@@ -232,11 +235,16 @@ def _visible_by_one_ray(
     settings: BakeSettings,
     numbers: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
-    """Test if a ray from each chosen vertex [N] reaches the area light; bool [N]."""
+    """Share of light [N] that reaches each chosen vertex along a ray: 0, 1, or what hair lets through."""
     side = np.where(facing[chosen] < 0, np.float32(-1), np.float32(1))[:, None]  # of hair
     origins = surface.vertices[chosen] + surface.normals[chosen] * (side * surface.offset_m[chosen])
     rays = on_disc(direction, settings.light_radius_deg, *numbers)
-    return ~occluded(surface.scene, origins, rays)
+    blocked = occluded(surface.scene, origins, rays)
+    passed = (~blocked).astype(np.float32)
+    if surface.two_sided.any():
+        hairy = np.flatnonzero(blocked)
+        passed[hairy] = _THROUGH_HAIR * ~occluded(surface.solid, origins[hairy], rays[hairy])
+    return passed
 
 
 def _shadow_edges(edges: np.ndarray, share: np.ndarray, lit: np.ndarray) -> np.ndarray:

@@ -141,6 +141,15 @@ def occluded(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: n
     return np.asarray(hits) != -1
 
 
+def hits_within(
+    scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray, reach_m: float
+) -> np.ndarray:
+    """Test if rays [N, 3] hit something between `OFFSET_M` and `reach_m`; bool [N]."""
+    starts = np.ascontiguousarray(origins + OFFSET_M * directions, np.float32)
+    hits = scene.run(starts, np.ascontiguousarray(directions, np.float32), output=True)
+    return np.asarray((hits["primID"] >= 0) & (hits["tfar"] < reach_m))
+
+
 def on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
     """Unit directions [N, 3] to points on the disc of an area light, from two numbers [N, 1] in 0..1."""
     axis = axis.astype(np.float32)

@@ -24,7 +24,7 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.pigments import hair_albedo
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.head.clothes import draw_clothes
+from facerf_cli.synth.head.body import draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
@@ -44,6 +44,7 @@ _OPEN_SHADE = 0.75  # share of the light that reaches skin and cloth around the 
 _UNDER_CHIN_M, _UNDER_CHIN_SHADE = -0.09, 0.5  # height below which skin is darker, and by how much
 _STRANDS_SHARE = 0.15  # of the hair's strands: enough at 2 mm per pixel, over a scalp of their colour
 _SCALP_M, _SCALP_BACK_M, _SCALP_LOW_M = 0.085, -0.02, -0.06  # skin above or behind, and not below, is scalp
+_BODY_EDGE_M = 0.02  # mean length of an edge of body and garment
 _COARSE = 2  # every other vertex of the face grid, enough at this resolution
 _SKIN, _HAIR, _CLOTH, _FRAME = (PARTS.index(name) for name in ("skin", "hair", "cloth", "frame"))
 # The clamped cosine in spherical harmonics (Ramamoorthi and Hanrahan, *An efficient representation for
@@ -135,7 +136,7 @@ def _surroundings(vertices: Tensor, random: np.random.Generator) -> _Surrounding
     bare = shell_head(vertices, (0.0, 0.0), 0)
     corners, weights = landmark_weights()
     landmarks_m = (vertices[corners] * weights[..., None]).sum(1).numpy()
-    dressed = joined(bare, draw_clothes(bare, random))
+    dressed, _ = draw_body(bare, random, _BODY_EDGE_M)
     worn: list[HeadMesh] = []
     if random.random() < _HAIR_SHARE:
         hair, _ = draw_hair(dressed, random)

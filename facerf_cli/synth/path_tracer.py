@@ -209,4 +209,4 @@ def _bumped(mi: types.ModuleType, material: Material, surface: dict[str, Any]) -
 def _texture(mi: types.ModuleType, texture: Tensor) -> dict[str, Any]:
     """Describe a texture [C, H, W] of raw values, bilinear, clamped at the borders."""
     pixels = np.ascontiguousarray(texture.permute(1, 2, 0).float().numpy())
-    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": "clamp"}
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True, "wrap_mode": "mirror"}

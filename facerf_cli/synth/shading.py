@@ -17,7 +17,10 @@ _SCATTER_REACH = 6  # texels of the kernel on each side
 _STRAND_LOBES = (
     (-0.12, 1.0),
     (0.17, 2.0),
-)  # hair, R and TRT: (shift to the tip in radians, width factor)
+    (0.06, 0.7),
+)  # hair, R, TRT and TT: (shift to the tip in radians, width factor)
+_UNMASKED = 0.6  # of the white highlight; the rest meets other strands
+_TRANSMITTED, _TRANSMITTED_WIDTH = 0.5, 0.45  # of TT: strength, standard deviation around the strand
 
 
 def diffuse_irradiance(
@@ -112,9 +115,10 @@ class Strands(NamedTuple):
 def strand_highlights(hair: Strands, lights: Tensor) -> tuple[Tensor, Tensor]:
     """Compute specular radiance [N, L] under lights [L, 3]: a white highlight, and one to tint by the hair.
 
-    These are the lobes R and TRT of Marschner et al. (*Light scattering from human hair fibers*, 2003), TRT
-    simplified to a shifted copy of R: a Gaussian in the half angle along the strand, cos(phi / 2) / 4 around
-    it.
+    These are the lobes R, and TRT and TT to tint, of Marschner et al. (*Light scattering from human hair
+    fibers*, 2003): Gaussians in the half angle along the strand; around it cos(phi / 2) / 4 for R and, as a
+    simplification, TRT, and for TT, the light that shines through, a Gaussian about the direction away from
+    the light.
     """
     sin_l, sin_v = hair.tangents @ lights.T, (hair.tangents * hair.views).sum(-1, keepdim=True)
     sin_l, sin_v = sin_l.clamp(-0.999, 0.999), sin_v.clamp(-0.999, 0.999)
@@ -127,8 +131,11 @@ def strand_highlights(hair: Strands, lights: Tensor) -> tuple[Tensor, Tensor]:
     fresnel = hair.specular[:, None] + (1 - hair.specular[:, None]) * (1 - incidence) ** 5
     around = math.pi * cos_l * cos_half_phi / (4 * cos_difference**2)
     half, width = (theta_l + theta_v) / 2, (hair.roughness[:, None] ** 2).clamp_min(0.06)
-    white, coloured = (around * _gaussian(half - shift, width * spread) for shift, spread in _STRAND_LOBES)
-    return fresnel * white, (1 - fresnel) ** 2 * hair.specular[:, None] * coloured
+    white, coloured, through = (_gaussian(half - shift, width * spread) for shift, spread in _STRAND_LOBES)
+    behind = _gaussian(math.pi - cos_phi.acos(), torch.tensor(_TRANSMITTED_WIDTH))
+    through = _TRANSMITTED * math.pi * cos_l / cos_difference**2 * behind * through
+    tinted = hair.specular[:, None] * around * coloured + through
+    return _UNMASKED * fresnel * around * white, (1 - fresnel) ** 2 * tinted
 
 
 def _gaussian(angle: Tensor, sigma: Tensor) -> Tensor:

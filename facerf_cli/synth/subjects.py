@@ -13,16 +13,17 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
-from facerf_cli.synth.head.clothes import draw_clothes
+from facerf_cli.synth.head.body import chin_height_m, draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
+from facerf_cli.synth.head.headwear import draw_headwear
 from facerf_cli.synth.head.mesh import HeadMesh, joined
 
 _POSE_STD_DEG = (6.0, 4.0, 2.0)  # yaw, pitch and roll of subjects who look ahead
 _GAZE_STD_DEG = 6.0
-_CLOSED_SHARE, _GLASSES_SHARE = 0.08, 0.15  # of subjects with closed eyes, with glasses
+_CLOSED_SHARE, _GLASSES_SHARE, _HEADWEAR_SHARE = 0.08, 0.15, 0.15  # with closed eyes, glasses, headwear
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,17 +59,21 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     face_vertices = model.vertices(alpha[None], beta[None])[0]
     landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
-    dressed = joined(bare, draw_clothes(bare, random))
-    hair, style = draw_hair(dressed, random)
+    dressed, garment = draw_body(bare, random)
+    headwear = draw_headwear(bare, chin_height_m(bare), random) if random.random() < _HEADWEAR_SHARE else None
+    hair, style = draw_hair(dressed, random, headwear)
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
     appearance = with_scalp(appearance, cover, generator)
     glasses = random.random() < _GLASSES_SHARE
     worn = [draw_glasses(bare, landmarks_m, random)] if glasses else []
+    worn += [headwear.mesh] if headwear else []
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
     mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), head_to_world.numpy())
     landmarks_world = landmarks_m @ head_to_world.numpy().T
     traits = appearance.traits | {
         "hair": style.name,
+        "garment": garment,
+        "headwear": headwear.kind if headwear else "none",
         "glasses": glasses,
         "eyes_closed": closed,
         "pose_deg": pose_deg.round(3).tolist(),

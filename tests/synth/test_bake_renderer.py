@@ -51,6 +51,7 @@ def board(part: str = "skin", side_m: float = 0.1, count: int = 21, z: float = 0
         np.full(len(vertices), PARTS.index(part), np.uint8),
         np.stack([u, v], -1).reshape(-1, 2).astype(np.float32),
         down,
+        np.zeros(len(vertices), np.uint8),
     )
 
 
@@ -64,6 +65,7 @@ def ball(radius_m: float = 0.05) -> HeadMesh:
         np.zeros(len(normals), np.uint8),
         np.full((len(normals), 2), 0.5, np.float32),
         np.zeros_like(normals),
+        np.zeros(len(normals), np.uint8),
     )
 
 

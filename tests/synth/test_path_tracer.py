@@ -57,6 +57,7 @@ def _corner() -> HeadMesh:
         np.repeat(np.array([PARTS.index("skin"), PARTS.index("cloth")], np.uint8), count * count),
         np.concatenate([uv, uv]).astype(np.float32),
         np.zeros((2 * count * count, 3), np.float32),
+        np.zeros(2 * count * count, np.uint8),
     )
 
 

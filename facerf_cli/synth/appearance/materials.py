@@ -16,6 +16,15 @@ from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_noise
 
 _SIDE = 256  # of the textures of eyes and cloth
+_CLOTHS = ("plain", "plain", "plain", "heather", "stripes", "check")
+# Common colours of garments, linear Rec.709: whites, greys, black, blues, browns, greens, reds, pastels.
+_DYES = (
+    *((0.70, 0.69, 0.66), (0.72, 0.72, 0.72), (0.55, 0.52, 0.45), (0.25, 0.25, 0.26)),
+    *((0.09, 0.09, 0.10), (0.020, 0.020, 0.022), (0.025, 0.025, 0.025), (0.014, 0.022, 0.055)),
+    *((0.03, 0.06, 0.14), (0.10, 0.17, 0.30), (0.30, 0.42, 0.60), (0.36, 0.26, 0.15)),
+    *((0.10, 0.055, 0.03), (0.07, 0.075, 0.03), (0.02, 0.06, 0.035), (0.16, 0.014, 0.02)),
+    *((0.40, 0.03, 0.03), (0.50, 0.24, 0.24), (0.52, 0.40, 0.12), (0.24, 0.10, 0.22)),
+)
 _HAIR_WISPS = 512  # different wisps in the texture of hair
 _PAINTED_HAIR = ("bald", "hairline_mm")  # parameters of painted scalp hair; here hair is geometry
 
@@ -59,7 +68,7 @@ class MaterialPoints:
 
 def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     """Draw one person with clothes and glasses; `side` of the canvas only sets the resolution of the skin."""
-    people = draw_people(1, generator)
+    people = replace(draw_people(1, generator), random_texture=torch.zeros(1))
     eye, eye_traits = eyeball_textures(_SIDE, people, generator)
     frame, frame_kind = _frame(generator)
     cloth, cloth_kind = _cloth(generator)
@@ -70,6 +79,7 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
         "cloth": cloth,
         "hair": _hair(people, generator),
         "frame": frame,
+        "hat": _cloth(generator)[0],
     }
     skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
     materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
@@ -107,7 +117,7 @@ def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator
 
 
 def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> MaterialPoints:
-    """Sample the materials at points, bilinear and clamped at the borders.
+    """Sample the materials at points, bilinear; cloth is repeated in mirror image, the others are clamped.
 
     part [N] is an index into `mesh.PARTS`, uv [N, 2] as in `HeadMesh`.
     """
@@ -121,7 +131,8 @@ def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> MaterialPoints:
         material = appearance.materials[name]
         texture = torch.cat([material.albedo, material.specular, material.roughness, material.relief])
         grid = (2 * at - 1).view(1, 1, -1, 2)
-        found = F.grid_sample(texture[None], grid, padding_mode="border", align_corners=False)
+        beyond = "reflection" if name in ("cloth", "hat") else "border"
+        found = F.grid_sample(texture[None], grid, padding_mode=beyond, align_corners=False)
         values[chosen] = found[0, :, 0].T
     return MaterialPoints(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
 
@@ -158,22 +169,30 @@ def _teeth(people: People, generator: torch.Generator) -> Material:
 
 
 def _cloth(generator: torch.Generator) -> tuple[Material, str]:
-    """Draw plain, heathered or striped cloth, and its kind."""
-    grey = torch.full((3,), _uniform(0.02, 0.6, generator))
-    colour = grey * torch.exp(_uniform(0, 0.9, generator) * torch.randn(3, generator=generator))
-    kind = ("plain", "plain", "heather", "stripes")[int(torch.randint(4, (), generator=generator))]
+    """Draw plain, heathered, striped or checked cloth, and its kind."""
+    kind = _CLOTHS[int(torch.randint(len(_CLOTHS), (), generator=generator))]
     side = _SIDE
     weave = torch.randn(1, side, side, generator=generator)
-    albedo = colour.clamp(0.015, 0.75).view(3, 1, 1) * (1 + 0.06 * weave)
+    albedo = _dye(generator) * (1 + 0.06 * weave)
     if kind == "heather":
         albedo = albedo * (1 + 0.25 * weave)
-    if kind == "stripes":
-        phase = torch.arange(side).view(1, -1, 1) / side * round(_uniform(6, 30, generator))
-        other = torch.rand(3, 1, 1, generator=generator) * 0.6 + 0.02
+    if kind in ("stripes", "check"):
+        phase = torch.arange(side).view(1, -1, 1) / side * round(_uniform(8, 24, generator))
         stripe = torch.sigmoid(12 * (torch.sin(2 * torch.pi * phase) - _uniform(-0.6, 0.6, generator)))
-        albedo = albedo * (1 - stripe) + stripe * other * (1 + 0.06 * weave)
+        if kind == "check":
+            stripe = (stripe + stripe.transpose(1, 2)) / 2
+        albedo = albedo * (1 - stripe) + stripe * _dye(generator) * (1 + 0.06 * weave)
     relief = 0.12 * torch.randn(2, side, side, generator=generator)
     return _flat(albedo, 0.02, _uniform(0.7, 0.9, generator), relief), kind
+
+
+def _dye(generator: torch.Generator) -> Tensor:
+    """Draw the colour [3, 1, 1] of a garment near one of `_DYES`."""
+    colour = torch.tensor(_DYES[int(torch.randint(len(_DYES), (), generator=generator))])
+    shift = torch.exp(
+        0.15 * torch.randn((), generator=generator) + 0.06 * torch.randn(3, generator=generator)
+    )
+    return (colour * shift).clamp(0.012, 0.8).view(3, 1, 1)
 
 
 def _hair(people: People, generator: torch.Generator) -> Material:

@@ -11,7 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from facerf_cli.synth.head.hair_styles import HairStyle, draw_style, scalp_margin_m
+from facerf_cli.synth.head.headwear import Headwear
 from facerf_cli.synth.head.hull import Hull, hull_of
+from facerf_cli.synth.head.labels import part_class
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, smoothstep, unit
 
 MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
@@ -19,13 +21,19 @@ MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
 _FACE_DEG = 50.0  # largest azimuth at which hair below the fringe covers the face
 _CHIN_M = -0.13  # hair below this height no longer covers the face
 _RAGGED_M = 0.002  # standard deviation of the hairline's height
+_RAGGED_FRINGE_M, _FRINGE_LOCKS = 0.005, 400  # deviation of a fringe's edge; locks of all hair
 _SHORTEST_STEP_M = 1e-4  # of a wisp
 
 
-def draw_hair(head: HeadMesh, random: np.random.Generator) -> tuple[HeadMesh | None, HairStyle]:
+def draw_hair(
+    head: HeadMesh, random: np.random.Generator, headwear: Headwear | None = None
+) -> tuple[HeadMesh | None, HairStyle]:
     """Draw a style and grow it on a head. If the head wears clothes, long hair falls over them."""
     style = draw_style(random)
-    hair = grow_hair(head, style, random)
+    if headwear is None:
+        hair = grow_hair(head, style, random)
+    else:
+        hair = headwear.uncovered(grow_hair(head, headwear.flat(style), random))
     return hair if len(hair.vertices) else None, style
 
 
@@ -43,7 +51,8 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     length = _lengths(roots, margin, style, random)
     wisps = _Wisps(roots, root_normals, style, hull, random)
     paths = wisps.grow(length)
-    covers = _covers_face(paths, style)
+    ragged_m = _ragged(roots, style, random)
+    covers = _covers_face(paths, style, ragged_m)
     first = np.where(covers.any(1), covers.argmax(1), style.segments + 1)
     last = np.maximum(first - 0.7, 0.3) / style.segments
     length = length * np.where(covers.any(1), last**style.crowding, 1)
@@ -54,7 +63,7 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     paths = _curled(paths, normals, length, leader, style, random)
     paths = hull.lifted(paths, np.minimum(0.0008, 0.02 * np.linspace(0, 1, paths.shape[1])))
     paths[:, 0] = roots - 0.001 * root_normals
-    keep = ~_covers_face(paths, style).any(1)
+    keep = ~_covers_face(paths, style, ragged_m).any(1)
     return _ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
 
 
@@ -185,11 +194,18 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
     return direction - (direction * normals).sum(-1, keepdims=True) * normals
 
 
-def _covers_face(paths: np.ndarray, style: HairStyle) -> np.ndarray:
+def _ragged(roots: np.ndarray, style: HairStyle, random: np.random.Generator) -> np.ndarray:
+    """Draw how much lower or higher the wisps [W] of a fringe end: lock by lock, and each alone."""
+    locks = roots[random.choice(len(roots), min(len(roots), _FRINGE_LOCKS), replace=False)]
+    lock = cKDTree(locks).query(roots)[1]
+    return _RAGGED_FRINGE_M * (random.normal(0, 1, len(locks))[lock] + random.normal(0, 0.6, len(roots)))
+
+
+def _covers_face(paths: np.ndarray, style: HairStyle, ragged_m: np.ndarray) -> np.ndarray:
     """[W, rows] bool: in front of the face and below the height to which a fringe may hang."""
     x, y, z = np.moveaxis(paths, -1, 0)
     azimuth = np.abs(np.degrees(np.arctan2(x, z)))
-    low = style.fringe_mm / 1000 + 0.10 * np.abs(x) * (style.comb == "parted")
+    low = style.fringe_mm / 1000 + ragged_m[:, None] + 0.10 * np.abs(x) * (style.comb == "parted")
     return (azimuth < _FACE_DEG) & (y < low) & (y > _CHIN_M)
 
 
@@ -272,6 +288,7 @@ def _ribbons(
         part=np.full(len(vertices), PARTS.index("hair"), np.uint8),
         uv=interleaved(uv, uv, uv),
         tangents=interleaved(along, along, along),
+        label=np.full(len(vertices), part_class("hair"), np.uint8),
     )
 
 

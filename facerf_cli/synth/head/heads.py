@@ -19,6 +19,7 @@ from facerf_cli.face.importers.source import EXPRESSION_STD
 from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.synth.head.labels import class_index, ears_of, part_class, skin_classes
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.head.slits import Slit, eye_slit, lip_slit
@@ -63,6 +64,7 @@ def build_head(
         part=plan.part,
         uv=plan.uv,
         tangents=np.zeros((len(plan.source), 3), np.float32),
+        label=plan.label,
     )
 
 
@@ -144,6 +146,7 @@ class _Plan:
     split_triangles: np.ndarray  # [F, 3] of the cut mesh
     part: np.ndarray  # [W] index into `PARTS`
     uv: np.ndarray  # [W, 2]
+    label: np.ndarray  # [W] index into `labels.CLASSES`
 
 
 @lru_cache(maxsize=4)
@@ -180,7 +183,16 @@ def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
         split_triangles=split,
         part=parts[kinds],
         uv=flat.astype(np.float32),
+        label=_labels(refine @ head.mean.double().numpy(), source, kinds, flat),
     )
+
+
+def _labels(mean: np.ndarray, source: np.ndarray, kinds: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Classes [W] of the vertices `source` of the fine mean head; kinds [W]: their parts of `HEAD_PARTS`."""
+    labels = np.array([part_class(name) for name in HEAD_PARTS], np.uint8)[kinds]
+    skin = kinds == _SKIN
+    labels[skin] = np.where(ears_of(mean[source[skin]]), class_index("ears"), skin_classes(uv[skin]))
+    return labels
 
 
 def _lip_slit(head: HeadModel, names: tuple[str, ...]) -> Slit | None:

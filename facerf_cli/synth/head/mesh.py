@@ -1,10 +1,12 @@
 """The mesh of a synthetic head in named parts, and the arithmetic that the builders of the parts share."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame")  # of HeadMesh.part, by index
+from facerf_cli.synth.head.labels import part_class
+
+PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame", "hat")  # of HeadMesh.part, by index
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,7 +16,7 @@ class HeadMesh:
     vertices, normals (unit) [V, 3]; triangles [F, 3] int64, counter-clockwise seen from outside, each within
     one part; part [V] uint8, an index into `PARTS`; uv [V, 2] in the texture of the part, row v = 0 at the
     top (skin: the face's UV map, continued beyond 0..1 over the rest of the head); tangents [V, 3] unit
-    along a strand of hair, zero elsewhere.
+    along a strand of hair, zero elsewhere; label [V] uint8, an index into `labels.CLASSES`.
     """
 
     vertices: np.ndarray
@@ -23,6 +25,7 @@ class HeadMesh:
     part: np.ndarray
     uv: np.ndarray
     tangents: np.ndarray
+    label: np.ndarray
 
 
 def joined(*meshes: HeadMesh) -> HeadMesh:
@@ -35,6 +38,7 @@ def joined(*meshes: HeadMesh) -> HeadMesh:
         part=np.concatenate([mesh.part for mesh in meshes]),
         uv=np.concatenate([mesh.uv for mesh in meshes]),
         tangents=np.concatenate([mesh.tangents for mesh in meshes]),
+        label=np.concatenate([mesh.label for mesh in meshes]),
     )
 
 
@@ -53,7 +57,16 @@ def strandless(
         part=np.full(len(vertices), PARTS.index(part), np.uint8),
         uv=uv.astype(np.float32),
         tangents=np.zeros((len(vertices), 3), np.float32),
+        label=np.full(len(vertices), part_class(part), np.uint8),
     )
+
+
+def kept_triangles(mesh: HeadMesh, kept: np.ndarray) -> HeadMesh:
+    """Select triangles [F] bool of a mesh, without the vertices that only others use."""
+    used, triangles = np.unique(mesh.triangles[kept], return_inverse=True)
+    fields = ("vertices", "normals", "part", "uv", "tangents", "label")
+    of_vertices = {name: getattr(mesh, name)[used] for name in fields}
+    return replace(mesh, triangles=triangles.reshape(-1, 3), **of_vertices)
 
 
 def ring_triangles(rings: int, segments: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from facerf_cli.synth.head import mouth
 from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface
 from facerf_cli.synth.head.ear import ear_hollow_mm, ear_surface
 from facerf_cli.synth.head.eyes import RADIUS_MM, eyeball, fitted_centre
+from facerf_cli.synth.head.labels import class_index, part_class, skin_classes
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, unit
 from facerf_cli.synth.head.openings import Sheet, lips, outline, skin_sheet
 
@@ -70,7 +71,9 @@ def _rimmed(skin_mm: np.ndarray, sheet: Sheet, rims: dict[str, list[np.ndarray]]
         uv += [uv[0][sheet.rims[name]]] * len(rings)
     count = sum(map(len, vertices))
     same = np.concatenate([sheet.same, np.arange(len(skin_mm), count)])
-    return _part("skin", np.concatenate(vertices), np.concatenate(triangles), np.concatenate(uv), same)
+    whole_uv = np.concatenate(uv)
+    label = skin_classes(whole_uv)
+    return _part("skin", np.concatenate(vertices), np.concatenate(triangles), whole_uv, same, label)
 
 
 def _open(landmarks_mm: np.ndarray) -> tuple[str, ...]:
@@ -195,13 +198,22 @@ def _ear(root: np.ndarray, side: float) -> HeadMesh:
     azimuth_deg = np.degrees(np.arctan2(points[:, 0], points[:, 2]))
     u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
     uv = np.stack([u, (TOP_M - points[:, 1] / 1000) / (TOP_M - BOTTOM_M)], -1)
-    return _part("skin", points, triangles if side > 0 else triangles[:, ::-1], uv)
+    label = np.full(len(points), class_index("ears"), np.uint8)
+    return _part("skin", points, triangles if side > 0 else triangles[:, ::-1], uv, label=label)
 
 
 def _part(
-    name: str, vertices_mm: np.ndarray, triangles: np.ndarray, uv: np.ndarray, same: np.ndarray | None = None
+    name: str,
+    vertices_mm: np.ndarray,
+    triangles: np.ndarray,
+    uv: np.ndarray,
+    same: np.ndarray | None = None,
+    label: np.ndarray | None = None,
 ) -> HeadMesh:
-    """Make a mesh of one part, without unused vertices; same [V]: the vertex that represents each place."""
+    """Make a mesh of one part, without unused vertices.
+
+    same [V]: the vertex that represents each place; label [V]: classes, by default that of the part.
+    """
     used = np.zeros(len(vertices_mm), bool)
     used[triangles] = True
     place = np.arange(len(vertices_mm)) if same is None else same
@@ -213,6 +225,7 @@ def _part(
         part=np.full(len(normals), PARTS.index(name), np.uint8),
         uv=uv[used].astype(np.float32),
         tangents=np.zeros((len(normals), 3), np.float32),
+        label=np.full(len(normals), part_class(name), np.uint8) if label is None else label[used],
     )
 
 
