@@ -18,7 +18,7 @@ from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.facets import Facets, facets_of
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.shading import Cosines, Strands, strand_cosines, strand_highlights, two_lobes
+from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, widened_lobes
 from facerf_cli.synth.stage_cameras import StageCamera
 
 _SKIN, _HAIR = PARTS.index("skin"), PARTS.index("hair")
@@ -26,7 +26,6 @@ _CHUNK = 1 << 19  # pixels x lights shaded at a time; fits the CPU caches
 _LIGHTS = 25  # lights bounced at a time
 _NEAR = 32  # neighbours that one pass of scattering reaches
 _RELIEF_SOFTNESS = 0.15  # stands for light from all sides, which keeps bumps from going black
-_NORMAL_VARIANCE = 0.18  # largest addition to alpha squared where normals vary within a pixel
 
 
 @dataclass(frozen=True)
@@ -97,6 +96,13 @@ def scattered_irradiance(
     return irradiance
 
 
+def irradiance_factors(head: HeadMesh, transport: MeshTransport) -> tuple[np.ndarray, np.ndarray]:
+    """Irradiance [V, L] straight from each light, and by one bounce off white surroundings; unscattered."""
+    direct = transport.visibility.T * _cosines(head, transport.directions)
+    bounced = transport.gathered(direct[transport.sites])
+    return direct, bounced[transport.site_of] * transport.baked[:, None]
+
+
 def _cosines(head: HeadMesh, directions: np.ndarray) -> np.ndarray:
     """Diffuse factors [V, L]: n.l clamped at 0, and `strand_cosines` on hair."""
     lights = torch.from_numpy(directions).float()
@@ -157,7 +163,15 @@ def _shaded(
     if settings.gloss:
         hair = facets.part == _HAIR
         lit = torch.from_numpy(facets.corners @ visibility)
-        white[~hair] = _gloss(facets, ~hair, lights) * lit[~hair]
+        gloss = widened_lobes(
+            facets.bent[~hair],
+            facets.views[~hair],
+            lights,
+            facets.surface.specular[~hair],
+            facets.surface.roughness[~hair],
+            facets.spread[~hair],
+        )
+        white[~hair] = gloss * lit[~hair]
         strands = Strands(
             facets.tangents[hair],
             facets.views[hair],
@@ -170,26 +184,6 @@ def _shaded(
     for channel, tinted in enumerate(facets.tinted):
         diffuse = (tinted @ irradiance[channel]) * relief
         yield diffuse + (white + coloured * facets.surface.albedo[:, channel, None]).numpy()
-
-
-def _gloss(facets: Facets, chosen: Tensor, lights: Tensor) -> Tensor:
-    """Highlights without shadows [n, L] of the chosen facets [N] (bool).
-
-    The variance of the normals within a pixel widens the lobe (Tokuyoshi and Kaplanyan, *Improved
-    geometric specular antialiasing*, 2019).
-    """
-    normals, views = facets.bent[chosen], facets.views[chosen]
-    l_dot_v = views @ lights.T
-    to_half = (2 + 2 * l_dot_v).clamp_min(1e-6).rsqrt()
-    n_dot_l, n_dot_v = normals @ lights.T, (normals * views).sum(1, keepdim=True)
-    cosines = Cosines(
-        n_dot_l=n_dot_l.clamp_min(0),
-        n_dot_v=n_dot_v.clamp_min(0.05),
-        n_dot_h=((n_dot_l + n_dot_v) * to_half).clamp(0, 1),
-        v_dot_h=((1 + l_dot_v) * to_half).clamp(0, 1),
-    )
-    widened = facets.surface.roughness[chosen] ** 4 + (2 * facets.spread[chosen]).clamp_max(_NORMAL_VARIANCE)
-    return two_lobes(cosines, facets.surface.specular[chosen, None], widened[:, None] ** 0.25)
 
 
 def _relief_ratio(facets: Facets, lights: Tensor) -> np.ndarray:

@@ -26,6 +26,7 @@ class Facets:
     corners: csr_matrix  # [N, W] mean barycentric weights; rows sum to 1
     tinted: list[csr_matrix]  # per channel [N, V]: weights times albedo
     surface: MaterialPoints
+    uv: Tensor  # [N, 2]
     normals: Tensor  # [N, 3] smooth normals
     bent: Tensor  # [N, 3] normals with relief
     views: Tensor  # [N, 3] directions to the camera
@@ -40,7 +41,7 @@ class Facets:
             self.corners[rows],
             [matrix[rows] for matrix in self.tinted],
             MaterialPoints(*(getattr(self.surface, field.name)[rows] for field in fields(MaterialPoints))),
-            *(getattr(self, name)[rows] for name in ("normals", "bent", "views", "tangents", "spread")),
+            *(getattr(self, name)[rows] for name in ("uv", "normals", "bent", "views", "tangents", "spread")),
         )
 
 
@@ -51,7 +52,8 @@ def facets_of(
 
     `relief` tilts the normals by the fine relief of the materials.
     """
-    samples = _samples(head, camera)
+    small = max(camera.camera.width_px, camera.camera.height_px) <= _SMALL_PX
+    samples = surface_samples(head, camera, 3 if small else 2)
     part = head.part[samples.corners[:, 0]]
     groups = _Groups.of(samples.pixel * len(PARTS) + part)
     vertices, used = np.unique(samples.corners, return_inverse=True)
@@ -75,6 +77,7 @@ def facets_of(
         surface=MaterialPoints(
             *(groups.mean(getattr(surface, field.name)) for field in fields(MaterialPoints))
         ),
+        uv=groups.mean(samples.interpolate(head.uv)),
         normals=unit(groups.mean(smooth), 1),
         bent=unit(bent, 1),
         views=unit(camera_head - torch.from_numpy(corners @ head.vertices[vertices]), 1),
@@ -88,7 +91,7 @@ def facets_of(
 
 
 @dataclass(frozen=True, eq=False)
-class _Samples:
+class Samples:
     """S visible points of the mesh, several per pixel."""
 
     pixel: np.ndarray  # [S]
@@ -129,10 +132,9 @@ class _Groups:
         return csr_matrix((values.ravel(), (rows, columns.ravel())), shape=(len(self.keys), width))
 
 
-def _samples(head: HeadMesh, stage_camera: StageCamera) -> _Samples:
-    """Rasterize the mesh at several samples per pixel."""
+def surface_samples(head: HeadMesh, stage_camera: StageCamera, scale: int) -> Samples:
+    """Rasterize the mesh at `scale` x `scale` samples per pixel."""
     camera = stage_camera.camera
-    scale = 3 if max(camera.width_px, camera.height_px) <= _SMALL_PX else 2
     finer = Camera(
         camera.focal_px * scale,
         camera.width_px * scale,
@@ -145,7 +147,7 @@ def _samples(head: HeadMesh, stage_camera: StageCamera) -> _Samples:
     fragments = rasterize(vertices, torch.from_numpy(head.triangles), finer)
     row, column = (index.numpy() for index in torch.nonzero(fragments.covered, as_tuple=True))
     triangle = fragments.triangle.numpy()[row, column]
-    return _Samples(
+    return Samples(
         pixel=(row // scale) * camera.width_px + column // scale,
         triangle=triangle,
         corners=head.triangles[triangle],
@@ -154,7 +156,7 @@ def _samples(head: HeadMesh, stage_camera: StageCamera) -> _Samples:
     )
 
 
-def _uv_tangents(head: HeadMesh, samples: _Samples, normals: Tensor) -> tuple[Tensor, Tensor]:
+def _uv_tangents(head: HeadMesh, samples: Samples, normals: Tensor) -> tuple[Tensor, Tensor]:
     """Unit tangents [S, 3] along u and v of the surface; 0 where u and v are constant."""
     used, inverse = np.unique(samples.triangle, return_inverse=True)
     corners = head.triangles[used]

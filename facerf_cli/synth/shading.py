@@ -13,13 +13,13 @@ from torch import Tensor
 from facerf_cli.synth.appearance.skin import Skin
 
 LOBES = ((1.0, 0.75), (0.55, 0.25))  # skin: (roughness factor, weight) of a broad and of a narrow, oily lobe
+_NORMAL_VARIANCE = 0.18  # largest addition to alpha squared where normals vary within a facet
 _SCATTER_REACH = 6  # texels of the kernel on each side
 _STRAND_LOBES = (
     (-0.12, 1.0),
     (0.17, 2.0),
     (0.06, 0.7),
 )  # hair, R, TRT and TT: (shift to the tip in radians, width factor)
-_UNMASKED = 0.6  # of the white highlight; the rest meets other strands
 _TRANSMITTED, _TRANSMITTED_WIDTH = 0.5, 0.45  # of TT: strength, standard deviation around the strand
 
 
@@ -88,6 +88,27 @@ def two_lobes(cosines: Cosines, specular: Tensor, roughness: Tensor) -> Tensor:
     return total * fresnel * n_dot_l
 
 
+def widened_lobes(
+    normals: Tensor, views: Tensor, lights: Tensor, specular: Tensor, roughness: Tensor, spread: Tensor
+) -> Tensor:
+    """Highlights without shadows [N, L] of facets under lights [L, 3]; normals, views [N, 3] are unit.
+
+    specular, roughness [N]. `spread` [N], the variance of the normals within a facet, widens the lobe
+    (Tokuyoshi and Kaplanyan, *Improved geometric specular antialiasing*, 2019).
+    """
+    l_dot_v = views @ lights.T
+    to_half = (2 + 2 * l_dot_v).clamp_min(1e-6).rsqrt()
+    n_dot_l, n_dot_v = normals @ lights.T, (normals * views).sum(1, keepdim=True)
+    cosines = Cosines(
+        n_dot_l=n_dot_l.clamp_min(0),
+        n_dot_v=n_dot_v.clamp_min(0.05),
+        n_dot_h=((n_dot_l + n_dot_v) * to_half).clamp(0, 1),
+        v_dot_h=((1 + l_dot_v) * to_half).clamp(0, 1),
+    )
+    widened = roughness**4 + (2 * spread).clamp_max(_NORMAL_VARIANCE)
+    return two_lobes(cosines, specular[:, None], widened[:, None] ** 0.25)
+
+
 def _smith(cosine: Tensor, alpha_squared: Tensor) -> Tensor:
     """2 cosine / G1, with Smith's masking G1 of equation 34 of Walter et al."""
     return cosine + (alpha_squared + (1 - alpha_squared) * cosine**2).sqrt()
@@ -131,11 +152,14 @@ def strand_highlights(hair: Strands, lights: Tensor) -> tuple[Tensor, Tensor]:
     fresnel = hair.specular[:, None] + (1 - hair.specular[:, None]) * (1 - incidence) ** 5
     around = math.pi * cos_l * cos_half_phi / (4 * cos_difference**2)
     half, width = (theta_l + theta_v) / 2, (hair.roughness[:, None] ** 2).clamp_min(0.06)
-    white, coloured, through = (_gaussian(half - shift, width * spread) for shift, spread in _STRAND_LOBES)
+    # Half a Gaussian: the half angle changes half as fast as the angle over which a lobe integrates to 1.
+    white, coloured, through = (
+        _gaussian(half - shift, width * spread) / 2 for shift, spread in _STRAND_LOBES
+    )
     behind = _gaussian(math.pi - cos_phi.acos(), torch.tensor(_TRANSMITTED_WIDTH))
     through = _TRANSMITTED * math.pi * cos_l / cos_difference**2 * behind * through
-    tinted = hair.specular[:, None] * around * coloured + through
-    return _UNMASKED * fresnel * around * white, (1 - fresnel) ** 2 * tinted
+    tinted = (1 - fresnel) ** 2 * hair.specular[:, None] * around * coloured
+    return fresnel * around * white, tinted + (1 - hair.specular[:, None]) ** 2 * through
 
 
 def _gaussian(angle: Tensor, sigma: Tensor) -> Tensor:

@@ -28,9 +28,12 @@ from facerf_cli.synth import bake_renderer, path_tracer
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, StageCamera, stage_cameras
 from facerf_cli.synth.subjects import Subject, subject_model
+from facerf_cli.synth.truth import truth_of
 
 Renderer = Literal["bake", "mitsuba"]
 _TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
+TRUTH = "truth"  # folder of a subject with the true layers of each camera
+EVEN_LIGHT = 4.0  # sum of the weights of a rig's lights under a map of radiance 1
 _LEAST_FACING = -0.2  # cosine to a camera below which a vertex is not baked
 _BAKE = BakeSettings()
 
@@ -153,17 +156,28 @@ def _visible_vertices(mesh: HeadMesh, cameras: tuple[StageCamera, ...]) -> np.nd
 def write_subject(
     folder: Path, subject: Subject, settings: StageSettings, transport_path: Path | None
 ) -> None:
-    """Write `folder`/CAMERA/LIGHT.exr and subject.json atomically, and the bake to `transport_path`."""
+    """Write `folder`/CAMERA/LIGHT.exr, truth/CAMERA.exr and subject.json atomically, and the bake to a path.
+
+    The colour of the truth is that of the person under an even white light of radiance 1.
+    """
     model = subject_model(settings.face_model)
     metadata = Provenance(**model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE).attributes()
     cameras, transport = photograph_subject(subject, settings)
     with atomic_path(folder) as unfinished:
         for camera, images in enumerate(cameras):
+            even = images.sum(0).permute(1, 2, 0).numpy() * (EVEN_LIGHT / len(images))
+            truth = truth_of(subject.mesh, subject.appearance, stage_cameras(settings.size_px)[camera])
+            write_exr(unfinished / TRUTH / f"C{camera}.exr", even, layers=truth.layers(), metadata=metadata)
             for light, image in enumerate(images.permute(0, 2, 3, 1).numpy()):
                 write_exr(unfinished / f"C{camera}" / f"L{light:03d}.exr", image, metadata=metadata)
         if transport_path and transport:
             _save_transport(transport_path, subject, transport, settings)
-        record = {"traits": subject.traits, "landmarks_world": subject.landmarks_world.tolist()}
+        record = {
+            "traits": subject.traits,
+            "head_to_world": subject.head_to_world.tolist(),
+            "landmarks_world": subject.landmarks_world.tolist(),
+            "more_landmarks_world": subject.more_landmarks_world,
+        }
         write_document(unfinished / "subject.json", record)
 
 

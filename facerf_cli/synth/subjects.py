@@ -20,6 +20,7 @@ from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.headwear import draw_headwear
 from facerf_cli.synth.head.mesh import HeadMesh, joined
+from facerf_cli.synth.truth import more_landmarks
 
 _POSE_STD_DEG = (6.0, 4.0, 2.0)  # yaw, pitch and roll of subjects who look ahead
 _GAZE_STD_DEG = 6.0
@@ -35,6 +36,7 @@ class Subject:
     head_to_world: Tensor  # [3, 3]
     face_vertices: Tensor  # [GRID * GRID, 3] of the canonical mesh, head frame
     landmarks_world: np.ndarray  # [68, 3], m
+    more_landmarks_world: dict[str, list[float]]  # of `truth.more_landmarks`, m
     traits: dict[str, Any]
 
 
@@ -68,8 +70,9 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     worn = [draw_glasses(bare, landmarks_m, random)] if glasses else []
     worn += [headwear.mesh] if headwear else []
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
-    mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), head_to_world.numpy())
-    landmarks_world = landmarks_m @ head_to_world.numpy().T
+    turn = head_to_world.numpy()
+    mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), turn)
+    more = {name: (place @ turn.T).round(6).tolist() for name, place in more_landmarks(bare).items()}
     traits = appearance.traits | {
         "hair": style.name,
         "garment": garment,
@@ -79,7 +82,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
         "pose_deg": pose_deg.round(3).tolist(),
         "gaze_deg": gaze.round(3).tolist(),
     }
-    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_world, traits)
+    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_m @ turn.T, more, traits)
 
 
 def _canvas_side(size_px: int) -> int:

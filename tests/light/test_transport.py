@@ -254,3 +254,16 @@ def test_strands_share_the_light_and_surroundings_of_those_near() -> None:
     sites = bake.site_of[hair]
     assert len(np.unique(sites)) < 0.25 * hair.sum()
     assert np.abs(vertices[bake.sites[sites]] - vertices[hair]).max() < 0.03
+
+
+def test_hair_lets_some_light_through_and_a_roof_does_not() -> None:
+    x, y, z = np.eye(3)
+    floor = _tessellated(np.zeros(3), z, x, 5)
+    for lifted, hair_roof, expected in ((0.1, True, 0.12), (0.1, False, 0.0)):
+        roof = _tessellated(np.array([-0.5, lifted, -0.5]), 2 * z, 2 * x, 3)
+        vertices, normals, triangles = _joined(floor, roof)
+        hair = (vertices[:, 1] > 0) & hair_roof
+        bake = bake_mesh(
+            vertices, normals, triangles, y[None], BakeSettings(light_radius_deg=0), two_sided=hair
+        )
+        np.testing.assert_allclose(bake.visibility[0][vertices[:, 1] == 0], expected, atol=1e-6)

@@ -3,7 +3,15 @@ import math
 import torch
 
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit
+from facerf_cli.synth.shading import (
+    Strands,
+    diffuse_irradiance,
+    highlights,
+    scatter,
+    strand_highlights,
+    tilt_normals,
+    unit,
+)
 
 
 def _skin(side: int = 4, specular: float = 0.04, roughness: float = 0.5) -> Skin:
@@ -77,3 +85,28 @@ def test_skins_span_light_to_dark_and_repeat_with_their_seed() -> None:
         (1, 2)
     )
     assert (red_over_blue > 1).float().mean() > 0.7  # skin is warm; a share wears random colours
+
+
+def test_hair_glows_against_the_light_and_tints_it() -> None:
+    tangents = torch.tensor([[0.0, -1, 0]])
+    views = torch.tensor([[0.0, 0, 1]])
+    hair = Strands(tangents, views, torch.tensor([0.046]), torch.tensor([0.4]))
+    ahead, aside, behind = (
+        torch.tensor([[0.0, 0, 1]]),
+        torch.tensor([[1.0, 0, 0]]),
+        torch.tensor([[0.0, 0, -1]]),
+    )
+    white, coloured = (
+        torch.stack(lobes)
+        for lobes in zip(*(strand_highlights(hair, light) for light in (ahead, aside, behind)), strict=True)
+    )
+    assert white[0] > white[1] > white[2] >= 0
+    assert coloured[2] > 10 * coloured[0] and coloured[2] > 10 * coloured[1]
+    # TT alone, of light from all around: half of what a strand of width 1 receives, without Fresnel's share.
+    turn = torch.linspace(-torch.pi, torch.pi, 721)[:-1]
+    around = torch.stack([turn.sin(), 0 * turn, turn.cos()], -1)
+    rise = torch.linspace(-1.5, 1.5, 301)
+    lights = torch.cat([around * a.cos() + torch.tensor([0.0, 1, 0]) * a.sin() for a in rise])
+    area = rise.cos().repeat_interleave(720) * (3 / 300) * (2 * torch.pi / 720)
+    _, coloured = strand_highlights(hair, lights)
+    assert 0.3 < float((coloured[0] * area).sum()) / torch.pi < 0.6

@@ -10,7 +10,7 @@ from facerf_cli.synth.appearance.people import People
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, places_mm, plain_noise
 
 _CORNERS = ((36, 39), (42, 45))  # landmarks of the eyes' corners
-_IRIS_DEG = 29.0  # edge of the iris, from the gaze axis
+IRIS_DEG = 29.0  # edge of the iris, from the gaze axis
 _RADIUS_MM = 12.0  # of the eyeball
 # Colours of irises, linear Rec.709.
 _BROWN, _AMBER = (0.055, 0.026, 0.012), (0.16, 0.085, 0.030)
@@ -46,14 +46,14 @@ def eyeball_textures(
     redness = float(torch.rand((), generator=generator) ** 2)
     sclera = _sclera(side, angle, redness, float(people.age[0]), generator)
     iris = _iris(angle, turn, pupil_deg, colours[0], generator)
-    edge = torch.sigmoid((_IRIS_DEG - angle) / 0.7)
+    edge = torch.sigmoid((IRIS_DEG - angle) / 0.7)
     albedo = sclera + edge * (iris - sclera)
     wet = torch.ones(1, side, side)
     relief = 0.01 * torch.cat([plain_noise((side, side), 14, generator) for _ in range(2)])
-    relief = relief * (angle > _IRIS_DEG)
+    relief = relief * (angle > IRIS_DEG)
     pupil_mm = 2 * _RADIUS_MM * math.radians(pupil_deg)
     traits: dict[str, float | str | bool] = {"iris": names[0], "pupil_mm": round(pupil_mm, 2)}
-    roughness = torch.where(angle < _IRIS_DEG, 0.08, 0.14)[None]
+    roughness = torch.where(angle < IRIS_DEG, 0.08, 0.14)[None]
     return (albedo.clamp(0.003, 0.9), 0.03 * wet, roughness, relief), traits
 
 
@@ -77,7 +77,7 @@ def _iris(
         bend = float(torch.randn((), generator=generator)) * 0.04
         fibres = fibres + torch.cos(waves * turn + phase + bend * angle) * (31 / waves) ** 0.5
     fibres = 1 + 0.14 * fibres
-    out = ((angle - pupil_deg) / (_IRIS_DEG - pupil_deg)).clamp(0, 1)
+    out = ((angle - pupil_deg) / (IRIS_DEG - pupil_deg)).clamp(0, 1)
     collarette = 0.35 * torch.exp(-(((out - 0.25) / 0.15) ** 2))
     rim = 1 - 0.75 * torch.sigmoid((out - 0.86) * 22)
     warm = torch.tensor([1.25, 1.0, 0.75]).view(3, 1, 1)

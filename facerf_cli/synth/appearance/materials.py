@@ -175,7 +175,7 @@ def _cloth(generator: torch.Generator) -> tuple[Material, str]:
     weave = torch.randn(1, side, side, generator=generator)
     albedo = _dye(generator) * (1 + 0.06 * weave)
     if kind == "heather":
-        albedo = albedo * (1 + 0.25 * weave)
+        albedo = albedo * (1 + 0.12 * weave)
     if kind in ("stripes", "check"):
         phase = torch.arange(side).view(1, -1, 1) / side * round(_uniform(8, 24, generator))
         stripe = torch.sigmoid(12 * (torch.sin(2 * torch.pi * phase) - _uniform(-0.6, 0.6, generator)))

@@ -1,7 +1,7 @@
 """Hats, caps, beanies and headscarves that fit a synthetic head.
 
-Every piece encloses the skull at a distance off the hull of the bare head, down to an edge whose height depends
-on the azimuth. Hair under it lies flat, and hair that would pierce it is left out. The hat is MakeHuman's.
+Every piece encloses the skull at a distance off the hull of the bare head, down to an edge whose height
+depends on the azimuth. Hair under it lies flat, and hair that would pierce it is left out.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Glasses sit in front of the eyes and off the skin; clothes lie around the neck."""
+"""Glasses sit in front of the eyes and off the skin."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ import trimesh
 
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.synth.bake_heads import mean_coefficients
-from facerf_cli.synth.head import clothes, glasses
-from facerf_cli.synth.head.clothes import GARMENTS, draw_clothes
+from facerf_cli.synth.head import glasses
+from facerf_cli.synth.head.body import chin_height_m, draw_body
 from facerf_cli.synth.head.glasses import GLASSES, draw_glasses
+from facerf_cli.synth.head.headwear import draw_headwear
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 
 
@@ -55,28 +56,12 @@ def test_glasses_sit_in_front_of_the_eyes_and_not_in_the_skin(
         assert covered.mean() < 0.01
 
 
-@pytest.mark.parametrize("kind", GARMENTS)
-def test_clothes_lie_outside_the_neck_and_reach_the_shoulders(
-    head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(clothes, "GARMENTS", (kind,))
-    cloth = draw_clothes(head, np.random.default_rng(3))
-    require_sound(cloth, "cloth")
-    assert 0.38 < np.ptp(cloth.vertices[:, 0]) < 0.48
-    chin = -0.0755
-    assert abs(cloth.vertices[:, 1].min() - (chin - 0.16)) < 0.015
-    assert cloth.vertices[:, 1].max() < chin + 0.02
-    skin = head.vertices[head.part == PARTS.index("skin")].astype(float)
-    normals = head.normals[head.part == PARTS.index("skin")].astype(float)
-    low = skin[:, 1] < chin - 0.075
-    assert low.sum() > 100
-    shell = trimesh.Trimesh(cloth.vertices, cloth.triangles, process=False)
-    covered = shell.ray.intersects_any(skin[low] + 1e-4 * normals[low], normals[low])
-    assert covered.mean() > 0.99
-
-
 def test_the_same_numbers_give_the_same_things(head: HeadMesh, landmarks: np.ndarray) -> None:
-    for draw in (lambda r: draw_glasses(head, landmarks, r), lambda r: draw_clothes(head, r)):
+    for draw in (
+        lambda r: draw_glasses(head, landmarks, r),
+        lambda r: draw_body(head, r)[0],
+        lambda r: draw_headwear(head, chin_height_m(head), r).mesh,
+    ):
         first, second, other = (draw(np.random.default_rng(seed)) for seed in (1, 1, 2))
         assert np.array_equal(first.vertices, second.vertices)
         assert np.array_equal(first.triangles, second.triangles)

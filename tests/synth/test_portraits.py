@@ -1,0 +1,125 @@
+"""Portraits shade as the bake renderer does, under any lights and appearance."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from facerf_cli.errors import InputError
+from facerf_cli.light.mesh_transport import bake_mesh
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.raster.camera import Camera, pose_to_rotation
+from facerf_cli.synth import bake_renderer
+from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.bake_renderer import RenderSettings
+from facerf_cli.synth.head.labels import class_index
+from facerf_cli.synth.head.mesh import PARTS, joined, strandless
+from facerf_cli.synth.portraits import Portrait, bake_portrait, load_portrait, photograph, save_portrait
+from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.subjects import Subject
+
+LIGHTS = rig_directions(24).numpy().astype(np.float64)
+BAKE = BakeSettings(light_radius_deg=0, bounce_samples=8)
+SIDE_PX = 48
+
+
+def appearance(albedo: tuple[float, float, float] = (0.5, 0.4, 0.3)) -> Appearance:
+    one = torch.ones(1, 8, 8)
+    material = Material(
+        torch.tensor(albedo).view(3, 1, 1) * one, 0.04 * one, 0.45 * one, torch.zeros(2, 8, 8)
+    )
+    return Appearance(dict.fromkeys(PARTS, material), torch.zeros(3), {})
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    """A ball of skin beside a board of hair, turned a little."""
+    ball = trimesh.creation.icosphere(4, 0.05)
+    points = np.array(ball.vertices)
+    skin = strandless("skin", points, points, np.array(ball.faces), np.full((len(points), 2), 0.5))
+    grid = np.stack(np.meshgrid(np.linspace(-0.06, 0.06, 25), np.linspace(-0.06, 0.06, 25)), -1).reshape(
+        -1, 2
+    )
+    wall = np.column_stack([grid[:, 0], grid[:, 1], np.full(len(grid), -0.055)])
+    cells = np.arange(625).reshape(25, 25)[:-1, :-1].ravel()
+    faces = np.concatenate(
+        [np.stack([cells, cells + 1, cells + 26], -1), np.stack([cells, cells + 26, cells + 25], -1)]
+    )
+    hair = strandless("hair", wall, np.broadcast_to([0, 0, 1.0], wall.shape), faces, np.full((625, 2), 0.5))
+    hair = replace(hair, tangents=np.broadcast_to(np.float32([0, -1, 0]), wall.shape).copy())
+    turn = pose_to_rotation(10, 5, 0)
+    return Subject(
+        joined(skin, hair), appearance(), turn, torch.zeros(1, 3), np.zeros((68, 3)), {"a": [0, 0.02, 0]}, {}
+    )
+
+
+@pytest.fixture(scope="module")
+def camera() -> StageCamera:
+    lens = Camera(SIDE_PX * 10 / 0.14, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
+    return StageCamera(lens, pose_to_rotation(-15, 0, 0), torch.tensor([0.0, 0, -10.0]))
+
+
+@pytest.fixture(scope="module")
+def portrait(subject: Subject, camera: StageCamera) -> Portrait:
+    return bake_portrait(subject, camera, LIGHTS, BAKE, 0)
+
+
+def weights(seed: int) -> torch.Tensor:
+    return torch.rand(24, 3, generator=torch.Generator().manual_seed(seed)) ** 4 / 6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_shades_as_the_bake_renderer_does(
+    subject: Subject, camera: StageCamera, portrait: Portrait, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.synth.portraits._HIGHLIGHTS", 24)
+    mesh, other = subject.mesh, appearance((0.3, 0.3, 0.3))
+    transport = bake_mesh(
+        mesh.vertices,
+        mesh.normals,
+        mesh.triangles,
+        LIGHTS,
+        BAKE,
+        0,
+        two_sided=mesh.part == PARTS.index("hair"),
+    )
+    settings = RenderSettings(bounces=1, scattering=False, relief=False)
+    olats, _ = bake_renderer.photograph(mesh, other, transport, camera, settings)
+    expected = torch.einsum("lchw,lc->chw", olats, weights(seed))
+    photo = photograph(portrait, other, weights(seed))
+    # Bytes of irradiance and smooth harmonics of the bounce, whose white balls tint it by one mean albedo.
+    off = (photo.image - expected).abs()
+    assert off.mean() < 0.015 * expected.mean()
+    # On the rim of the ball a facet spans many angles, and the mean of products is not that of the factors.
+    assert off.flatten().quantile(0.99) < 0.04 * expected.max()
+
+
+def test_truth_lies_beside_the_photo(portrait: Portrait) -> None:
+    photo = photograph(portrait, appearance(), weights(0))
+    assert photo.image.shape == photo.albedo.shape == photo.normals.shape == (3, SIDE_PX, SIDE_PX)
+    background = photo.classes[class_index("background")]
+    assert (photo.alpha + background - 1).abs().max() < 0.15  # other samples of a pixel
+    assert (photo.alpha + background - 1).abs().mean() < 0.01
+    inside = photo.alpha > 0.99
+    assert torch.allclose(photo.albedo[0][inside], torch.tensor(0.5), atol=2e-3)
+    assert (photo.image[:, photo.alpha == 0] == 0).all()
+
+
+def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: Portrait) -> None:
+    assert torch.allclose(portrait.landmarks_px[:68], torch.tensor([SIDE_PX / 2, SIDE_PX / 2]), atol=1e-3)
+    assert float(portrait.landmarks_px[68, 1]) == pytest.approx(SIDE_PX / 2 - 0.02 / 0.14 * SIDE_PX, abs=0.05)
+    assert torch.allclose(portrait.rotation, pose_to_rotation(-15, 0, 0) @ subject.head_to_world, atol=1e-6)
+
+
+def test_a_file_gives_the_same_portrait_and_another_is_refused(portrait: Portrait, tmp_path: Path) -> None:
+    path = tmp_path / "one.safetensors"
+    save_portrait(path, portrait)
+    again = load_portrait(path)
+    assert torch.equal(again.direct, portrait.direct) and again.side_px == SIDE_PX
+    path.write_bytes(b"something else")
+    with pytest.raises(InputError, match="not a portrait"):
+        load_portrait(path)

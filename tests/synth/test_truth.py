@@ -1,0 +1,98 @@
+"""The truth of an image: matte, classes, surface and material of known shapes; places of irises and ears."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+import trimesh
+
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.raster.camera import Camera, pose_to_rotation
+from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.bake_heads import mean_coefficients
+from facerf_cli.synth.head.heads import build_head
+from facerf_cli.synth.head.labels import CLASSES, class_index
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
+from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.truth import more_landmarks, truth_of
+
+SIDE_PX, RADIUS_M, FAR_M = 64, 0.05, 10.0
+
+
+def camera(yaw_deg: float = 0.0) -> StageCamera:
+    lens = Camera(SIDE_PX * FAR_M / 0.12, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
+    return StageCamera(lens, pose_to_rotation(yaw_deg, 0, 0), torch.tensor([0.0, 0, -FAR_M]))
+
+
+def halves() -> HeadMesh:
+    """A ball whose right half is hair to the classes."""
+    ball = trimesh.creation.icosphere(5, RADIUS_M)
+    points = np.array(ball.vertices)
+    mesh = strandless("skin", points, points, np.array(ball.faces), np.full((len(points), 2), 0.5))
+    return replace(mesh, label=np.where(points[:, 0] > 0, class_index("hair"), class_index("skin")))
+
+
+def painted() -> Appearance:
+    one = torch.ones(1, 8, 8)
+    colour = torch.tensor([0.6, 0.4, 0.2]).view(3, 1, 1) * one
+    return Appearance(
+        dict.fromkeys(PARTS, Material(colour, 0.03 * one, 0.4 * one, torch.zeros(2, 8, 8))),
+        torch.zeros(3),
+        {},
+    )
+
+
+def test_layers_of_a_ball_are_those_of_geometry() -> None:
+    truth = truth_of(halves(), painted(), camera())
+    assert abs(truth.alpha.sum() - np.pi * (RADIUS_M / 0.12 * SIDE_PX) ** 2) < 0.01 * truth.alpha.sum()
+    assert ((truth.alpha > 0) & (truth.alpha < 1)).sum() > 60
+    np.testing.assert_allclose(truth.classes.sum(-1), 1, atol=1e-6)
+    middle = SIDE_PX // 2
+    inside = np.hypot(*(np.mgrid[-middle:middle, -middle:middle] + 0.5)) < 20
+    left, right = inside.copy(), inside.copy()
+    left[:, middle - 1 :], right[:, : middle + 1] = False, False
+    assert (truth.classes[left][:, class_index("skin")] > 0.99).all()
+    assert (truth.classes[right][:, class_index("hair")] > 0.99).all()
+    np.testing.assert_allclose(
+        truth.albedo[inside], np.broadcast_to([0.6, 0.4, 0.2], (inside.sum(), 3)), atol=1e-5
+    )
+    np.testing.assert_allclose(truth.specular[inside], 0.03, atol=1e-6)
+    centre = truth.positions_m - [0, 0, -FAR_M]
+    np.testing.assert_allclose(np.linalg.norm(centre, axis=-1)[inside], RADIUS_M, atol=3e-4)
+    cosines = (truth.normals * centre).sum(-1)[inside] / RADIUS_M
+    assert cosines.min() > 0.99
+    depth = truth.layers()["depth.Z"][inside]
+    assert abs(depth.min() - (FAR_M - RADIUS_M)) < 3e-4
+
+
+def test_normals_and_positions_are_in_camera_space() -> None:
+    turned = truth_of(halves(), painted(), camera(90.0))
+    middle = SIDE_PX // 2
+    # The head's left half in the image, skin, turns to the camera when the head turns to the right.
+    assert turned.classes[middle, middle, class_index("skin")] > 0.99
+    np.testing.assert_allclose(turned.normals[middle, middle], [0, 0, 1], atol=0.03)
+    assert turned.positions_m[middle, middle, 2] > -FAR_M + 0.9 * RADIUS_M
+
+
+def test_layers_have_the_names_of_all_classes() -> None:
+    layers = truth_of(halves(), painted(), camera()).layers()
+    assert {f"class.{name}" for name in CLASSES} < set(layers) and "person.A" in layers
+    assert all(np.isfinite(layer).all() for layer in layers.values())
+
+
+def test_irises_follow_the_gaze_and_ears_have_ends() -> None:
+    model = load_face_model()
+    ahead, aside = (
+        more_landmarks(build_head(model, *mean_coefficients(model), gaze, subdivisions=0))
+        for gaze in ((0.0, 0.0), (20.0, 0.0))
+    )
+    for side, sign in (("left", -1), ("right", 1)):
+        iris = ahead[f"{side} iris"]
+        ring = np.stack([ahead[f"{side} iris {k}"] for k in range(8)])
+        assert iris[0] * sign > 0.02 and iris[2] > ring[:, 2].max()
+        spread = np.linalg.norm((ring - ring.mean(0))[:, :2], axis=-1)
+        np.testing.assert_allclose(spread, 0.012 * np.sin(np.radians(29)), atol=0.0012)
+        assert ring[0, 0] > iris[0] + 0.004 and ring[2, 1] > iris[1] + 0.004
+        assert 0.003 < aside[f"{side} iris"][0] - iris[0] < 0.006  # 13 mm sin 20 degrees is 4.4 mm
+        top, lobe, back = (ahead[f"{side} ear {name}"] for name in ("top", "lobe", "back"))
+        assert top[1] > lobe[1] + 0.04 and back[2] < lobe[2]
