@@ -7,8 +7,9 @@ set -euo pipefail
 run=$1 time=${2:-20m} yale=${3:-} shifts=${4:-}
 export OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 dataset=(--dataset "$run/dataset" --texture-size 128)
-joint=("${dataset[@]}" --preset paper --photos "$run/photos"
-    --appearance-features "$run/appearance/best.safetensors" --light-features "$run/light/best.safetensors")
+joint=("${dataset[@]}" --preset paper --appearance-features "$run/appearance/best.safetensors"
+    --light-features "$run/light/best.safetensors")
+photos=(--photos "$run/photos") # they train the Geometry Network
 heads=(--heads-from "$run/ict.npz" --heads 60 --bank "$run/bank")
 
 train() {  # NAME OPTIONS...: a run, measured
@@ -22,9 +23,9 @@ train() {  # NAME OPTIONS...: a run, measured
     fi
 }
 
-train paper "${joint[@]}"
-train without-normals "${joint[@]}" --without-normals
-train mean-face "${joint[@]}" --mean-face
+train paper "${joint[@]}" "${photos[@]}"
+train without-normals "${joint[@]}" "${photos[@]}" --without-normals
+train mean-face "${joint[@]}" "${photos[@]}" --mean-face
 train geometry "${joint[@]}" --geometry landmarks
 train loss --preset paper --stage reflectance "${dataset[@]}"
 train data --preset paper --stage reflectance "${heads[@]}"
