@@ -14,17 +14,20 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.body import chin_height_m, draw_body
+from facerf_cli.synth.head.facial_strands import grow_beard, grow_lashes
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.headwear import draw_headwear
+from facerf_cli.synth.head.held import draw_earrings, draw_hand, draw_microphone
 from facerf_cli.synth.head.mesh import HeadMesh, joined
 from facerf_cli.synth.truth import more_landmarks
 
 _POSE_STD_DEG = (6.0, 4.0, 2.0)  # yaw, pitch and roll of subjects who look ahead
 _GAZE_STD_DEG = 6.0
 _CLOSED_SHARE, _GLASSES_SHARE, _HEADWEAR_SHARE = 0.08, 0.15, 0.15  # with closed eyes, glasses, headwear
+_HELD, _HELD_SHARES, _EARRINGS_SHARE = ("none", "hand", "microphone"), (0.89, 0.08, 0.03), 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,22 +70,31 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
     appearance = with_scalp(appearance, cover, generator)
     glasses = random.random() < _GLASSES_SHARE
-    worn = [draw_glasses(bare, landmarks_m, random)] if glasses else []
+    worn = [grow_lashes(landmarks_m, random)]
+    worn += [beard] if (beard := grow_beard(bare, appearance.traits, random)) else []
+    worn += [draw_glasses(bare, landmarks_m, random)] if glasses else []
     worn += [headwear.mesh] if headwear else []
+    more = more_landmarks(bare)
+    held = str(random.choice(_HELD, p=_HELD_SHARES))
+    worn += [draw_hand(bare, random)] if held == "hand" else []
+    worn += [draw_microphone(random)] if held == "microphone" else []
+    if random.random() < _EARRINGS_SHARE and (not headwear or headwear.kind != "headscarf"):
+        worn.append(draw_earrings([more[name] for name in ("left ear lobe", "right ear lobe")], random))
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
     turn = head_to_world.numpy()
     mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), turn)
-    more = {name: (place @ turn.T).round(6).tolist() for name, place in more_landmarks(bare).items()}
+    more_world = {name: (place @ turn.T).round(6).tolist() for name, place in more.items()}
     traits = appearance.traits | {
         "hair": style.name,
         "garment": garment,
+        "held": held,
         "headwear": headwear.kind if headwear else "none",
         "glasses": glasses,
         "eyes_closed": closed,
         "pose_deg": pose_deg.round(3).tolist(),
         "gaze_deg": gaze.round(3).tolist(),
     }
-    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_m @ turn.T, more, traits)
+    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_m @ turn.T, more_world, traits)
 
 
 def _canvas_side(size_px: int) -> int:

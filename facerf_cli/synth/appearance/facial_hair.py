@@ -124,7 +124,7 @@ def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tens
 
 
 @lru_cache(maxsize=4)
-def _beard_density(window: Window) -> Tensor:
+def beard_density(window: Window) -> Tensor:
     """Density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
     x, y = places_mm(window)
     lower = smooth(_below_edge(window, _BEARD_EDGE) / 20 + 0.5)
@@ -144,7 +144,7 @@ def _beards(people: People, window: Window, generator: torch.Generator) -> tuple
     if not grown:
         return cover, shadow
     patchy = 1 + 0.25 * noise(len(grown), window, 18, generator, octaves=2)
-    ground = _beard_density(window)
+    ground = beard_density(window)
     for index, patch in zip(grown, patchy, strict=True):
         density = ground * patch[None].clamp(0.3, 1.4)
         cover[index], shadow[index] = _beard(people, index, window, density, generator)

@@ -14,7 +14,15 @@ from facerf_cli.light.transport import build_scene, hits_within
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.makehuman import GARMENTS, packed_mesh
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, kept_triangles, smoothstep, strandless
+from facerf_cli.synth.head.mesh import (
+    PARTS,
+    HeadMesh,
+    cloth_like,
+    joined,
+    kept_triangles,
+    smoothstep,
+    strandless,
+)
 from facerf_cli.synth.head.neckwear import draw_neckwear
 from facerf_cli.synth.head.subdivision import loop_step
 
@@ -32,7 +40,6 @@ _TOUCH_M = 0.003  # cloth this near to skin hides it, too, if it lies inside
 _STRIP_M, _KEPT_M = 0.006, 0.016  # skin shows in places wider than a strip; this far around them it is kept
 _STRAPLESS_SHARE, _STRAPLESS_M = 0.05, 0.13  # of people; upper edge of their top below the neck
 _NECKWEAR_SHARE = 0.15  # of people
-_CLOTH_M = 0.5  # size of the texture of cloth on a garment
 _SKIN_V = (1.02, 1.45)  # rows of the skin's texture, from the neck, that the body repeats
 
 
@@ -136,8 +143,7 @@ def _garment(
         lift = smoothstep(vertices[:, 1] - chin_m, *(-level for level in _LIFTED_M))
         short = lift * np.where(facing & (aside < 0.012), np.maximum(_OFF_SKIN_M - off, 0), 0)
         vertices = vertices + short[:, None] * outward[near]
-    uv = np.stack([0.5 + vertices[:, 0] / _CLOTH_M, -vertices[:, 1] / _CLOTH_M], -1)
-    return strandless("cloth", vertices, _normals(vertices, faces), faces, uv)
+    return cloth_like("cloth", vertices, faces)
 
 
 def _without_hidden(skin: HeadMesh, garment: HeadMesh, chin: float) -> HeadMesh:

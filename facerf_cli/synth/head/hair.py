@@ -46,7 +46,7 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     roots, root_normals, margin = _roots(head, style, random)
     if not len(roots):
         none = np.zeros((0, style.segments + 1, 3))
-        return _ribbons(none, none, none[:, 0], style, random)
+        return ribbons(none, none, none[:, 0], style, random)
     hull = hull_of(head)
     length = _lengths(roots, margin, style, random)
     wisps = _Wisps(roots, root_normals, style, hull, random)
@@ -64,7 +64,7 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     paths = hull.lifted(paths, np.minimum(0.0008, 0.02 * np.linspace(0, 1, paths.shape[1])))
     paths[:, 0] = roots - 0.001 * root_normals
     keep = ~_covers_face(paths, style, ragged_m).any(1)
-    return _ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
+    return ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
 
 
 def _roots(
@@ -254,7 +254,7 @@ def _tangents(paths: np.ndarray) -> np.ndarray:
     return unit(np.gradient(paths, axis=1))
 
 
-def _ribbons(
+def ribbons(
     paths: np.ndarray,
     normals: np.ndarray,
     root_normals: np.ndarray,

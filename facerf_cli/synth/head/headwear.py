@@ -7,13 +7,19 @@ depends on the azimuth. Hair under it lies flat, and hair that would pierce it i
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.hair_styles import HairStyle
 from facerf_cli.synth.head.hull import Hull, hull_of
 from facerf_cli.synth.head.makehuman import packed_mesh
-from facerf_cli.synth.head.mesh import HeadMesh, joined, kept_triangles, smoothstep, strandless
+from facerf_cli.synth.head.mesh import (
+    HeadMesh,
+    cloth_like,
+    joined,
+    kept_triangles,
+    ring_surface,
+    smoothstep,
+    strandless,
+)
 from facerf_cli.synth.head.neckwear import draw_wraps
 from facerf_cli.synth.head.subdivision import loop_step
 
@@ -21,7 +27,6 @@ HEADWEAR = ("fedora", "cap", "beanie", "headscarf")
 
 _AROUND, _ROWS = 144, 40  # vertices around and rings of a shell
 _HAIR_M = 0.004  # thickness of the hair below headwear
-_CLOTH_M = 0.5  # size of the texture of cloth
 _FACE_DEG, _FACE_LOW_M = (
     56.0,
     -0.074,
@@ -112,7 +117,7 @@ def _shell(
     rings = np.concatenate(
         [inner, _on_hull(hull, azimuth, arc[:1], off[:1] - 0.001), _on_hull(hull, azimuth, arc, off)]
     )
-    return _surface(rings[::-1])
+    return ring_surface("hat", rings[::-1])
 
 
 def _smooth_around(values: np.ndarray) -> np.ndarray:
@@ -135,7 +140,7 @@ def _visor(
     down = drop * (0.5 * share + 0.6 * side**2 * share) + 0.012 * share**2
     top = base + np.stack([0.25 * ahead * side, -down, ahead], -1)
     under = top - [0, 0.0025, 0]
-    return _surface(np.concatenate([top, under[::-1]]), closed=False)
+    return ring_surface("hat", np.concatenate([top, under[::-1]]), closed=False)
 
 
 def _fedora(hull: Hull, edge_m: tuple[float, float, float], off_m: float) -> HeadMesh:
@@ -154,7 +159,7 @@ def _fedora(hull: Hull, edge_m: tuple[float, float, float], off_m: float) -> Hea
     placed = (vertices - [centre[0], base, centre[2]]) * [wide / half[0], 1.08, deep / half[2]] + middle
     slope = (edge_m[0] - edge_m[2]) / (2 * deep)
     placed[:, 1] += edge_m[1] - 0.004 + slope * (placed[:, 2] - middle[2])
-    return _mesh(placed, faces)
+    return cloth_like("hat", placed, faces)
 
 
 def _headscarf(
@@ -174,10 +179,10 @@ def _headscarf(
     upper = np.where(faced, crown, 0.0)
     arc_up = upper + (0.141 - upper) * share
     fold = 0.0015 * np.sin(9 * azimuth + 14 * share + random.uniform(0, 6.3))
-    shells = [_surface(_on_hull(hull, azimuth, arc_up, off_m + fold)[::-1])]
+    shells = [ring_surface("hat", _on_hull(hull, azimuth, arc_up, off_m + fold)[::-1])]
     under = np.where(faced, bottom - hull.middle[1], 0.0)
     arc_low = under + (low - under) * share
-    shells.append(_surface(_on_hull(hull, azimuth, arc_low, off_m + fold + 0.012 * share)))
+    shells.append(ring_surface("hat", _on_hull(hull, azimuth, arc_low, off_m + fold + 0.012 * share)))
     wraps = draw_wraps(head, chin_m - 0.012, 2, random)
     return _as_hat(joined(*shells, wraps))
 
@@ -186,20 +191,3 @@ def _as_hat(mesh: HeadMesh) -> HeadMesh:
     """The same mesh as part "hat"."""
     like = strandless("hat", mesh.vertices, mesh.normals, mesh.triangles, mesh.uv)
     return replace(mesh, part=like.part, label=like.label)
-
-
-def _surface(rings: np.ndarray, closed: bool = True) -> HeadMesh:
-    """Mesh rings [R, N, 3] that go down and, seen from outside, to the right."""
-    count, around = rings.shape[:2]
-    ids = np.arange(count * around).reshape(count, around)
-    if closed:
-        ids = np.concatenate([ids, ids[:, :1]], 1)
-    upper, lower = ids[:-1], ids[1:]
-    quads = [(upper[:, :-1], lower[:, :-1], upper[:, 1:]), (upper[:, 1:], lower[:, :-1], lower[:, 1:])]
-    return _mesh(rings.reshape(-1, 3), np.concatenate([np.stack(quad, -1).reshape(-1, 3) for quad in quads]))
-
-
-def _mesh(vertices: np.ndarray, faces: np.ndarray) -> HeadMesh:
-    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-    uv = np.stack([0.5 + vertices[:, 0] / _CLOTH_M, 0.5 - vertices[:, 1] / _CLOTH_M], -1)
-    return strandless("hat", vertices, normals, faces, uv)

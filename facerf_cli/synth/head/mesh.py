@@ -3,10 +3,13 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
+from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.labels import part_class
 
 PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame", "hat")  # of HeadMesh.part, by index
+CLOTH_M = 0.5  # size of the texture of cloth
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +95,26 @@ def capped(rings: int, segments: int) -> np.ndarray:
     faces = np.where(faces < segments, 0, np.where(faces >= last, last, faces))
     a, b, c = faces.T
     return faces[(a != b) & (b != c) & (c != a)]
+
+
+def ring_surface(part: str, rings: np.ndarray, closed: bool = True) -> HeadMesh:
+    """Mesh rings [R, N, 3] that go down and, seen from outside, to the right; with a texture for cloth."""
+    count, around = rings.shape[:2]
+    ids = np.arange(count * around).reshape(count, around)
+    if closed:
+        ids = np.concatenate([ids, ids[:, :1]], 1)
+    upper, lower = ids[:-1], ids[1:]
+    quads = [(upper[:, :-1], lower[:, :-1], upper[:, 1:]), (upper[:, 1:], lower[:, :-1], lower[:, 1:])]
+    return cloth_like(
+        part, rings.reshape(-1, 3), np.concatenate([np.stack(q, -1).reshape(-1, 3) for q in quads])
+    )
+
+
+def cloth_like(part: str, vertices: np.ndarray, triangles: np.ndarray) -> HeadMesh:
+    """Make a mesh of one part with smooth normals; its texture lies flat on it, seen from the front."""
+    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(triangles)).numpy()
+    uv = np.stack([0.5 + vertices[:, 0] / CLOTH_M, 0.5 - vertices[:, 1] / CLOTH_M], -1)
+    return strandless(part, vertices, normals, triangles, uv)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

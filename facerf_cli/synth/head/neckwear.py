@@ -1,18 +1,15 @@
 """Turtlenecks and scarves: cloth around the neck of a synthetic head, over its garment."""
 
 import numpy as np
-import torch
 
-from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.hull import Hull, hull_of
-from facerf_cli.synth.head.mesh import HeadMesh, joined, strandless, unit
+from facerf_cli.synth.head.mesh import HeadMesh, joined, ring_surface
 
 NECKWEAR = ("turtleneck", "scarf")
 
 _AROUND = 144  # vertices around the neck
 _ROWS = 26  # rings of a surface
 _FLARE_M = 0.03  # below the chin the neck is at its narrowest
-_CLOTH_M = 0.5  # size of the texture of cloth
 
 
 def draw_neckwear(head: HeadMesh, chin_m: float, random: np.random.Generator) -> HeadMesh:
@@ -67,14 +64,12 @@ def _loft(hull: Hull, chin_m: float, azimuth: np.ndarray, level: np.ndarray, off
     neck = np.maximum(level, chin_m - _FLARE_M)  # further down the shoulders begin
     on_neck = np.stack([far[..., 0], neck, far[..., 2]], -1)
     rings = far - ((hull.height(on_neck) - off)[..., None]) * outward
-    count, around = off.shape
-    ids = np.concatenate([np.arange(count * around).reshape(count, around)] * 2, 1)[:, : around + 1]
-    upper, lower = ids[:-1], ids[1:]
-    quads = [(upper[:, :-1], lower[:, :-1], upper[:, 1:]), (upper[:, 1:], lower[:, :-1], lower[:, 1:])]
-    triangles = np.concatenate([np.stack(quad, -1).reshape(-1, 3) for quad in quads])
-    vertices = rings.reshape(-1, 3)
-    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(triangles)).numpy()
-    if (normals.reshape(rings.shape)[_ROWS // 2] * unit(outward)).sum() < 0:  # rings that go up
-        triangles, normals = triangles[:, ::-1], -normals
-    uv = np.stack([0.5 + vertices[:, 0] / _CLOTH_M, -vertices[:, 1] / _CLOTH_M], -1)
-    return strandless("cloth", vertices, normals, triangles, uv)
+    return ring_surface("cloth", rings if _faces_out(rings, outward) else rings[::-1])
+
+
+def _faces_out(rings: np.ndarray, outward: np.ndarray) -> bool:
+    """Whether rings [R, N, 3] go down on their outer side; outward [N, 3]: away from the neck."""
+    reach = (rings * outward).sum(-1).mean(1)
+    outer = int(reach.argmax())
+    inner = rings[max(outer - 1, 0) : outer + 2, :, 1].mean(1)
+    return bool(inner[0] > inner[-1])
