@@ -67,7 +67,7 @@ def draw_earrings(lobes: list[np.ndarray], random: np.random.Generator) -> HeadM
         if kind == "hoop":
             pieces.append(_hoop(at - [0, size, 0], size))
         else:
-            low = at - [0, 0.0 if kind == "stud" else random.uniform(0.008, 0.025), 0]
+            low = at - [0, 0.0 if kind == "stud" else random.uniform(0.008, 0.018), 0]
             angle = np.linspace(0.02, np.pi - 0.02, 9)[:, None]
             up = np.array([0, 1.0, 0])
             pieces.append(
