@@ -68,7 +68,7 @@ def _loft(hull: Hull, chin_m: float, azimuth: np.ndarray, level: np.ndarray, off
 
 
 def _faces_out(rings: np.ndarray, outward: np.ndarray) -> bool:
-    """Whether rings [R, N, 3] go down on their outer side; outward [N, 3]: away from the neck."""
+    """Test if rings [R, N, 3] go down on their outer side; outward [N, 3]: away from the neck."""
     reach = (rings * outward).sum(-1).mean(1)
     outer = int(reach.argmax())
     inner = rings[max(outer - 1, 0) : outer + 2, :, 1].mean(1)
