@@ -62,8 +62,9 @@ def synth_stage(
     """Photograph synthetic people in a light stage: one light at a time, eight cameras, one exposure.
 
     Writes a capture for `facerf prepare-dataset`: stage.json, and SUBJECT/CAMERA/LIGHT.exr in half floats,
-    scene-linear Rec.709. SUBJECT/truth/CAMERA.exr has the true matte, classes, surface and material. Person number n depends on --seed, n and the face model alone, so a larger
-    --subjects adds people and changes none.
+    scene-linear Rec.709. SUBJECT/truth/CAMERA.exr has the true matte, classes, surface and material.
+    Person number n depends on --seed, n and the face model alone, so a larger --subjects adds people and
+    changes none.
     """
     if transport and renderer != "bake":
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")

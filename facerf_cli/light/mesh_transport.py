@@ -64,21 +64,25 @@ def bake_mesh(
     seed: int = 0,
     wanted: np.ndarray | None = None,
     two_sided: np.ndarray | None = None,
+    clearance_m: np.ndarray | None = None,
 ) -> MeshTransport:
     """Bake the vertices [V, 3] (m) with unit normals [V, 3] of a mesh, lit from unit directions [L, 3].
 
     Only `wanted` [V] bool vertices are baked, by default all, and the visibility of those from which light
-    bounces to them. `two_sided` [V] bool vertices (hair) are lit on both sides, with a single ray per light,
-    and only every `_STRAND_STRIDE`-th of them is traced: they are many, close together and finer than any
-    penumbra. Unless the lights are points, shadows are smoothed by a mean over the edges of a vertex, which
-    removes the zigzag of the triangles from their outlines.
+    bounces to them. Rays start at least `clearance_m` [V] off the surface. `two_sided` [V] bool vertices (hair)
+    are lit on both sides, with a single ray per light, and only every `_STRAND_STRIDE`-th of them is traced:
+    they are many, close together and finer than any penumbra. Unless the lights are points, shadows are smoothed
+    by a mean over the edges of a vertex, which removes the zigzag of the triangles from their outlines.
     """
     count, nothing = len(vertices), np.zeros(len(vertices), bool)
     curve = _along_curve(vertices)  # the order of vertices below: near rays use the same caches
     rank = np.argsort(curve)
     baked = ~nothing if wanted is None else wanted
     strand = nothing if two_sided is None else two_sided
-    surface = MeshSurface.of(vertices[curve], normals[curve], rank[triangles], strand[curve])
+    clearance_m = np.zeros(count) if clearance_m is None else clearance_m
+    surface = MeshSurface.of(
+        vertices[curve], normals[curve], rank[triangles], strand[curve], clearance_m[curve]
+    )
     shifts = np.random.default_rng(seed).random((count, 2), np.float32)[curve]
     strands, traced_strands = rank[np.flatnonzero(strand)], rank[np.flatnonzero(strand)[::_STRAND_STRIDE]]
     near = _nearest_of(surface.vertices, strands, traced_strands)
@@ -127,12 +131,18 @@ class MeshSurface:
 
     @classmethod
     def of(
-        cls, vertices: np.ndarray, normals: np.ndarray, triangles: np.ndarray, two_sided: np.ndarray
+        cls,
+        vertices: np.ndarray,
+        normals: np.ndarray,
+        triangles: np.ndarray,
+        two_sided: np.ndarray,
+        clearance_m: np.ndarray,
     ) -> "MeshSurface":
         """Find the edges of a mesh and build its embree scene."""
         vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
         edges = _edges(triangles, len(vertices))
-        offset_m = _mesh_offset_m(vertices, normals, edges)[:, None]
+        offset_m = np.maximum(_mesh_offset_m(vertices, normals, edges), clearance_m)[:, None]
+        offset_m = offset_m.astype(np.float32)
         edges = edges[~two_sided[edges[:, 0]]]
         both_ways = np.concatenate([edges, edges[:, ::-1]]).T
         ones = np.ones(2 * len(edges), np.float32)

@@ -22,6 +22,7 @@ from facerf_cli.raster.camera import project
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.bake_renderer import irradiance_factors
 from facerf_cli.synth.facets import facets_of
+from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.labels import CLASSES
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, unit, widened_lobes
@@ -93,6 +94,7 @@ def bake_portrait(
         seed,
         wanted=(mesh.normals @ camera.head_to_camera.numpy()[2]) > -0.3,
         two_sided=mesh.part == _HAIR,
+        clearance_m=clearance_m(mesh),
     )
     facets, shares, pixels = facets_of(mesh, subject.appearance, camera, relief=False)
     direct, bounce = irradiance_factors(mesh, transport)

@@ -25,6 +25,7 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.synth import bake_renderer, path_tracer
+from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, StageCamera, stage_cameras
 from facerf_cli.synth.subjects import Subject, subject_model
@@ -134,6 +135,7 @@ def photograph_subject(
         settings.seed,
         wanted=_visible_vertices(mesh, cameras),
         two_sided=mesh.part == PARTS.index("hair"),
+        clearance_m=clearance_m(mesh),
     )
     irradiance = bake_renderer.scattered_irradiance(mesh, appearance, transport)
     images = (

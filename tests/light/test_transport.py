@@ -267,3 +267,16 @@ def test_hair_lets_some_light_through_and_a_roof_does_not() -> None:
             vertices, normals, triangles, y[None], BakeSettings(light_radius_deg=0), two_sided=hair
         )
         np.testing.assert_allclose(bake.visibility[0][vertices[:, 1] == 0], expected, atol=1e-6)
+
+
+def test_rays_clear_a_surface_that_lies_closely_over_another() -> None:
+    x, y, z = np.eye(3)
+    vertices, normals, triangles = _joined(
+        _tessellated(np.zeros(3), z, x, 5), _tessellated(np.array([-0.5, 0.001, -0.5]), 2 * z, 2 * x, 3)
+    )
+    low = vertices[:, 1] == 0
+    for clearance_m, expected in ((None, 0.0), (np.full(len(vertices), 0.0025), 1.0)):
+        bake = bake_mesh(
+            vertices, normals, triangles, y[None], BakeSettings(light_radius_deg=0), clearance_m=clearance_m
+        )
+        assert (bake.visibility[0][low] == expected).all()

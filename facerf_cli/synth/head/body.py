@@ -32,6 +32,7 @@ _NECK_M = 0.025  # height of the chin above the middle of the neck
 _LOW_M = 0.012  # skin of the head this far below the chin is neck
 _DRAWN_M = 0.02  # standard deviation of the distance to the head's skin up to which the body is drawn to it
 _NEAR = 4  # vertices of the body that carry a vertex of a garment
+_OVERLAP_M = 0.0025  # larger than the gap between the skins of neck and body
 _FINE_M = 0.008  # mean length of an edge above which a mesh is subdivided
 _OFF_SKIN_M = 0.004  # distance of cloth from skin
 _LIFTED_M = (0.15, 0.08)  # below the chin; further down cloth may lie in the skin, which is left out there
@@ -75,6 +76,11 @@ def chin_height_m(head: HeadMesh) -> float:
     skin = head.part == PARTS.index("skin")
     nearest = np.linalg.norm(head.uv[skin] - LANDMARK_UV[_CHIN], axis=-1).argmin()
     return max(float(head.vertices[skin][nearest, 1]) - 0.003, _LOWEST_CHIN_M)
+
+
+def clearance_m(person: HeadMesh) -> np.ndarray:
+    """Distance [V] off the surface at which rays must start: neck and body lie closely over each other."""
+    return _OVERLAP_M * (person.label == class_index("neck"))
 
 
 def _neck_depth_m(head: HeadMesh, level_m: float) -> float:

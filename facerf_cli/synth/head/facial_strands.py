@@ -88,7 +88,8 @@ def grow_lashes(landmarks_m: np.ndarray, random: np.random.Generator) -> HeadMes
         lid = CubicSpline(np.linspace(0, 1, 4), landmarks_m[list(ids)])(along)
         eye = landmarks_m[36:42] if ids[0] < 42 else landmarks_m[42:48]
         away = unit((lid - eye.mean(0)) * [1.0, 0.6, 0.0])
-        upward = 1.0 if count == 110 else -1.0
+        opening = float(np.linalg.norm(eye[[1, 2]].mean(0) - eye[[4, 5]].mean(0)))
+        upward = 1.8 * float(smoothstep(np.array(opening), 0.002, 0.007)) - 0.8 if count == 110 else -1.0
         share = np.linspace(0, 1, _LASHES.segments + 1)[:, None, None]
         length = _LASH_M[count] * random.uniform(0.6, 1.1, (count, 1))
         ahead, rise = np.array([0, 0, 1.0]), np.array([0, upward, 0])
