@@ -69,10 +69,10 @@ def bake_mesh(
     """Bake the vertices [V, 3] (m) with unit normals [V, 3] of a mesh, lit from unit directions [L, 3].
 
     Only `wanted` [V] bool vertices are baked, by default all, and the visibility of those from which light
-    bounces to them. Rays start at least `clearance_m` [V] off the surface. `two_sided` [V] bool vertices (hair)
-    are lit on both sides, with a single ray per light, and only every `_STRAND_STRIDE`-th of them is traced:
-    they are many, close together and finer than any penumbra. Unless the lights are points, shadows are smoothed
-    by a mean over the edges of a vertex, which removes the zigzag of the triangles from their outlines.
+    bounces to them. Rays start at least `clearance_m` [V] off the surface. `two_sided` [V] bool vertices
+    (hair) are lit on both sides, with a single ray per light, and only every `_STRAND_STRIDE`-th of them is
+    traced: they are many, close together and finer than any penumbra. Unless the lights are points, shadows
+    are smoothed by a mean over the edges of a vertex, which removes the zigzag of the triangles.
     """
     count, nothing = len(vertices), np.zeros(len(vertices), bool)
     curve = _along_curve(vertices)  # the order of vertices below: near rays use the same caches
