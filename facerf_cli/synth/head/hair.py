@@ -7,14 +7,17 @@ that hangs in front of the face is grown a second time, shorter. Heights and azi
 (`face.topology`).
 """
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 from facerf_cli.synth.head.hair_styles import HairStyle, draw_style, scalp_margin_m
+from facerf_cli.synth.head.hair_tails import ROWS, tail_paths, tied
 from facerf_cli.synth.head.headwear import Headwear
 from facerf_cli.synth.head.hull import Hull, hull_of
 from facerf_cli.synth.head.labels import part_class
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, smoothstep, unit
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, smoothstep, unit
 
 MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
 
@@ -57,6 +60,8 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     last = np.maximum(first - 0.7, 0.3) / style.segments
     length = length * np.where(covers.any(1), last**style.crowding, 1)
     paths = wisps.grow(length)
+    if style.comb == "tied":
+        paths = tied(paths, hull, style.knot_mm / 1000, style.layer_mm / 1000)
     leader = _leaders(roots, style, random)
     paths = _clumped(paths, leader, style, random)
     normals = hull.normals(paths)
@@ -64,7 +69,15 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     paths = hull.lifted(paths, np.minimum(0.0008, 0.02 * np.linspace(0, 1, paths.shape[1])))
     paths[:, 0] = roots - 0.001 * root_normals
     keep = ~_covers_face(paths, style, ragged_m).any(1)
-    return ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
+    hair = ribbons(paths[keep], normals[keep], root_normals[keep], style, random)
+    return joined(hair, _tail(head, style, hull, random)) if style.tail else hair
+
+
+def _tail(head: HeadMesh, style: HairStyle, hull: Hull, random: np.random.Generator) -> HeadMesh:
+    """Grow the ponytail, bun or braids of a style."""
+    paths, normals = tail_paths(style.tail, head.vertices, hull, style.knot_mm / 1000, random)
+    shape = replace(style, segments=ROWS - 1, crowding=1.0)
+    return ribbons(paths, normals, normals[:, 0], shape, random)
 
 
 def _roots(
@@ -175,6 +188,8 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
         direction[:, 2] -= 0.5 * (y < 0.08) * (z > 0)  # temples: downward, not in front of the face
     elif style.comb == "back":
         direction = np.stack([0.12 * side, -0.2 - 0.3 * (1 - front), -1 + 0.3 * front], -1)
+    elif style.comb == "tied":
+        direction = unit(np.array([0, style.knot_mm / 1000, -0.09]) - points)
     elif style.comb == "fringe":
         ahead = smoothstep((roots[:, 2] - 0.02) / 0.03) * (np.abs(roots[:, 0]) < 0.055)
         away = np.clip(x / 0.03, -1, 1)

@@ -7,11 +7,27 @@ import numpy as np
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M
 
-STYLES = ("bald", "buzz", "short", "parted", "swept", "fringe", "bob", "long", "wavy", "curly", "receding")
-_FREQUENCIES = (0.06, 0.10, 0.14, 0.13, 0.08, 0.10, 0.10, 0.11, 0.08, 0.06, 0.04)  # of `STYLES`
+# The styles, and how often they are drawn.
+_FREQUENCIES = {
+    "bald": 0.06,
+    "buzz": 0.09,
+    "short": 0.12,
+    "parted": 0.11,
+    "swept": 0.06,
+    "fringe": 0.08,
+    "bob": 0.09,
+    "long": 0.10,
+    "wavy": 0.07,
+    "curly": 0.05,
+    "afro": 0.03,
+    "receding": 0.04,
+    "tied": 0.07,
+    "braided": 0.03,
+}
+STYLES = tuple(_FREQUENCIES)
 
 # Fields of each style: a value, a range (low, high) to draw from, or a [list] to choose from. The side_mm of
-# "curly" is a fraction of its top_mm.
+# "curly" and "afro" is a fraction of their top_mm.
 _STYLE_FIELDS: dict[str, dict[str, Any]] = {
     "bald": {"wisps": 0},
     "buzz": {
@@ -149,6 +165,53 @@ _STYLE_FIELDS: dict[str, dict[str, Any]] = {
         "clump_wisps": 5,
         "frizz_mm": 2.5,
     },
+    "afro": {
+        "comb": "out",
+        "wisps": 8_600,
+        "segments": 14,
+        "edge": 0.7,
+        "top_mm": (45, 85),
+        "side_mm": (0.8, 1),
+        "layer_mm": 100,
+        "lift": 1.0,
+        "gravity": 0,
+        "width_mm": (1.8, 2.3),
+        "curl_mm": (2.0, 3.5),
+        "wave_mm": (9, 15),
+        "stray": 0.7,
+        "clump": (0.1, 0.3),
+        "clump_wisps": 4,
+        "frizz_mm": 3.0,
+    },
+    "tied": {
+        "comb": "tied",
+        "tail": ["ponytail", "bun"],
+        "wisps": 13_000,
+        "segments": 7,
+        "top_mm": 230,
+        "side_mm": 200,
+        "edge": 1.0,
+        "layer_mm": (4, 9),
+        "lift": (0.2, 0.5),
+        "gravity": 0,
+        "stray": 0.05,
+        "frizz_mm": (0.2, 0.6),
+        "knot_mm": (30, 120),
+    },
+    "braided": {
+        "comb": "parted",
+        "tail": "braids",
+        "wisps": 12_000,
+        "segments": 8,
+        "top_mm": (120, 150),
+        "side_mm": (60, 90),
+        "edge": 0.95,
+        "layer_mm": (6, 11),
+        "lift": 0.3,
+        "gravity": 0.9,
+        "parting_mm": (-6, 6),
+        "tuck": 1.0,
+    },
 }
 # The hairline: height in metres at an azimuth in degrees from the nose, the same on both sides of the head.
 # `forehead_mm` and `recession_mm` of a style are added to the first heights; the ear lies between 75 and
@@ -165,7 +228,9 @@ class HairStyle:
     """Cut and comb of one person's hair; every field is a number or a name, so that it can be recorded."""
 
     name: str = "short"
-    comb: str = "whorl"  # whorl, parted, back, fringe or out
+    comb: str = "whorl"  # whorl, parted, back, fringe, out or tied
+    tail: str = ""  # ponytail, bun or braids
+    knot_mm: float = 60.0  # height of the knot to which hair is tied
     wisps: int = 14_000
     segments: int = 7  # of a wisp
     top_mm: float = 40.0  # length on top of the head
@@ -192,7 +257,7 @@ class HairStyle:
 
 def draw_style(random: np.random.Generator, name: str | None = None) -> HairStyle:
     """Draw a random style, or a random variant of the style `name`."""
-    drawn = str(random.choice(STYLES, p=np.array(_FREQUENCIES) / sum(_FREQUENCIES)))
+    drawn = str(random.choice(STYLES, p=np.array(list(_FREQUENCIES.values())) / sum(_FREQUENCIES.values())))
     name = drawn if name is None else name
     if name not in _STYLE_FIELDS:
         raise ValueError(f"hair style {name!r}: unknown; choose one of {', '.join(STYLES)}")
@@ -218,7 +283,7 @@ def draw_style(random: np.random.Generator, name: str | None = None) -> HairStyl
         width_mm=between(0.8, 1.2),
     )
     own = {field: drawn_from(value) for field, value in _STYLE_FIELDS[name].items()}
-    if name == "curly":
+    if name in ("curly", "afro"):
         own["side_mm"] *= own["top_mm"]
     return replace(common, **own)
 

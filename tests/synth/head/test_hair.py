@@ -1,11 +1,14 @@
 """Hair grows on the scalp only and leaves the face visible."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from facerf_cli.face.topology import cylinder_uv
 from facerf_cli.synth.head.hair import draw_hair, grow_hair
 from facerf_cli.synth.head.hair_styles import STYLES, HairStyle, draw_style, scalp_cover, scalp_margin_m
+from facerf_cli.synth.head.hair_tails import ROWS, tail_paths
 from facerf_cli.synth.head.hull import hull_of
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 
@@ -25,6 +28,11 @@ def grown(head: HeadMesh, name: str, seed: int = 5) -> tuple[HairStyle, HeadMesh
     return style, grow_hair(head, style, random)
 
 
+def without_tail(head: HeadMesh, style: HairStyle, hair: HeadMesh) -> tuple[HairStyle, HeadMesh]:
+    """The hair of a style on the head itself."""
+    return style, grow_hair(head, replace(style, tail=""), np.random.default_rng(5)) if style.tail else hair
+
+
 @pytest.mark.parametrize("name", HAIRY)
 def test_every_style_is_a_sound_mesh_of_bounded_size(hairs: Hairs, name: str) -> None:
     style, hair = hairs[name]
@@ -40,8 +48,10 @@ def test_every_style_is_a_sound_mesh_of_bounded_size(hairs: Hairs, name: str) ->
 
 
 @pytest.mark.parametrize("name", HAIRY)
-def test_hair_is_rooted_on_the_scalp_and_not_on_ears_face_or_neck(hairs: Hairs, name: str) -> None:
-    style, hair = hairs[name]
+def test_hair_is_rooted_on_the_scalp_and_not_on_ears_face_or_neck(
+    head: HeadMesh, hairs: Hairs, name: str
+) -> None:
+    style, hair = without_tail(head, *hairs[name])
     roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
     assert (scalp_margin_m(roots, style) > -0.012).all()
     azimuth = np.abs(np.degrees(np.arctan2(roots[:, 0], roots[:, 2])))
@@ -60,7 +70,7 @@ def test_eyes_nose_and_mouth_are_seen_from_the_front(hairs: Hairs, name: str) ->
 
 @pytest.mark.parametrize("name", HAIRY)
 def test_no_hair_passes_through_the_skin_or_floats_far_away(head: HeadMesh, hairs: Hairs, name: str) -> None:
-    style, hair = hairs[name]
+    style, hair = without_tail(head, *hairs[name])
     free = hair.vertices[hair.uv[:, 1] > 0.5].astype(float)
     height = hull_of(head).height(free)
     assert np.quantile(height, 0.005) > -0.003
@@ -107,3 +117,28 @@ def test_the_cover_of_the_scalp_is_where_roots_are_and_not_on_the_face(hairs: Ha
     roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
     assert scalp_cover(cylinder_uv(roots), style).mean() > 0.8
     assert (scalp_cover(np.array([[0.5, 0.3], [0.3, 0.5], [0.5, 0.9]]), style) == 0).all()
+
+
+def test_tied_hair_ends_in_its_knot_and_lies_on_the_head(head: HeadMesh) -> None:
+    random = np.random.default_rng(3)
+    style = replace(draw_style(random, "tied"), tail="", frizz_mm=0.0, curl_mm=0.0)
+    hair = grow_hair(head, style, random)
+    tips = hair.vertices[hair.uv[:, 1] == 1].astype(float)
+    knot = np.median(tips, axis=0)
+    assert abs(knot[1] - style.knot_mm / 1000) < 0.01 and knot[2] < -0.06
+    assert (np.linalg.norm(tips - knot, axis=-1) < 0.015).mean() > 0.95
+    assert hull_of(head).height(hair.vertices.astype(float)).max() < 0.02
+
+
+@pytest.mark.parametrize("tail", ["ponytail", "bun", "braids"])
+def test_tails_hang_where_they_are_tied(head: HeadMesh, tail: str) -> None:
+    paths, normals = tail_paths(tail, head.vertices, hull_of(head), 0.06, np.random.default_rng(4))
+    assert paths.shape == normals.shape and paths.shape[1:] == (ROWS, 3)
+    assert np.isfinite(paths).all()
+    first, last = paths[:, 0].mean(0), paths[:, -1]
+    if tail == "braids":
+        assert {-1.0, 1.0} == set(np.sign(paths[:, 0, 0])) and np.abs(paths[:, 0, 0]).min() > 0.05
+        assert last[:, 1].max() < -0.15 and np.ptp(last[last[:, 0] > 0], axis=0).max() < 0.03
+    else:
+        assert first[2] < -0.07 and hull_of(head).height(paths.reshape(-1, 3)).min() > -0.03
+        assert (last[:, 1].mean() < -0.05) == (tail == "ponytail")
