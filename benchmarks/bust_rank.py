@@ -8,11 +8,11 @@ functions of the light direction that a class needs. `maps` weighs the lights as
 what the pixels look like under 100 maps at random rotations.
 """
 
-import argparse
 import time
 
 import numpy as np
 import torch
+from _common import arguments
 
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
@@ -58,7 +58,7 @@ def needed(rows: np.ndarray) -> list[int]:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__doc__)
     parser.add_argument("--people", type=int, default=8)
     parser.add_argument("--face-model", default="builtin")
     options = parser.parse_args()

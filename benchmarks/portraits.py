@@ -7,11 +7,11 @@ Columns of the sheet: even light, light as in training with another skin and oth
 side, a lamp behind; classes, matte, albedo and normals.
 """
 
-import argparse
 import time
 
 import numpy as np
 import torch
+from _common import arguments
 from PIL import Image
 
 from facerf_cli.light.mesh_transport import bake_mesh
@@ -76,7 +76,7 @@ def twin_s(subject: Subject, camera: StageCamera, directions: np.ndarray) -> flo
 
 def main() -> None:
     """Print the times and write the sheet."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = arguments(__doc__)
     parser.add_argument("--people", type=int, default=2)
     parser.add_argument("--face-model", default="builtin")
     parser.add_argument("--sheet", default="")
