@@ -10,6 +10,7 @@ from facerf_cli.cli.options import DryRunOption, OutputOption, OverwriteOption, 
 from facerf_cli.errors import UsageError
 
 Renderer = Literal["bake", "mitsuba"]
+Frame = Literal["head", "bust"]
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,7 @@ class SynthStage:
     face_model: str
     renderer: Renderer
     lights: int
+    frame: Frame
     transport: bool
     batch: BatchOptions
     settings: Settings
@@ -50,6 +52,9 @@ def synth_stage(
     lights: Annotated[
         int, typer.Option(min=4, max=1000, help="Use so many lights, uniform on the sphere.")
     ] = 150,
+    frame: Annotated[
+        Frame, typer.Option(help="Show the head down to the collar, or a bust down to the chest.")
+    ] = "head",
     transport: Annotated[
         bool, typer.Option("--transport", help="Keep the baked transport in transport/SUBJECT.safetensors.")
     ] = False,
@@ -72,5 +77,5 @@ def synth_stage(
 
     batch = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
-    work = SynthStage(subjects, size, face_model, renderer, lights, transport, batch, settings)
+    work = SynthStage(subjects, size, face_model, renderer, lights, frame, transport, batch, settings)
     raise typer.Exit(photograph_people(work))

@@ -27,7 +27,7 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.synth import bake_renderer, path_tracer
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, StageCamera, stage_cameras
+from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, Frame, StageCamera, stage_cameras
 from facerf_cli.synth.subjects import Subject, subject_model
 from facerf_cli.synth.truth import truth_of
 
@@ -48,6 +48,7 @@ class StageSettings:
     renderer: Renderer = "bake"
     lights: int = RIG_LIGHTS
     seed: int = 0
+    frame: Frame = "head"
 
 
 def light_directions(settings: StageSettings) -> np.ndarray:
@@ -59,7 +60,7 @@ def describe_stage(settings: StageSettings) -> dict[str, Any]:
     """Build the content of stage.json, without subjects."""
     flip = np.diag([1.0, -1.0, -1.0])  # to OpenCV axes
     cameras = []
-    for index, view in enumerate(stage_cameras(settings.size_px)):
+    for index, view in enumerate(stage_cameras(settings.size_px, settings.frame)):
         pose = np.column_stack([view.head_to_camera.double().numpy(), view.translation_m.double().numpy()])
         focal, centre = view.camera.focal_px, view.camera.cx_px
         cameras.append(
@@ -121,7 +122,7 @@ def photograph_subject(
     subject: Subject, settings: StageSettings
 ) -> tuple[Iterator[Tensor], MeshTransport | None]:
     """Render linear images [L, 3, H, W], one camera at a time; return them and the bake, if there is one."""
-    directions, cameras = light_directions(settings), stage_cameras(settings.size_px)
+    directions, cameras = light_directions(settings), stage_cameras(settings.size_px, settings.frame)
     mesh, appearance = subject.mesh, subject.appearance
     if settings.renderer == "mitsuba":
         images = (path_tracer.photograph(mesh, appearance, directions, camera)[0] for camera in cameras)
@@ -168,7 +169,8 @@ def write_subject(
     with atomic_path(folder) as unfinished:
         for camera, images in enumerate(cameras):
             even = images.sum(0).permute(1, 2, 0).numpy() * (EVEN_LIGHT / len(images))
-            truth = truth_of(subject.mesh, subject.appearance, stage_cameras(settings.size_px)[camera])
+            view = stage_cameras(settings.size_px, settings.frame)[camera]
+            truth = truth_of(subject.mesh, subject.appearance, view)
             write_exr(unfinished / TRUTH / f"C{camera}.exr", even, layers=truth.layers(), metadata=metadata)
             for light, image in enumerate(images.permute(0, 2, 3, 1).numpy()):
                 write_exr(unfinished / f"C{camera}" / f"L{light:03d}.exr", image, metadata=metadata)

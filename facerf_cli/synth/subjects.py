@@ -19,11 +19,13 @@ from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
-from facerf_cli.synth.head.headwear import draw_headwear
+from facerf_cli.synth.head.headwear import Headwear, draw_headwear
 from facerf_cli.synth.head.held import draw_earrings, draw_hand, draw_microphone
 from facerf_cli.synth.head.mesh import HeadMesh, joined
 from facerf_cli.synth.truth import more_landmarks
 
+_SMALL_PX = 96  # images up to this side show coarse meshes
+_BODY_EDGE_M = 0.008  # mean length of an edge of body and garment, in larger images
 _POSE_STD_DEG = (6.0, 4.0, 2.0)  # yaw, pitch and roll of subjects who look ahead
 _GAZE_STD_DEG = 6.0
 _CLOSED_SHARE, _GLASSES_SHARE, _HEADWEAR_SHARE = 0.08, 0.15, 0.15  # with closed eyes, glasses, headwear
@@ -64,22 +66,13 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     face_vertices = model.vertices(alpha[None], beta[None])[0]
     landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
-    dressed, garment = draw_body(bare, random)
+    dressed, garment = draw_body(bare, random, _BODY_EDGE_M if size_px > _SMALL_PX else 3 * _BODY_EDGE_M)
     headwear = draw_headwear(bare, chin_height_m(bare), random) if random.random() < _HEADWEAR_SHARE else None
     hair, style = draw_hair(dressed, random, headwear)
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
     appearance = with_scalp(appearance, cover, generator)
-    glasses = random.random() < _GLASSES_SHARE
-    worn = [grow_lashes(landmarks_m, random)]
-    worn += [beard] if (beard := grow_beard(bare, appearance.traits, random)) else []
-    worn += [draw_glasses(bare, landmarks_m, random)] if glasses else []
-    worn += [headwear.mesh] if headwear else []
+    worn, seen = _worn(bare, landmarks_m, appearance, headwear, random)
     more = more_landmarks(bare)
-    held = str(random.choice(_HELD, p=_HELD_SHARES))
-    worn += [draw_hand(bare, random)] if held == "hand" else []
-    worn += [draw_microphone(random)] if held == "microphone" else []
-    if random.random() < _EARRINGS_SHARE and (not headwear or headwear.kind != "headscarf"):
-        worn.append(draw_earrings([more[name] for name in ("left ear lobe", "right ear lobe")], random))
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
     turn = head_to_world.numpy()
     mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), turn)
@@ -87,14 +80,37 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     traits = appearance.traits | {
         "hair": style.name,
         "garment": garment,
-        "held": held,
         "headwear": headwear.kind if headwear else "none",
-        "glasses": glasses,
+        **seen,
         "eyes_closed": closed,
         "pose_deg": pose_deg.round(3).tolist(),
         "gaze_deg": gaze.round(3).tolist(),
     }
     return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_m @ turn.T, more_world, traits)
+
+
+def _worn(
+    bare: HeadMesh,
+    landmarks_m: np.ndarray,
+    appearance: Appearance,
+    headwear: Headwear | None,
+    random: np.random.Generator,
+) -> tuple[list[HeadMesh], dict[str, Any]]:
+    """Draw what a head wears and holds before it, with lashes and beard; return also the traits."""
+    beard = grow_beard(bare, appearance.traits, random)
+    meshes = [grow_lashes(landmarks_m, random), *([beard] if beard else [])]
+    glasses, held = random.random() < _GLASSES_SHARE, str(random.choice(_HELD, p=_HELD_SHARES))
+    if glasses:
+        meshes.append(draw_glasses(bare, landmarks_m, random))
+    if headwear:
+        meshes.append(headwear.mesh)
+    if held != "none":
+        meshes.append(draw_hand(bare, random) if held == "hand" else draw_microphone(random))
+    lobes = [place for name, place in more_landmarks(bare).items() if name.endswith("ear lobe")]
+    earrings = random.random() < _EARRINGS_SHARE and (not headwear or headwear.kind != "headscarf")
+    if earrings and lobes:
+        meshes.append(draw_earrings(lobes, random))
+    return meshes, {"glasses": glasses, "held": held, "earrings": earrings}
 
 
 def _canvas_side(size_px: int) -> int:
@@ -104,7 +120,7 @@ def _canvas_side(size_px: int) -> int:
 
 def _subdivisions(size_px: int) -> int:
     """Number of subdivisions of the head mesh that make its edges about a pixel long."""
-    return 0 if size_px <= 96 else 1 if size_px <= 384 else 2
+    return 0 if size_px <= _SMALL_PX else 1 if size_px <= 384 else 2
 
 
 def _eyes_closed(model: MorphableModel, beta: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ def photograph_people(options: SynthStage) -> int:
         load_mitsuba()
     batch, settings = options.batch, options.settings
     stage = StageSettings(
-        options.size_px, options.face_model, options.renderer, options.lights, settings.seed
+        options.size_px, options.face_model, options.renderer, options.lights, settings.seed, options.frame
     )
     folders = [batch.output / f"{index:04d}" for index in range(options.subjects)]
     items = [Item(folder, folder, folder.name) for folder in folders]

@@ -33,7 +33,6 @@ _LOW_M = 0.012  # skin of the head this far below the chin is neck
 _DRAWN_M = 0.02  # standard deviation of the distance to the head's skin up to which the body is drawn to it
 _NEAR = 4  # vertices of the body that carry a vertex of a garment
 _OVERLAP_M = 0.0025  # larger than the gap between the skins of neck and body
-_FINE_M = 0.008  # mean length of an edge above which a mesh is subdivided
 _OFF_SKIN_M = 0.004  # distance of cloth from skin
 _LIFTED_M = (0.15, 0.08)  # below the chin; further down cloth may lie in the skin, which is left out there
 _UNDER_M = (0.08, 0.05)  # cloth outside of skin, and inside of it, within these distances hides it
@@ -44,7 +43,7 @@ _NECKWEAR_SHARE = 0.15  # of people
 _SKIN_V = (1.02, 1.45)  # rows of the skin's texture, from the neck, that the body repeats
 
 
-def draw_body(head: HeadMesh, random: np.random.Generator, edge_m: float = _FINE_M) -> tuple[HeadMesh, str]:
+def draw_body(head: HeadMesh, random: np.random.Generator, edge_m: float = 0.008) -> tuple[HeadMesh, str]:
     """Draw the upper body and a garment for a bare head; return all as one mesh, and the garment's name.
 
     The meshes are subdivided until their edges are shorter than `edge_m` on average.
