@@ -200,7 +200,8 @@ def _hair(people: People, generator: torch.Generator) -> Material:
     wisps = _HAIR_WISPS
     melanin = torch.exp(0.18 * torch.randn(wisps, generator=generator))
     grey = people.grey[0]
-    white = (torch.rand(wisps, generator=generator) * 0.6 + 0.2 < grey).float() * 0.6 + 0.4 * grey
+    mixed = 0.3 * (grey * (1 - grey)).sqrt()  # a wisp is of many hairs, white ones among them
+    white = (grey + mixed * torch.randn(wisps, generator=generator)).clamp(0, 1)
     tip = torch.linspace(1.1, _uniform(0.55, 1.0, generator), 64)[:, None]
     eumelanin = people.hair_eumelanin[0] * melanin * tip
     albedo = hair_albedo(eumelanin, people.hair_pheomelanin[0] * melanin * tip, white.expand(64, -1))
