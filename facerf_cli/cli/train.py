@@ -248,7 +248,11 @@ def train(
     ] = None,
     bf16: Annotated[
         bool | None,
-        _speed("--bf16/--no-bf16", help="Train in mixed precision.", show_default="on; paper and tiny off"),
+        _speed(
+            "--bf16/--no-bf16",
+            help="Train in mixed precision.",
+            show_default="on; presets paper and tiny, and --form paper, off",
+        ),
     ] = None,
     compile_model: Annotated[
         bool, _speed("--compile", help="Compile the networks with torch; the first steps take minutes.")
@@ -274,6 +278,7 @@ def train(
         max_time = _DEFAULT_TIME
     training = preset_of(preset, stage)
     optimizer = training.optimizer
+    form = form or ("paper" if preset == "paper" else "default")
     training = replace(
         training,
         steps=steps,
@@ -283,7 +288,7 @@ def train(
         optimizer=replace(optimizer, learning_rate=learning_rate or optimizer.learning_rate),
         batch=batch or training.batch,
         validate_every=validate_every or training.validate_every,
-        bf16=training.bf16 if bf16 is None else bf16,
+        bf16=training.bf16 and form != "paper" if bf16 is None else bf16,  # its gradients overflow
     )
     from facerf_cli.cli.items.train_run import run_training
 
@@ -291,7 +296,7 @@ def train(
         TrainOptions(
             output=output,
             preset=preset,
-            form=form or ("paper" if preset == "paper" else "default"),
+            form=form,
             stage=stage,
             training=training,
             resume=resume,

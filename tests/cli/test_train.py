@@ -5,6 +5,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from facerf_cli.cli.items import train_run
+from facerf_cli.cli.train import TrainOptions
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
@@ -240,3 +242,21 @@ def test_feature_networks_of_another_scale_are_refused(
     again = [*line, "--stage", "light-features", "--start-from", light[1], "-o", str(tmp_path / "again")]
     assert main([*again, "--texture-size", "40"]) == 1
     assert "trained on images of 48 px, here they have 40" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ((), True),
+        (("--form", "paper"), False),
+        (("--preset", "tiny"), False),
+        (("--form", "paper", "--bf16"), True),
+    ],
+)
+def test_the_papers_form_trains_in_full_precision_by_default(
+    line: tuple[str, ...], expected: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[TrainOptions] = []
+    monkeypatch.setattr(train_run, "run_training", seen.append)
+    assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "builtin", *line]) == 0
+    assert seen[0].training.bf16 is expected
