@@ -22,7 +22,7 @@ from facerf_cli.synth import bake_renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.head.labels import CLASSES
 from facerf_cli.synth.head.mesh import PARTS
-from facerf_cli.synth.portraits import Portrait, bake_portrait, photograph
+from facerf_cli.synth.portraits import BakedPortrait, bake_portrait, photograph
 from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.texture_samples import draw_light
@@ -34,7 +34,7 @@ PALETTE = (
 )
 
 
-def lamp(portrait: Portrait, azimuth_deg: float, elevation_deg: float) -> torch.Tensor:
+def lamp(portrait: BakedPortrait, azimuth_deg: float, elevation_deg: float) -> torch.Tensor:
     """Weights [L, 3] of a lamp with a little light from all around."""
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     toward = [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)]
@@ -48,7 +48,9 @@ def shown(image: torch.Tensor) -> np.ndarray:
     return np.asarray((image / white).clamp(0, 1).permute(1, 2, 0).numpy() ** (1 / 2.2))
 
 
-def row(portrait: Portrait, own: Appearance, other: Appearance, generator: torch.Generator) -> np.ndarray:
+def row(
+    portrait: BakedPortrait, own: Appearance, other: Appearance, generator: torch.Generator
+) -> np.ndarray:
     """One person of the sheet."""
     even = torch.full((LIGHTS, 3), 4 / LIGHTS)
     lights = ((even, own), (draw_light(portrait.directions, generator), other))

@@ -1,4 +1,4 @@
-"""Portraits for training: whole people whose light, skin and clothes are drawn anew for every photo.
+"""Portraits for training: whole people whose light, skin and clothes differ in every photo.
 
 `bake_portrait` photographs a person once and keeps what does not depend on light and appearance: the facets
 of the image with their surface, and how much of each rig light reaches them. `photograph` shades them with
@@ -37,7 +37,7 @@ _HAIR = PARTS.index("hair")
 
 
 @dataclass(frozen=True, eq=False)
-class Portrait:
+class BakedPortrait:
     """One image [S, S] of a person, as N facets: parts of the mesh in a pixel; vectors in camera space.
 
     pixel [N] int32, row by row; share [N] float16 of the pixel; part [N] uint8; uv [N, 2] float32 of the
@@ -82,7 +82,7 @@ class PortraitPhoto:
 
 def bake_portrait(
     subject: Subject, camera: StageCamera, directions: np.ndarray, settings: BakeSettings, seed: int
-) -> Portrait:
+) -> BakedPortrait:
     """Bake what a camera sees of a person under lights from world-space `directions` [L, 3]."""
     mesh = subject.mesh
     transport = bake_mesh(
@@ -108,7 +108,7 @@ def bake_portrait(
     landmarks = np.concatenate([subject.landmarks_world, list(subject.more_landmarks_world.values())])
     landmarks_camera = torch.from_numpy(landmarks).float() @ rotation.T + camera.translation_m
     owner = np.repeat(pixels, np.diff(shares.indptr))
-    return Portrait(
+    return BakedPortrait(
         pixel=torch.from_numpy(owner).int(),
         share=torch.from_numpy(shares.data).half(),
         part=facets.part.byte(),
@@ -126,7 +126,7 @@ def bake_portrait(
     )
 
 
-def photograph(portrait: Portrait, appearance: Appearance, weights: Tensor) -> PortraitPhoto:
+def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor) -> PortraitPhoto:
     """Shade a portrait under weights [L, 3] of its lights; no light scatters under the skin."""
     part = portrait.part.long()
     surface = sample(appearance, part, portrait.uv)
@@ -169,17 +169,17 @@ def photograph(portrait: Portrait, appearance: Appearance, weights: Tensor) -> P
     return PortraitPhoto(image, alpha, classes, albedo, unit(normal, 0))
 
 
-def save_portrait(path: Path, portrait: Portrait) -> None:
+def save_portrait(path: Path, portrait: BakedPortrait) -> None:
     """Write a portrait, whole or not at all."""
     tensors = {field.name: getattr(portrait, field.name).contiguous() for field in fields(portrait)}
     with atomic_path(path) as temporary:
         save_file(tensors, temporary)
 
 
-def load_portrait(path: Path) -> Portrait:
+def load_portrait(path: Path) -> BakedPortrait:
     """Read a portrait; raise InputError where the file is not one."""
     try:
-        portrait = Portrait(**load_file(path))
+        portrait = BakedPortrait(**load_file(path))
     except Exception as error:  # safetensors raises its own kinds
         raise InputError(f"{path}: not a portrait; bake it again ({type(error).__name__})") from None
     if portrait.classes.shape[-1] != len(CLASSES):

@@ -1,4 +1,4 @@
-"""What a photo of a synthetic person truly shows, pixel by pixel: matte, classes, surface and material.
+"""True layers of a photo of a synthetic person: matte, classes, surface and material.
 
 Further landmarks than the 68 of `face.topology` have names: centres and outlines of the irises, and ears.
 """

@@ -18,7 +18,7 @@ from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.mesh import PARTS, joined, strandless
-from facerf_cli.synth.portraits import Portrait, bake_portrait, load_portrait, photograph, save_portrait
+from facerf_cli.synth.portraits import BakedPortrait, bake_portrait, load_portrait, photograph, save_portrait
 from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject
 
@@ -64,7 +64,7 @@ def camera() -> StageCamera:
 
 
 @pytest.fixture(scope="module")
-def portrait(subject: Subject, camera: StageCamera) -> Portrait:
+def portrait(subject: Subject, camera: StageCamera) -> BakedPortrait:
     return bake_portrait(subject, camera, LIGHTS, BAKE, 0)
 
 
@@ -74,7 +74,7 @@ def weights(seed: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_it_shades_as_the_bake_renderer_does(
-    subject: Subject, camera: StageCamera, portrait: Portrait, seed: int, monkeypatch: pytest.MonkeyPatch
+    subject: Subject, camera: StageCamera, portrait: BakedPortrait, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("facerf_cli.synth.portraits._HIGHLIGHTS", 24)
     mesh, other = subject.mesh, appearance((0.3, 0.3, 0.3))
@@ -98,7 +98,7 @@ def test_it_shades_as_the_bake_renderer_does(
     assert off.flatten().quantile(0.99) < 0.04 * expected.max()
 
 
-def test_truth_lies_beside_the_photo(portrait: Portrait) -> None:
+def test_truth_lies_beside_the_photo(portrait: BakedPortrait) -> None:
     photo = photograph(portrait, appearance(), weights(0))
     assert photo.image.shape == photo.albedo.shape == photo.normals.shape == (3, SIDE_PX, SIDE_PX)
     background = photo.classes[class_index("background")]
@@ -109,13 +109,15 @@ def test_truth_lies_beside_the_photo(portrait: Portrait) -> None:
     assert (photo.image[:, photo.alpha == 0] == 0).all()
 
 
-def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: Portrait) -> None:
+def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: BakedPortrait) -> None:
     assert torch.allclose(portrait.landmarks_px[:68], torch.tensor([SIDE_PX / 2, SIDE_PX / 2]), atol=1e-3)
     assert float(portrait.landmarks_px[68, 1]) == pytest.approx(SIDE_PX / 2 - 0.02 / 0.14 * SIDE_PX, abs=0.05)
     assert torch.allclose(portrait.rotation, pose_to_rotation(-15, 0, 0) @ subject.head_to_world, atol=1e-6)
 
 
-def test_a_file_gives_the_same_portrait_and_another_is_refused(portrait: Portrait, tmp_path: Path) -> None:
+def test_a_file_gives_the_same_portrait_and_another_is_refused(
+    portrait: BakedPortrait, tmp_path: Path
+) -> None:
     path = tmp_path / "one.safetensors"
     save_portrait(path, portrait)
     again = load_portrait(path)

@@ -1,4 +1,4 @@
-"""What is tied off the head: ponytails, buns and braids, as paths of wisps that begin at a knot."""
+"""Ponytails, buns and braids of hair: paths of wisps that begin at a knot."""
 
 import numpy as np
 from scipy.spatial import cKDTree
