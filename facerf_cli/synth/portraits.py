@@ -32,7 +32,7 @@ from facerf_cli.synth.truth import truth_of
 
 _BOUNCE_ORDER = 3  # of the spherical harmonics that hold bounced light
 _HIGHLIGHTS = 12  # only the brightest lights have highlights
-_LEAST_COSINE = 0.05  # below it a facet's visibility is not told from its irradiance
+_LEAST_COSINE = 0.05  # below it a facet's visibility cannot be derived from its irradiance
 _HAIR = PARTS.index("hair")
 
 

@@ -71,8 +71,9 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     hair, style = draw_hair(dressed, random, headwear)
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
     appearance = with_scalp(appearance, cover, generator)
-    worn, seen = _worn(bare, landmarks_m, appearance, headwear, random)
     more = more_landmarks(bare)
+    lobes = [place for name, place in more.items() if name.endswith("ear lobe")]
+    worn, seen = _worn(bare, landmarks_m, lobes, appearance, headwear, random)
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
     turn = head_to_world.numpy()
     mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), turn)
@@ -92,6 +93,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
 def _worn(
     bare: HeadMesh,
     landmarks_m: np.ndarray,
+    lobes: list[np.ndarray],
     appearance: Appearance,
     headwear: Headwear | None,
     random: np.random.Generator,
@@ -106,7 +108,6 @@ def _worn(
         meshes.append(headwear.mesh)
     if held != "none":
         meshes.append(draw_hand(bare, random) if held == "hand" else draw_microphone(random))
-    lobes = [place for name, place in more_landmarks(bare).items() if name.endswith("ear lobe")]
     earrings = random.random() < _EARRINGS_SHARE and (not headwear or headwear.kind != "headscarf")
     if earrings and lobes:
         meshes.append(draw_earrings(lobes, random))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from facerf_cli.synth.head.hair_styles import HairStyle
-from facerf_cli.synth.head.hull import Hull, hull_of
+from facerf_cli.synth.head.hull import RADIUS_M, Hull, hull_of
 from facerf_cli.synth.head.makehuman import packed_mesh
 from facerf_cli.synth.head.mesh import (
     HeadMesh,
@@ -83,7 +83,7 @@ def _edge(edge_m: tuple[float, float, float], azimuth: np.ndarray) -> np.ndarray
 
 def _on_hull(hull: Hull, azimuth: np.ndarray, arc_m: np.ndarray, off_m: np.ndarray) -> np.ndarray:
     """Points [..., 3] off the hull at azimuths and arcs above its middle (below it: heights)."""
-    elevation = np.maximum(arc_m, 0) / 0.09
+    elevation = np.maximum(arc_m, 0) / RADIUS_M
     level = np.minimum(arc_m, 0)
     outward = np.stack(
         [np.cos(elevation) * np.sin(azimuth), np.sin(elevation), np.cos(elevation) * np.cos(azimuth)], -1

@@ -1,6 +1,7 @@
 """Things that hide parts of a face or hang beside it: a hand at cheek or chin, a microphone, earrings."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from facerf_cli.synth.head.hull import hull_of
 from facerf_cli.synth.head.labels import class_index
@@ -22,8 +23,9 @@ def draw_hand(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
     vertices = step @ vertices
     side = float(random.choice([-1, 1]))
     fingers = unit(np.array([-0.3 * side, 1.0, random.uniform(-0.5, -0.1)]))
-    turned = vertices @ _turn(_HAND_DIRECTION, fingers).T
-    turned = turned @ _about(fingers, random.uniform(0, 2 * np.pi)).T * [side, 1, 1]
+    upright, _ = Rotation.align_vectors(fingers, _HAND_DIRECTION)
+    spun = Rotation.from_rotvec(random.uniform(0, 2 * np.pi) * fingers)
+    turned = (spun * upright).apply(vertices) * [side, 1, 1]
     if side < 0:
         faces = faces[:, [0, 2, 1]]
     azimuth = side * np.radians(random.uniform(8, 50))
@@ -107,16 +109,3 @@ def _rings(centres: np.ndarray, along: np.ndarray, radii: np.ndarray) -> np.ndar
     turn = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     circle = np.cos(turn)[:, None] * ahead - np.sin(turn)[:, None] * across
     return centres[:, None] + radii[:, None] * circle
-
-
-def _turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """The smallest rotation [3, 3] from one unit vector to another."""
-    axis, cosine = np.cross(start, end), float(start @ end)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
-
-
-def _about(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation [3, 3] by an angle in radians about a unit axis."""
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross

@@ -15,7 +15,7 @@ from facerf_cli.synth.head.mesh import PARTS, HeadMesh, unit
 
 _AZIMUTHS = 96
 _ARC_M = 0.004  # height of a cell
-_RADIUS_M = 0.09  # arc per radian of elevation
+RADIUS_M = 0.09  # arc per radian of elevation
 _LOWEST_M = -0.36  # arc of the lowest row
 _MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skull, above the ears
 _SLICE_M = (0.07, 0.09)  # range of heights in which front and back of the skull are measured
@@ -61,7 +61,7 @@ class Hull:
         x, y, z = np.moveaxis(points - self.middle, -1, 0)
         level = np.hypot(x, z)
         above = np.maximum(y, 0)
-        arc = np.where(y > 0, _RADIUS_M * np.arctan2(above, level), y)
+        arc = np.where(y > 0, RADIUS_M * np.arctan2(above, level), y)
         return np.hypot(level, above), np.arctan2(x, z) % (2 * np.pi), arc
 
 
@@ -73,7 +73,7 @@ def hull_of(head: HeadMesh) -> Hull:
     points = np.concatenate([*sampled, *((coarse[:, k] + coarse[:, k - 1]) / 2 for k in range(3))])
     hull = Hull(_middle(points), np.zeros((1, _AZIMUTHS)))
     out, azimuth, arc = hull._coordinates(points)
-    rows = int((np.pi / 2 * _RADIUS_M - _LOWEST_M) / _ARC_M) + 2
+    rows = int((np.pi / 2 * RADIUS_M - _LOWEST_M) / _ARC_M) + 2
     row = np.clip(np.rint((arc - _LOWEST_M) / _ARC_M).astype(int), 0, rows - 1)
     column = np.rint(azimuth / (2 * np.pi) * _AZIMUTHS).astype(int) % _AZIMUTHS
     radius = np.zeros((rows, _AZIMUTHS))
