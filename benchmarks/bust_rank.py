@@ -17,9 +17,9 @@ from _common import arguments
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth import bake_renderer
-from facerf_cli.synth.head.labels import CLASSES
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import draw_subject, subject_model

@@ -26,7 +26,6 @@ from torch import Tensor
 
 from facerf_cli.composite import Composition
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
@@ -35,6 +34,7 @@ from facerf_cli.metrics import light_error_deg
 from facerf_cli.models import DEFAULT_CHECKPOINT, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.training.pretrained import load_features
 
 TURNS_DEG = (0, 120)  # of each map

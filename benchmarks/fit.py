@@ -23,11 +23,11 @@ from facerf_cli.composite import Composition, Target
 from facerf_cli.evaluation.protocols.yale_b_cases import Sitter, face_mask
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.images import read_image
 from facerf_cli.models import Models, load_models
 from facerf_cli.pipeline import fit_photo
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera, project
 
 SUBJECTS = ["yaleB05", "yaleB15", "yaleB22"]  # of which normals are measured, unless --all

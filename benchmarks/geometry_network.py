@@ -24,13 +24,13 @@ from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FitSettings, fit_batch, fit_problem
 from facerf_cli.face.fit_start import FitStart, better_start, start_states
 from facerf_cli.face.gauss_newton import FitState, Problem, minimise, residuals, total_cost
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.models import load_models
 from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.synth.face_crops import RenderedFaces
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings

@@ -17,10 +17,10 @@ from PIL import Image
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth import bake_renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
-from facerf_cli.synth.head.labels import CLASSES
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.portraits import BakedPortrait, bake_portrait, photograph
 from facerf_cli.synth.stage_cameras import StageCamera

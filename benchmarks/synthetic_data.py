@@ -17,11 +17,12 @@ import numpy as np
 import torch
 from _common import MAPS, arguments, print_header, print_row, required
 
-from facerf_cli.face.landmarks import detect_landmarks, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.light.sphere import latlong_solid_angles
 from facerf_cli.metrics import TONES, tone_of
+from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.camera import project
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky
 from facerf_cli.synth.stage_cameras import stage_cameras
@@ -67,7 +68,7 @@ def report_people(capture: Path) -> None:
 def landmark_errors(subject: Path) -> tuple[float, float] | None:
     """Mean error of all 68 landmarks and of the inner 51; None where there is not exactly one face."""
     lit = np.mean([read_image(path).pixels for path in sorted((subject / "C0").glob("*.exr"))], 0)
-    faces = detect_landmarks(to_display(lit))
+    faces = detect_faces(to_display(lit))
     if len(faces) != 1:
         return None
     record = json.loads((subject / "subject.json").read_text())

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         predict_olat,
         read_image,
         relight,
+        segment,
         write_image,
     )
 
@@ -28,6 +29,7 @@ __all__ = [
     "predict_olat",
     "read_image",
     "relight",
+    "segment",
     "write_image",
 ]
 

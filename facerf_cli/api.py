@@ -15,14 +15,18 @@ from facerf_cli import pipeline
 from facerf_cli.baselines import Kind
 from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
+from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.files import images
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.models import Models
 from facerf_cli.models import load_models as load
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
 
 Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
@@ -98,6 +102,18 @@ def load_models(
     return load(None if checkpoint is None else Path(checkpoint), face_model, torch.device(device))
 
 
+def segment(photo: np.ndarray, landmarks_px: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Segment the person with the largest face of a photo [H, W, 3], or the one with landmarks [68, 2].
+
+    Returns layers [H, W] in 0..1: 'person.A', the matte, and 'class.hair', 'class.skin' and so on, which sum
+    to it. Raises InputError where no face is found.
+    """
+    photo = _checked(photo)
+    if landmarks_px is None:
+        landmarks_px = find_faces(photo, "photo")[0].landmarks_px
+    return segment_image(to_display(photo), check_landmarks(landmarks_px)).layers()
+
+
 def fit_photo(
     models: Models,
     photo: np.ndarray,
@@ -111,9 +127,7 @@ def fit_photo(
     geometry and side of the texture are those with which the networks were trained. Raises InputError where
     no face is found or the fit fails.
     """
-    photo = np.ascontiguousarray(photo, np.float32)
-    if photo.ndim != 3 or photo.shape[2] != 3:
-        raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
+    photo = _checked(photo)
     sides = models.sides(texture_side)
     if landmarks_px is not None:
         if geometry == "network":
@@ -121,6 +135,13 @@ def fit_photo(
         return pipeline.fit_photo(models, photo, landmarks_px, sides)
     face = pipeline.find_for(geometry or models.default_geometry, photo, "photo")[0]
     return pipeline.head_of(models, photo, face, sides)
+
+
+def _checked(photo: np.ndarray) -> np.ndarray:
+    photo = np.ascontiguousarray(photo, np.float32)
+    if photo.ndim != 3 or photo.shape[2] != 3:
+        raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
+    return photo
 
 
 def relight(

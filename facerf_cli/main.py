@@ -28,6 +28,7 @@ from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
 from facerf_cli.cli.relight_dataset import relight_dataset
+from facerf_cli.cli.segment import segment
 from facerf_cli.cli.synth_stage import synth_stage
 from facerf_cli.cli.train import train
 from facerf_cli.errors import FacerfError, UsageError
@@ -39,6 +40,7 @@ VERBS: tuple[Callable[..., Any], ...] = (
     convert_light,
     predict_olat,
     fit_geometry,
+    segment,
     synth_stage,
     prepare_dataset,
     relight_dataset,

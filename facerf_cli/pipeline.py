@@ -26,13 +26,15 @@ from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import Face, FaceBox, find_boxes, find_faces
+from facerf_cli.face.landmarks import Face, FaceBox
 from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk, weighted_sums
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
+from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
+from facerf_cli.portrait.occluders import uncovered
 
 
 def fit_photo(
@@ -68,19 +70,33 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
     return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
 
 
-def find_for(geometry: Geometry, photo: np.ndarray, name: str, which: str = "largest") -> Sequence[FaceBox]:
+def find_for(
+    geometry: Geometry,
+    photo: np.ndarray,
+    name: str,
+    which: str = "largest",
+    landmarks_from: LandmarksFrom = "facerf",
+) -> Sequence[FaceBox]:
     """Find faces in a photo [H, W, 3] with what a geometry needs: landmarks, or boxes alone.
 
     `which` is largest, all or an index. Raises InputError, with the photo's name, where no face is found.
     """
-    return (find_boxes if geometry == "network" else find_faces)(photo, name, which)
+    faces = find_faces(photo, name, which, landmarks_from)
+    return [face.box for face in faces] if geometry == "network" else faces
 
 
 def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | None = None) -> Head:
-    """The head of a face found in a photo: fitted to its landmarks, or regressed where it has none."""
+    """The head of a face found in a photo: fitted to its landmarks, or regressed where it has none.
+
+    What covers the skin in the photo (hair, glasses, a hand) is not taken as skin.
+    """
     if isinstance(face, Face):
-        return fit_photo(models, photo, face.landmarks_px, sides)
-    return regress_photo(models, photo, face.box_px, sides)
+        head = fit_photo(models, photo, face.landmarks_px, sides)
+    else:
+        head = regress_photo(models, photo, face.box_px, sides)
+    if not isinstance(face, FoundFace | FoundBox):
+        return head
+    return head.without(models.face, uncovered(face.seen, head.fit.crop))
 
 
 @torch.no_grad()

@@ -15,7 +15,7 @@ LEVELS = (
     ("synth", "capture"),
     ("pipeline",),
     ("field", "baselines", "composite"),
-    ("models",),
+    ("models", "portrait"),
     ("network", "face"),
     ("raster", "light", "files", "metrics"),
     ("workers", "ray_workers", "colour", "logs", "errors"),

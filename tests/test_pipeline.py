@@ -9,7 +9,6 @@ from torch import Tensor, nn
 from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.topology import region_mask
 from facerf_cli.field import photo_evidence, weighted_sum
 from facerf_cli.files.images import read_image
@@ -18,6 +17,7 @@ from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.models import Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"

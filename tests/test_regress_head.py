@@ -12,12 +12,13 @@ from torch import nn
 from facerf_cli.errors import UsageError
 from facerf_cli.face import landmarks
 from facerf_cli.face.crop import from_box, from_landmarks
-from facerf_cli.face.landmarks import FaceBox, find_boxes, find_faces
+from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.files.images import read_image
 from facerf_cli.models import Models, Sides, load_models
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.pipeline import fit_photo, head_of, regress_head, regress_photo
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
 SIDES = Sides(64, 128)
@@ -126,7 +127,7 @@ def test_boxes_are_found_without_the_landmark_predictor(monkeypatch: pytest.Monk
         raise AssertionError("the predictor was loaded")
 
     monkeypatch.setattr(landmarks, "_predictor", never)
-    box = find_boxes(photo, "astronaut")[0]
+    box = find_faces(photo, "astronaut")[0].box
     assert box.box_px == whole.box_px and box.score == whole.score
     by_box, by_landmarks = from_box(box.box_px, 64), from_landmarks(whole.landmarks_px, 64)
     assert by_box.side_px == pytest.approx(by_landmarks.side_px, rel=0.15)

@@ -24,6 +24,7 @@ from facerf_cli.cli.options import (
 from facerf_cli.cli.photo_options import (
     FaceOption,
     GeometryOption,
+    LandmarksFromOption,
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
@@ -110,6 +111,7 @@ def estimate_light(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -126,7 +128,14 @@ def estimate_light(
     if width % 2:
         raise UsageError(f"--width {width}: an odd width has no half; give an even number")
     photo = PhotoOptions(
-        settings_of(context), input_colourspace, face_model, face, landmarks, geometry, texture_size
+        settings_of(context),
+        input_colourspace,
+        face_model,
+        face,
+        landmarks,
+        geometry,
+        texture_size,
+        landmarks_from,
     )
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)

@@ -29,7 +29,13 @@ from facerf_cli.cli.options import (
     settings_of,
     with_machines,
 )
-from facerf_cli.cli.photo_options import FaceOption, GeometryOption, LandmarksOption, PhotoOptions
+from facerf_cli.cli.photo_options import (
+    FaceOption,
+    GeometryOption,
+    LandmarksFromOption,
+    LandmarksOption,
+    PhotoOptions,
+)
 from facerf_cli.errors import UsageError
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
@@ -43,6 +49,7 @@ def olat(
     every: EveryOption = 1,
     joint_fit: JointFitOption = False,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -60,7 +67,9 @@ def olat(
     refuse_without_field(context, options, "network_alone")
     from facerf_cli.cli.items.evaluate_olat import run_olat
 
-    photo = PhotoOptions(settings_of(context), face_model=face_model, geometry=geometry)
+    photo = PhotoOptions(
+        settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
+    )
     photo.check()
     return run_olat(dataset, options, photo, split, every, joint_fit, network_alone)
 
@@ -85,6 +94,7 @@ def reconstruction(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
     non_negative: NonNegativeOption = True,
@@ -101,7 +111,13 @@ def reconstruction(
     folder = only_dataset(inputs)
     refuse_for_others(context, photos=folder is None)
     photo = PhotoOptions(
-        settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
+        settings_of(context),
+        input_colourspace,
+        face_model,
+        face,
+        landmarks,
+        geometry=geometry,
+        landmarks_from=landmarks_from,
     )
     photo.check()
     light = _light_options(photo, options, non_negative, refine)
@@ -136,6 +152,7 @@ def transfer(
     joint_fit: JointFitOption = False,
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
     non_negative: NonNegativeOption = True,
@@ -151,7 +168,12 @@ def transfer(
     refuse_for_others(context, photos)
     refuse_without_field(context, options, "held_to_photo")
     photo = PhotoOptions(
-        settings_of(context), input_colourspace, face_model, landmarks=landmarks, geometry=geometry
+        settings_of(context),
+        input_colourspace,
+        face_model,
+        landmarks=landmarks,
+        geometry=geometry,
+        landmarks_from=landmarks_from,
     )
     photo.check()
     light = _light_options(photo, options, non_negative, refine)
@@ -181,6 +203,7 @@ def geometry(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -197,7 +220,13 @@ def geometry(
     refuse_for_others(context, photos=folder is None)
     refuse_without_field(context, options, "mean_checkpoint")
     photo = PhotoOptions(
-        settings_of(context), input_colourspace, face_model, face, landmarks, geometry=geometry
+        settings_of(context),
+        input_colourspace,
+        face_model,
+        face,
+        landmarks,
+        geometry=geometry,
+        landmarks_from=landmarks_from,
     )
     photo.check()
     from facerf_cli.cli.items.evaluate_photos import run_geometry
@@ -236,6 +265,7 @@ def yale_b(
         ),
     ] = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
 ) -> int:
@@ -251,7 +281,9 @@ def yale_b(
     refuse_without_field(context, options, "network_alone")
     from facerf_cli.cli.items.evaluate_images import run_yale_b
 
-    photo = PhotoOptions(settings_of(context), face_model=face_model, geometry=geometry)
+    photo = PhotoOptions(
+        settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
+    )
     return run_yale_b(folder, options, photo, shifts, subjects or [], network_alone)
 
 

@@ -20,6 +20,7 @@ from facerf_cli.cli.options import (
 from facerf_cli.cli.photo_options import (
     FaceOption,
     GeometryOption,
+    LandmarksFromOption,
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
@@ -66,6 +67,7 @@ def fit_geometry(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     texture_size: TextureSizeOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
@@ -78,7 +80,14 @@ def fit_geometry(
     share of the distance between the outer eye corners), its quality (good, fair, poor) and the pose.
     """
     photo = PhotoOptions(
-        settings_of(context), input_colourspace, face_model, face, landmarks, geometry, texture_size
+        settings_of(context),
+        input_colourspace,
+        face_model,
+        face,
+        landmarks,
+        geometry,
+        texture_size,
+        landmarks_from,
     )
     photo.check()
     work = FitGeometry(photo)

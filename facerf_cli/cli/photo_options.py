@@ -29,6 +29,15 @@ LandmarksOption = Annotated[
         show_default="detect them",
     ),
 ]
+LandmarksFrom = Literal["facerf", "dlib"]
+LandmarksFromOption = Annotated[
+    LandmarksFrom,
+    typer.Option(
+        "--landmarks-from",
+        help="Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence excludes "
+        "commercial use).",
+    ),
+]
 Geometry = Literal["landmarks", "network"]
 GeometryOption = Annotated[
     Geometry | None,
@@ -60,6 +69,7 @@ class PhotoOptions:
     landmarks: Path | None = None
     geometry: Geometry | None = None  # None: as the checkpoint was trained
     texture_side: int | None = None  # None: the checkpoint's
+    landmarks_from: LandmarksFrom = "facerf"
 
     def check(self) -> None:
         """Raise UsageError for an option that would fail every photo; nothing heavy is loaded."""

@@ -23,6 +23,7 @@ from facerf_cli.cli.options import (
 from facerf_cli.cli.photo_options import (
     FaceOption,
     GeometryOption,
+    LandmarksFromOption,
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
@@ -89,6 +90,7 @@ def predict_olat(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -101,7 +103,9 @@ def predict_olat(
     settings = settings_of(context)
     parse_lights(lights)
     parse_pose(pose)
-    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, geometry, texture_size)
+    photo = PhotoOptions(
+        settings, input_colourspace, face_model, face, landmarks, geometry, texture_size, landmarks_from
+    )
     photo.check()
     work = PredictOlat(photo, lights, pose, image, network_alone, int(memory * 2**30), precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)

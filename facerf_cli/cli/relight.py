@@ -26,6 +26,7 @@ from facerf_cli.cli.options import (
 from facerf_cli.cli.photo_options import (
     FaceOption,
     GeometryOption,
+    LandmarksFromOption,
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
@@ -196,6 +197,7 @@ def relight(
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
@@ -215,7 +217,9 @@ def relight(
     parse_lights(lights)
     if network_alone and reflectance != "field":
         raise UsageError("--network-alone: is for the field; leave it out, or use --reflectance field")
-    photo = PhotoOptions(settings, input_colourspace, face_model, face, landmarks, geometry, texture_size)
+    photo = PhotoOptions(
+        settings, input_colourspace, face_model, face, landmarks, geometry, texture_size, landmarks_from
+    )
     photo.check()
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file; give one that exists")

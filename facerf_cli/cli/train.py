@@ -15,6 +15,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
+_HEAD_STAGES = (*_TEXTURE_STAGES, "geometry", "parsing")  # which draw synthetic heads
 _CROP_STAGES = ("joint", "appearance-features")  # which read a dataset's crops
 _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
@@ -29,9 +30,9 @@ _STAGES = {  # the stages that an option applies to
     "texture_size": (*_TEXTURE_STAGES, *_CROP_STAGES),
     "dataset": (*_TEXTURE_STAGES, *_CROP_STAGES),
     "fit_with": _TEXTURE_STAGES,
-    "heads_from": (*_TEXTURE_STAGES, "geometry"),
-    "heads": (*_TEXTURE_STAGES, "geometry"),
-    "bank": (*_TEXTURE_STAGES, "geometry"),
+    "heads_from": _HEAD_STAGES,
+    "heads": _HEAD_STAGES,
+    "bank": _HEAD_STAGES,
 }
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 _DEFAULT_TIME = "2h"
@@ -104,7 +105,7 @@ def train(
             help="Train the networks of a stage. reflectance: the Reflectance Network, on textures; "
             "geometry: the Geometry Network, on rendered heads; joint: both, through the rasterizer; "
             "light-features, appearance-features: the networks of those options; diffuse-sh: the network "
-            "of that baseline.",
+            "of that baseline; parsing: the Parsing Network, on whole synthetic people.",
             show_default="joint with --preset paper, else reflectance",
         ),
     ] = None,
@@ -148,7 +149,11 @@ def train(
         ),
     ] = None,
     heads_from: Annotated[
-        str, _data(metavar="NAME|PATH", help="Draw synthetic heads from this face model.")
+        str,
+        _data(
+            metavar="NAME|PATH",
+            help="Draw synthetic heads from this face model; of the stage parsing, from several with commas.",
+        ),
     ] = "builtin",
     fit_with: Annotated[
         str,

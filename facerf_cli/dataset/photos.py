@@ -21,10 +21,10 @@ from torch import Tensor
 from facerf_cli.dataset.crop_move import CropMove
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.documents import digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.workers import in_shards
 
 CACHED_SIDE_PX = 512  # the side of the paper's crops

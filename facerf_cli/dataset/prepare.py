@@ -24,7 +24,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
 from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
-from facerf_cli.face.landmarks import choose_face, detect_landmarks, to_display
+from facerf_cli.face.landmarks import choose_face, to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
@@ -34,6 +34,7 @@ from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
+from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 
@@ -189,7 +190,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
     for light, weight in zip(person.lights, weights, strict=True):
         lit += weight * person.capture.frame(person.name, camera, light)
-    faces = detect_landmarks(to_display(lit))
+    faces = detect_faces(to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 

@@ -24,6 +24,7 @@ from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_of
 from facerf_cli.models import Models, Sides
 from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.portrait.find import LandmarksFrom
 from facerf_cli.synth.appearance.pigments import skin_albedo
 
 T = TypeVar("T")
@@ -93,6 +94,7 @@ class Person:
     geometry: Geometry | None
     sides: Sides
     keep_eyes: bool = False
+    landmarks_from: LandmarksFrom = "facerf"
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
@@ -129,7 +131,7 @@ class Person:
         if self.geometry is None:
             face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
         else:
-            face = find_for(self.geometry, image, name)[0]
+            face = find_for(self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
         return Portrait(LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
 
     def source(self, pair: Pair) -> np.ndarray:

@@ -104,6 +104,15 @@ def from_box(box_px: Box, size_px: int) -> Crop:
     return Crop(x_px - side_px / 2, y_px - side_px / 2, side_px, size_px)
 
 
+def box_of(crop: Crop) -> Box:
+    """The box around which `from_box` cuts a crop."""
+    box_side_px = crop.side_px / _PER_BOX
+    x_px = crop.x0_px + crop.side_px / 2
+    y_px = crop.y0_px + crop.side_px / 2 + _ABOVE_BOX * box_side_px
+    half_px = box_side_px / 2
+    return x_px - half_px, y_px - half_px, x_px + half_px, y_px + half_px
+
+
 def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:
     """The landmarks as float64 [68, 2]; raises InputError where they cannot be a face."""
     landmarks_px = np.asarray(landmarks_px, np.float64)

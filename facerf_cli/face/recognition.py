@@ -6,7 +6,7 @@ from typing import Any
 import dlib
 import numpy as np
 
-from facerf_cli.face.landmarks import bundled_model
+from facerf_cli.face.dlib_landmarks import bundled_model
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 RECOGNITION_LICENCE = (

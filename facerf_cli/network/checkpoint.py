@@ -20,6 +20,7 @@ from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
 FORMAT = "facerf-checkpoint-1"
@@ -33,6 +34,7 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
     ("light_features", "vgg"): LightNetwork,
     ("appearance_features", "vgg"): AppearanceNetwork,
     ("diffuse_sh", "default"): DiffuseNetwork,
+    ("parsing", "default"): ParsingNetwork,
 }
 
 

@@ -142,7 +142,7 @@ def _surroundings(vertices: Tensor, random: np.random.Generator) -> _Surrounding
         hair, _ = draw_hair(dressed, random)
         worn += [hair] if hair else []
     if random.random() < _GLASSES_SHARE:
-        worn.append(draw_glasses(bare, landmarks_m, random))
+        worn.append(draw_glasses(bare, landmarks_m, random).frame)
     mesh = joined(dressed, *worn)
     on_face = (mesh.part == _SKIN) & ((mesh.uv >= 0) & (mesh.uv <= 1)).all(-1)
     shown = np.isin(mesh.part, (_SKIN, _HAIR, _CLOTH, _FRAME))

@@ -5,6 +5,8 @@ of the image with their surface, and how much of each rig light reaches them. `p
 any appearance under any lights, in a few hundredths of a second, with the truth beside it.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -14,17 +16,20 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.silhouette import RAYS_PER_LANDMARK, silhouette_ids
+from facerf_cli.face.topology import CONTOUR
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.light.mesh_transport import bake_mesh
+from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.raster.camera import project
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.bake_renderer import irradiance_factors
 from facerf_cli.synth.facets import facets_of
 from facerf_cli.synth.head.body import clearance_m
-from facerf_cli.synth.head.labels import CLASSES
 from facerf_cli.synth.head.mesh import PARTS
+from facerf_cli.synth.lenses import Lenses, lenses_in, reflections
 from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, unit, widened_lobes
 from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject
@@ -34,6 +39,7 @@ _BOUNCE_ORDER = 3  # of the spherical harmonics that hold bounced light
 _HIGHLIGHTS = 12  # only the brightest lights have highlights
 _LEAST_COSINE = 0.05  # below it a facet's visibility cannot be derived from its irradiance
 _HAIR = PARTS.index("hair")
+_MISSING = (math.nan,) * 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +51,7 @@ class BakedPortrait:
     [N, 3] float32; direct [N, L] uint8, of 255: visibility of each light, on surfaces times n.l; bounce
     [N, 16] float16: spherical harmonics of the light after one bounce off white surroundings; directions
     [L, 3] of the lights; classes [S, S, C] uint8: shares, of 255; landmarks_px [68 + M, 2]; rotation [3, 3]:
-    head_to_camera.
+    head_to_camera; lens_*: see `Lenses`.
     """
 
     pixel: Tensor
@@ -62,6 +68,9 @@ class BakedPortrait:
     classes: Tensor
     landmarks_px: Tensor
     rotation: Tensor
+    lens_pixel: Tensor
+    lens_normals: Tensor
+    lens_views: Tensor
 
     @property
     def side_px(self) -> int:
@@ -78,24 +87,42 @@ class PortraitPhoto:
     classes: Tensor
     albedo: Tensor  # [3, S, S] times alpha
     normals: Tensor  # [3, S, S] unit, camera space; 0 off the person
+    specular: Tensor  # [S, S] share of the person's radiance that highlights make, without those of lenses
 
 
 def bake_portrait(
     subject: Subject, camera: StageCamera, directions: np.ndarray, settings: BakeSettings, seed: int
 ) -> BakedPortrait:
     """Bake what a camera sees of a person under lights from world-space `directions` [L, 3]."""
+    return view_of(subject, bake_subject(subject, [camera], directions, settings, seed), camera)
+
+
+def bake_subject(
+    subject: Subject,
+    cameras: Sequence[StageCamera],
+    directions: np.ndarray,
+    settings: BakeSettings,
+    seed: int,
+) -> MeshTransport:
+    """Bake the light transport of all that some of the cameras can see of a person."""
     mesh = subject.mesh
-    transport = bake_mesh(
+    axes = np.stack([camera.head_to_camera.numpy()[2] for camera in cameras])
+    return bake_mesh(
         mesh.vertices,
         mesh.normals,
         mesh.triangles,
         directions,
         settings,
         seed,
-        wanted=(mesh.normals @ camera.head_to_camera.numpy()[2]) > -0.3,
+        wanted=(mesh.normals @ axes.T).max(1) > -0.3,
         two_sided=mesh.part == _HAIR,
         clearance_m=clearance_m(mesh),
     )
+
+
+def view_of(subject: Subject, transport: MeshTransport, camera: StageCamera) -> BakedPortrait:
+    """Bake what one camera sees of a person whose light transport is known."""
+    mesh, directions = subject.mesh, transport.directions
     facets, shares, pixels = facets_of(mesh, subject.appearance, camera, relief=False)
     direct, bounce = irradiance_factors(mesh, transport)
     basis = sh_basis(torch.from_numpy(directions).float() @ camera.head_to_camera.T.float(), _BOUNCE_ORDER)
@@ -105,9 +132,8 @@ def bake_portrait(
     rotation = camera.head_to_camera.float()
     points = torch.from_numpy(facets.corners @ mesh.vertices[facets.vertices]).float()
     truth = truth_of(mesh, subject.appearance, camera)
-    landmarks = np.concatenate([subject.landmarks_world, list(subject.more_landmarks_world.values())])
-    landmarks_camera = torch.from_numpy(landmarks).float() @ rotation.T + camera.translation_m
     owner = np.repeat(pixels, np.diff(shares.indptr))
+    lenses = _lenses(subject, camera, -truth.positions_m[..., 2])
     return BakedPortrait(
         pixel=torch.from_numpy(owner).int(),
         share=torch.from_numpy(shares.data).half(),
@@ -121,9 +147,34 @@ def bake_portrait(
         bounce=(bounced @ torch.linalg.pinv(basis).T).half(),
         directions=torch.from_numpy(directions).float() @ rotation.T,
         classes=torch.from_numpy((255 * truth.classes).round().astype(np.uint8)),
-        landmarks_px=project(landmarks_camera, camera.camera),
+        landmarks_px=_landmarks_px(subject, camera),
         rotation=rotation @ subject.head_to_world.float(),
+        lens_pixel=lenses.pixels.int(),
+        lens_normals=lenses.normals.half(),
+        lens_views=lenses.views.half(),
     )
+
+
+def _lenses(subject: Subject, camera: StageCamera, depth_m: np.ndarray) -> Lenses:
+    if subject.lenses is None:
+        return Lenses(torch.zeros(0, dtype=torch.long), torch.zeros(0, 3), torch.zeros(0, 3))
+    return lenses_in(subject.lenses, camera, depth_m)
+
+
+def _landmarks_px(subject: Subject, camera: StageCamera) -> Tensor:
+    """Landmarks [68 + M, 2] of an image; those of the jaw lie on its outline, as detectors place them.
+
+    The others are `MORE_LANDMARKS`; NaN for those that a person does not have.
+    """
+    rotation = camera.head_to_camera.float()
+    face = subject.face_vertices @ subject.head_to_world.T.float()
+    face_px = project(face @ rotation.T + camera.translation_m, camera.camera)
+    outline = silhouette_ids(face_px[None], (rotation @ subject.head_to_world)[None])[0]
+    more = [subject.more_landmarks_world.get(name, _MISSING) for name in MORE_LANDMARKS]
+    points = torch.from_numpy(np.concatenate([subject.landmarks_world, more])).float()
+    found = project(points @ rotation.T + camera.translation_m, camera.camera)
+    found[list(CONTOUR)] = face_px[outline[::RAYS_PER_LANDMARK]]
+    return found
 
 
 def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor) -> PortraitPhoto:
@@ -141,6 +192,7 @@ def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor)
     basis = sh_basis(portrait.directions, _BOUNCE_ORDER)
     bounced = (portrait.bounce.float() @ (basis.T @ weights)).clamp_min(0)
     radiance = surface.albedo * (lit + surface.albedo.mean(0) * bounced)
+    highlights = torch.zeros_like(radiance)
     bright = weights.sum(1).topk(min(_HIGHLIGHTS, len(weights))).indices
     lights, power, visible = (
         portrait.directions[bright],
@@ -156,17 +208,33 @@ def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor)
         portrait.spread.float()[~hair],
     )
     n_dot_l = (normals[~hair] @ lights.T).clamp_min(_LEAST_COSINE)
-    radiance[~hair] += (gloss * (visible[~hair] / n_dot_l).clamp(0, 1)) @ power
+    highlights[~hair] = (gloss * (visible[~hair] / n_dot_l).clamp(0, 1)) @ power
     white, coloured = (lobe * visible[hair] @ power for lobe in strand_highlights(strands, lights))
-    radiance[hair] += white + coloured * surface.albedo[hair]
+    highlights[hair] = white + coloured * surface.albedo[hair]
     share, pixel = portrait.share.float()[:, None], portrait.pixel.long()
-    columns = torch.cat([radiance, surface.albedo, normals], 1) * share
+    columns = torch.cat([radiance + highlights, surface.albedo, normals, highlights], 1) * share
     side = portrait.side_px
     summed = torch.zeros(side * side, columns.shape[1]).index_add_(0, pixel, columns)
-    image, albedo, normal = summed.T.view(3, 3, side, side)
+    specular = summed[:, 9:].mean(1) / summed[:, :3].mean(1).clamp_min(1e-6)
+    lenses = Lenses(portrait.lens_pixel.long(), portrait.lens_normals.float(), portrait.lens_views.float())
+    seen, transmitted = reflections(lenses, portrait.directions)
+    summed[lenses.pixels, :3] = summed[lenses.pixels, :3] * transmitted[:, None] + seen @ weights
+    image, albedo, normal = summed[:, :9].T.view(3, 3, side, side)
     classes = portrait.classes.permute(2, 0, 1).float() / 255
     alpha = torch.zeros(side * side).index_add_(0, pixel, share[:, 0]).view(side, side)
-    return PortraitPhoto(image, alpha, classes, albedo, unit(normal, 0))
+    return PortraitPhoto(image, alpha, classes, albedo, unit(normal, 0), specular.view(side, side))
+
+
+def visibility_of(portrait: BakedPortrait) -> Tensor:
+    """Share [L, S, S] of each light that reaches the person in a pixel; 0 on surfaces that face away."""
+    cosines = (portrait.normals.float() @ portrait.directions.T).clamp_min(_LEAST_COSINE)
+    cosines[portrait.part.long() == _HAIR] = 1
+    share = portrait.share.float()[:, None]
+    visible = (portrait.direct.float() / 255 / cosines).clamp(0, 1)
+    side, lights = portrait.side_px, len(portrait.directions)
+    columns = torch.cat([visible, torch.ones(len(visible), 1)], 1) * share
+    summed = torch.zeros(side * side, lights + 1).index_add_(0, portrait.pixel.long(), columns)
+    return (summed[:, :-1] / summed[:, -1:].clamp_min(1e-6)).T.view(lights, side, side)
 
 
 def save_portrait(path: Path, portrait: BakedPortrait) -> None:

@@ -27,6 +27,7 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.synth import bake_renderer, path_tracer
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.lenses import lenses_in, over_lenses
 from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, Frame, StageCamera, stage_cameras
 from facerf_cli.synth.subjects import Subject, subject_model
 from facerf_cli.synth.truth import truth_of
@@ -140,10 +141,24 @@ def photograph_subject(
     )
     irradiance = bake_renderer.scattered_irradiance(mesh, appearance, transport)
     images = (
-        bake_renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)[0]
+        _with_lenses(
+            bake_renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)[0],
+            subject,
+            camera,
+            directions,
+        )
         for camera in cameras
     )
     return images, transport
+
+
+def _with_lenses(images: Tensor, subject: Subject, camera: StageCamera, directions: np.ndarray) -> Tensor:
+    """Lay the lenses of a person's glasses over images [L, 3, H, W]."""
+    if subject.lenses is None:
+        return images
+    depth_m = -truth_of(subject.mesh, subject.appearance, camera).positions_m[..., 2]
+    in_camera = torch.from_numpy(directions).float() @ camera.head_to_camera.T.float()
+    return over_lenses(images, lenses_in(subject.lenses, camera, depth_m), in_camera)
 
 
 def _visible_vertices(mesh: HeadMesh, cameras: tuple[StageCamera, ...]) -> np.ndarray:

@@ -43,6 +43,7 @@ class Subject:
     landmarks_world: np.ndarray  # [68, 3], m
     more_landmarks_world: dict[str, list[float]]  # of `truth.more_landmarks`, m
     traits: dict[str, Any]
+    lenses: HeadMesh | None = None  # of glasses, in world space
 
 
 @lru_cache(maxsize=1)
@@ -73,7 +74,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     appearance = with_scalp(appearance, cover, generator)
     more = more_landmarks(bare)
     lobes = [place for name, place in more.items() if name.endswith("ear lobe")]
-    worn, seen = _worn(bare, landmarks_m, lobes, appearance, headwear, random)
+    worn, lenses, seen = _worn(bare, landmarks_m, lobes, appearance, headwear, random)
     head_to_world = pose_to_rotation(*(float(angle) for angle in pose_deg))
     turn = head_to_world.numpy()
     mesh = _rotated(joined(dressed, *([hair] if hair else []), *worn), turn)
@@ -87,7 +88,16 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
         "pose_deg": pose_deg.round(3).tolist(),
         "gaze_deg": gaze.round(3).tolist(),
     }
-    return Subject(mesh, appearance, head_to_world, face_vertices, landmarks_m @ turn.T, more_world, traits)
+    return Subject(
+        mesh,
+        appearance,
+        head_to_world,
+        face_vertices,
+        landmarks_m @ turn.T,
+        more_world,
+        traits,
+        _rotated(lenses, turn) if lenses else None,
+    )
 
 
 def _worn(
@@ -97,13 +107,14 @@ def _worn(
     appearance: Appearance,
     headwear: Headwear | None,
     random: np.random.Generator,
-) -> tuple[list[HeadMesh], dict[str, Any]]:
-    """Draw what a head wears and holds before it, with lashes and beard; return also the traits."""
+) -> tuple[list[HeadMesh], HeadMesh | None, dict[str, Any]]:
+    """Draw what a head wears and holds, with lashes and beard; return also lenses and the traits."""
     beard = grow_beard(bare, appearance.traits, random)
     meshes = [grow_lashes(landmarks_m, random), *([beard] if beard else [])]
     glasses, held = random.random() < _GLASSES_SHARE, str(random.choice(_HELD, p=_HELD_SHARES))
-    if glasses:
-        meshes.append(draw_glasses(bare, landmarks_m, random))
+    drawn = draw_glasses(bare, landmarks_m, random) if glasses else None
+    if drawn:
+        meshes.append(drawn.frame)
     if headwear:
         meshes.append(headwear.mesh)
     if held != "none":
@@ -111,7 +122,8 @@ def _worn(
     earrings = random.random() < _EARRINGS_SHARE and (not headwear or headwear.kind != "headscarf")
     if earrings and lobes:
         meshes.append(draw_earrings(lobes, random))
-    return meshes, {"glasses": glasses, "held": held, "earrings": earrings}
+    traits = {"glasses": glasses, "held": held, "earrings": earrings}
+    return meshes, drawn.lenses if drawn else None, traits
 
 
 def _canvas_side(size_px: int) -> int:

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from facerf_cli.portrait.classes import CLASSES, IRIS_POINTS, class_index
 from facerf_cli.synth.appearance.eye_textures import IRIS_DEG
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.facets import Samples, surface_samples
-from facerf_cli.synth.head.labels import CLASSES, class_index
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, unit
 from facerf_cli.synth.stage_cameras import StageCamera
 
 _SAMPLES = 3  # along each side of a pixel
-_IRIS_POINTS = 8  # on the outline of an iris, from its right end counter-clockwise
 _NEAR = 4  # vertices of the eyeball around a point of the iris
 
 
@@ -106,7 +105,7 @@ def more_landmarks(mesh: HeadMesh) -> dict[str, np.ndarray]:
 def _iris(mesh: HeadMesh, sign: int) -> dict[str, np.ndarray]:
     """Centre and outline of the iris on one side: means of the nearest vertices by the eyeball's texture."""
     ball = np.flatnonzero((mesh.part == PARTS.index("eye")) & (mesh.vertices[:, 0] * sign > 0))
-    turn = np.arange(_IRIS_POINTS) / _IRIS_POINTS * 2 * np.pi
+    turn = np.arange(IRIS_POINTS) / IRIS_POINTS * 2 * np.pi
     ring = 0.5 + IRIS_DEG / 180 * np.stack([np.cos(turn), -np.sin(turn)], -1)
     found = {}
     for name, uv in {"iris": np.array([0.5, 0.5]), **{f"iris {k}": at for k, at in enumerate(ring)}}.items():

@@ -4,12 +4,18 @@ The command line reads its defaults here, so this module imports no torch.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Preset = Literal["default", "paper", "tiny"]
-Stage = Literal["reflectance", "geometry", "joint", "light-features", "appearance-features", "diffuse-sh"]
+Stage = Literal[
+    "reflectance", "geometry", "joint", "light-features", "appearance-features", "diffuse-sh", "parsing"
+]
+_PARSING_BATCH = 16
 FEATURE_STAGES = ("light-features", "appearance-features")  # of networks that a loss compares images with
+
+
+_BESIDE_THE_PAPER = (*FEATURE_STAGES, "parsing")
 
 
 @dataclass(frozen=True)
@@ -98,11 +104,12 @@ PRESETS: dict[Preset, TrainSettings] = {
 
 
 def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
-    """Settings of a preset; the paper's optimizer is for its own loss, not for the networks of its features.
+    """Settings of a preset; the paper's optimizer is for its own loss, not for networks besides it.
 
-    It does not say how those were trained.
+    It does not say how those of its features were trained.
     """
-    return PRESETS["default" if preset == "paper" and stage in FEATURE_STAGES else preset]
+    settings = PRESETS["default" if preset == "paper" and stage in _BESIDE_THE_PAPER else preset]
+    return replace(settings, batch=_PARSING_BATCH) if stage == "parsing" and preset != "tiny" else settings
 
 
 # Settings that may differ between a run and its resumption.

@@ -10,10 +10,10 @@ import trimesh
 from skimage.metrics import peak_signal_noise_ratio
 
 from facerf_cli.face.fit import FaceFit, load_fit
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import render_texture
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"

@@ -10,12 +10,12 @@ import torch
 from facerf_cli.face import landmarks
 from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import load_fit
-from facerf_cli.face.landmarks import find_boxes
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
 from facerf_cli.models import DEFAULT_CHECKPOINT, Models, Sides, load_models
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint, save_networks
+from facerf_cli.portrait.find import find_faces
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
@@ -37,7 +37,7 @@ def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
     assert fit(tmp_path, "--geometry", "network") == 0
     found = load_fit(tmp_path / "astronaut_fit.npz")
     photo = read_image(PHOTO).pixels
-    assert found.crop == from_box(find_boxes(photo, "astronaut")[0].box_px, 512)
+    assert found.crop == from_box(find_faces(photo, "astronaut")[0].box_px, 512)
     models = load_models(None, "builtin", torch.device("cpu"))
     assert models.geometry is not None
     crop = torch.from_numpy(found.crop.apply(photo)).permute(2, 0, 1)[None]

@@ -9,7 +9,6 @@ import torch
 
 from facerf_cli.colour import luminance
 from facerf_cli.face.fit import fit_from_arrays
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.images import read_image, write_display
@@ -18,6 +17,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import normal_map
 

@@ -8,7 +8,6 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.field import Field
@@ -18,6 +17,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import normal_map
 from facerf_cli.synth.sky.skies import kind_of
 

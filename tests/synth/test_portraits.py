@@ -9,19 +9,28 @@ import torch
 import trimesh
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.topology import GRID
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth import bake_renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.bake_renderer import RenderSettings
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.mesh import PARTS, joined, strandless
-from facerf_cli.synth.portraits import BakedPortrait, bake_portrait, load_portrait, photograph, save_portrait
+from facerf_cli.synth.portraits import (
+    BakedPortrait,
+    bake_portrait,
+    load_portrait,
+    photograph,
+    save_portrait,
+    visibility_of,
+)
 from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject
 
+EAR = "left ear top"
 LIGHTS = rig_directions(24).numpy().astype(np.float64)
 BAKE = BakeSettings(light_radius_deg=0, bounce_samples=8)
 SIDE_PX = 48
@@ -53,7 +62,13 @@ def subject() -> Subject:
     hair = replace(hair, tangents=np.broadcast_to(np.float32([0, -1, 0]), wall.shape).copy())
     turn = pose_to_rotation(10, 5, 0)
     return Subject(
-        joined(skin, hair), appearance(), turn, torch.zeros(1, 3), np.zeros((68, 3)), {"a": [0, 0.02, 0]}, {}
+        joined(skin, hair),
+        appearance(),
+        turn,
+        torch.zeros(GRID * GRID, 3),
+        np.zeros((68, 3)),
+        {EAR: [0, 0.02, 0]},
+        {},
     )
 
 
@@ -109,9 +124,38 @@ def test_truth_lies_beside_the_photo(portrait: BakedPortrait) -> None:
     assert (photo.image[:, photo.alpha == 0] == 0).all()
 
 
+def test_the_specular_share_is_what_gloss_adds(portrait: BakedPortrait) -> None:
+    dull = appearance()
+    materials = {
+        name: replace(material, specular=0 * material.specular) for name, material in dull.materials.items()
+    }
+    dull = replace(dull, materials=materials)
+    glossy, matte = photograph(portrait, appearance(), weights(0)), photograph(portrait, dull, weights(0))
+    skin = glossy.classes[class_index("skin")] > 0.99
+    shining, rest = (
+        photo.specular * photo.image.mean(0) for photo in (glossy, matte)
+    )  # rest: at grazing angles
+    added = glossy.image.mean(0) - matte.image.mean(0)
+    assert glossy.specular[skin].max() > 0.05
+    assert torch.allclose((shining - rest)[skin], added[skin], atol=1e-5)
+
+
+def test_visibility_by_light(portrait: BakedPortrait) -> None:
+    visible = visibility_of(portrait)
+    assert visible.shape == (24, SIDE_PX, SIDE_PX) and visible.min() >= 0 and visible.max() <= 1
+    photo = photograph(portrait, appearance(), weights(0))
+    skin = photo.classes[class_index("skin")] > 0.99
+    toward = torch.einsum("lc,chw->lhw", portrait.directions, photo.normals)
+    lit, away = toward > 0.3, toward < -0.1
+    assert visible[:, skin][lit[:, skin]].mean() > 0.9  # nothing but the board behind it is near the ball
+    assert visible[:, skin][away[:, skin]].max() < 0.1  # a pixel holds some normals
+
+
 def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: BakedPortrait) -> None:
     assert torch.allclose(portrait.landmarks_px[:68], torch.tensor([SIDE_PX / 2, SIDE_PX / 2]), atol=1e-3)
-    assert float(portrait.landmarks_px[68, 1]) == pytest.approx(SIDE_PX / 2 - 0.02 / 0.14 * SIDE_PX, abs=0.05)
+    ear = portrait.landmarks_px[68 + MORE_LANDMARKS.index(EAR)]
+    assert portrait.landmarks_px[68:].isnan().all(1).sum() == len(MORE_LANDMARKS) - 1
+    assert float(ear[1]) == pytest.approx(SIDE_PX / 2 - 0.02 / 0.14 * SIDE_PX, abs=0.05)
     assert torch.allclose(portrait.rotation, pose_to_rotation(-15, 0, 0) @ subject.head_to_world, atol=1e-6)
 
 

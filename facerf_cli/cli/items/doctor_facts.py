@@ -13,11 +13,13 @@ import torch
 from facerf_cli.cli.doctor import MISSING
 from facerf_cli.cli.options import Settings, torch_device
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.landmarks import DETECTOR_LICENCE, PREDICTOR_LICENCE, predictor_path
+from facerf_cli.face.detector import DETECTOR_LICENCE
+from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, predictor_path
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.face.recognition import RECOGNITION_LICENCE
 from facerf_cli.models import DEFAULT_CHECKPOINT
 from facerf_cli.network.checkpoint import load_checkpoint
+from facerf_cli.portrait.parse import SHIPPED
 
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:
@@ -27,7 +29,9 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
         "assets": {
             "face model": _face_model(BUILTIN_PATH),
             "checkpoint": _checkpoint(settings.checkpoint or DEFAULT_CHECKPOINT),
-            "landmarks": _landmark_model(),
+            "parsing": _checkpoint(SHIPPED),
+            "detector": {"licence": DETECTOR_LICENCE},
+            "extra dlib": _extra_models(),
         },
         "colour": _colour_configuration(),
         "cache": {"folder": platformdirs.user_cache_dir("facerf")},
@@ -65,17 +69,16 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
 
 
-def _landmark_model() -> dict[str, str]:
+def _extra_models() -> dict[str, str]:
+    """The models of the extra `dlib`, which may not be used commercially."""
     try:
-        size = _size(predictor_path())
-    except FacerfError as error:
-        size = f"{MISSING}: {error}"
-    return {
-        "points": PREDICTOR_LICENCE,
-        "size": size,
-        "detector": DETECTOR_LICENCE,
-        "recognition": RECOGNITION_LICENCE,
-    }
+        return {
+            "points": PREDICTOR_LICENCE,
+            "size": _size(predictor_path()),
+            "recognition": RECOGNITION_LICENCE,
+        }
+    except FacerfError:
+        return {"points": "not installed (pip install 'facerf[dlib]'; its licence excludes commercial use)"}
 
 
 def _colour_configuration() -> dict[str, Any]:

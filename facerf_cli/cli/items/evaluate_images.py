@@ -61,8 +61,11 @@ class _YaleB:
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
-        geometry = self.methods.photo.geometry or methods[0].models.default_geometry
-        return compare_sitter(self.database, item.name, methods, self.network_alone, geometry)
+        photo = self.methods.photo
+        geometry = photo.geometry or methods[0].models.default_geometry
+        return compare_sitter(
+            self.database, item.name, methods, self.network_alone, geometry, photo.landmarks_from
+        )
 
 
 def run_pairs(

@@ -152,7 +152,7 @@ def person_of(
     models, photo = load_methods(options)[0].models, options.photo
     geometry = None if joint_fit else photo.geometry or models.default_geometry
     sides = models.sides(photo.texture_side)
-    return Person(dataset, item.name, geometry, sides, keep_eyes)
+    return Person(dataset, item.name, geometry, sides, keep_eyes, photo.landmarks_from)
 
 
 def portraits(item: Item, options: MethodOptions, keep_eyes: bool) -> Iterator[tuple[Case, Portrait]]:

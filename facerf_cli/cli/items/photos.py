@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,13 +19,16 @@ from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import FaceBox, face_at, read_landmarks
+from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.logs import LOGGER_NAME, Provenance
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
 from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.portrait.confidence import confidence_in
+from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
+from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
 _LANDMARK_SUFFIXES = (".pts", ".json")
@@ -48,7 +51,7 @@ class FittedFace:
     def facts(self) -> dict[str, Any]:
         """The face's entries in the report."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {**fit_facts(self.fit), "pose_deg": pose_deg}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found)}
 
 
 def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
@@ -82,11 +85,49 @@ def read_photo(item: Item, options: PhotoOptions) -> LinearImage:
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
     found = list(_find(item, image, options))
-    tags = [f"_face{index}" for index in range(len(found))] if options.face == "all" else [""]
+    for face in found:
+        _say_confidence(item, face)
     return [
         FittedFace(tag, face, _fit_one(item, image, face, options))
-        for face, tag in zip(found, tags, strict=True)
+        for face, tag in zip(found, _tags(len(found), options), strict=True)
     ]
+
+
+def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
+    """Find the faces that the options choose, from left to right, with the tags of their outputs."""
+    if options.landmarks is not None:
+        faces = [_given(item, options.landmarks)]
+    else:
+        faces = find_faces(image.pixels, str(item.input_path), options.face, options.landmarks_from)
+    for face in faces:
+        _say_confidence(item, face)
+    return list(zip(_tags(len(faces), options), faces, strict=True))
+
+
+def facts_of_found(faces: Sequence[FaceBox]) -> dict[str, Any]:
+    """The report's entries of a photo whose faces were only found."""
+    facts = [confidence_facts(face) for face in faces]
+    return facts[0] if len(facts) == 1 else {"faces": facts}
+
+
+def confidence_facts(face: FaceBox) -> dict[str, Any]:
+    """A face's confidence for the report; nothing where it was given, or found by dlib."""
+    if not isinstance(face, FoundFace | FoundBox):
+        return {}
+    confidence = confidence_in(face)
+    factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
+    return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
+
+
+def _say_confidence(item: Item, face: FaceBox) -> None:
+    if isinstance(face, FoundFace | FoundBox):
+        confidence = confidence_in(face)
+        why = "" if confidence.word == "sure" else f" ({confidence.reason})"
+        log.info("%s: %s%s", item.input_path, confidence.word, why)
+
+
+def _tags(count: int, options: PhotoOptions) -> list[str]:
+    return [f"_face{index}" for index in range(count)] if options.face == "all" else [""]
 
 
 def fit_facts(fit: FaceFit) -> dict[str, Any]:
@@ -100,6 +141,11 @@ def facts_of(faces: list[FittedFace]) -> dict[str, Any]:
     return faces[0].facts() if len(faces) == 1 else {"faces": [face.facts() for face in faces]}
 
 
+def stamp(item: Item) -> dict[str, str | int]:
+    """Metadata for parts of a photo, which stay photographs."""
+    return Provenance(item.input_path.name, source_type="").attributes()
+
+
 def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
     """Metadata for the outputs of a photo."""
     return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
@@ -108,12 +154,17 @@ def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> 
 def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FaceBox]:
     """Find the faces that the options choose; with their landmarks where the fit needs them."""
     if options.landmarks is not None:
-        single = not options.landmarks.is_dir()
-        path = options.landmarks if single else _landmark_file(item, options.landmarks)
-        yield face_at(read_landmarks(path))
+        yield _given(item, options.landmarks)
     else:
         geometry = options.geometry or load_models_once(options).default_geometry
-        yield from find_for(geometry, image.pixels, str(item.input_path), options.face)
+        yield from find_for(
+            geometry, image.pixels, str(item.input_path), options.face, options.landmarks_from
+        )
+
+
+def _given(item: Item, landmarks: Path) -> Face:
+    """The face whose landmarks a file holds, or a folder for this photo."""
+    return face_at(read_landmarks(_landmark_file(item, landmarks) if landmarks.is_dir() else landmarks))
 
 
 def _landmark_file(item: Item, folder: Path) -> Path:
@@ -140,6 +191,11 @@ def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOption
             100 * head.fit.error_iod,
         )
     return head
+
+
+def person_matte(image: LinearImage, head: Head) -> np.ndarray:
+    """Matte [H, W] of the person whose head was fitted in a photo."""
+    return segment(to_display(image.pixels), head.fit.crop.to_photo(head.landmarks_px)).matte
 
 
 def read_matte(path: Path, size_px: tuple[int, ...]) -> np.ndarray:

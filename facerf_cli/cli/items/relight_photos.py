@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from facerf_cli.cli.items.photos import (
     fit_faces,
     fit_facts,
     load_models_once,
+    person_matte,
     provenance,
     read_matte,
     read_photo,
@@ -68,6 +69,7 @@ class _Shown:
     relit: Callable[[slice], list[Relit]]  # by some of the setups
     bytes_each: int
     alpha: np.ndarray | None = None  # of the photo
+    layers: Mapping[str, np.ndarray] = field(default_factory=dict)  # of every image, beside its own
 
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
@@ -104,7 +106,9 @@ def _relight_face(
         metadata["facerf:network_alone"] = 1
     alpha = image.alpha if work.composite == "photo" else None
     bytes_each = head.face.texture.nbytes + (composition.surround.nbytes if composition.surround else 0)
-    shown = _Shown(composition, directions, weights, relit, bytes_each, alpha)
+    whole = work.composite == "photo" and work.pose is None
+    layers = {"person.A": person_matte(image, head)} if whole else {}
+    shown = _Shown(composition, directions, weights, relit, bytes_each, alpha, layers)
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
 
@@ -198,6 +202,7 @@ def _write_setups(
             path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
             light = RigLight(shown.directions, weights)
             image = shown.composer.image(light, relit)
+            image = replace(image, layers={**image.layers, **shown.layers})
             _write(path, image, shown.composer.exposed(light, relit, image, ev), shown.alpha, ev, metadata)
             yield path, ev
 

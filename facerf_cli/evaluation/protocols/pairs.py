@@ -17,8 +17,8 @@ import OpenImageIO as oiio
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.case import Case, Comparison, read_array
-from facerf_cli.face.landmarks import find_faces
 from facerf_cli.files.images import LinearImage, read_image
+from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".npy"}

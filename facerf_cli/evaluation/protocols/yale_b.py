@@ -31,6 +31,7 @@ from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.portrait.find import LandmarksFrom
 
 COLUMNS = ("frontal", "soft", "environment")
 PEERS = ("DPR", "GeomConsistentFR")
@@ -130,6 +131,7 @@ def compare_sitter(
     methods: Sequence[Method],
     network_alone: bool = False,
     geometry: Geometry = "landmarks",
+    landmarks_from: LandmarksFrom = "facerf",
 ) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
@@ -139,7 +141,8 @@ def compare_sitter(
     sitter = Sitter(database, subject)
     questions = list(sitter.questions())
     frontal = sitter.image("frontal")
-    face = find_for(geometry, _rgb(frontal), str(database.folder / subject))[0]
+    name = str(database.folder / subject)
+    face = find_for(geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
     for source in dict.fromkeys(question.source for question in questions):
         asked = [question for question in questions if question.source == source]
         photo = sitter.image(source)

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV, cylinder_uv
 from facerf_cli.light.transport import build_scene, hits_within
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.makehuman import GARMENTS, packed_mesh
 from facerf_cli.synth.head.mesh import (
     PARTS,

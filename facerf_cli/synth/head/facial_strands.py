@@ -6,11 +6,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from facerf_cli.face.topology import LANDMARK_UV
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.appearance.facial_hair import beard_density
 from facerf_cli.synth.head.hair import ribbons
 from facerf_cli.synth.head.hair_styles import HairStyle
 from facerf_cli.synth.head.hull import hull_of
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, smoothstep, unit
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Window
 

@@ -4,10 +4,12 @@ The rims stand in front of the eyes, as near as nose, brows and cheeks allow. A 
 and the temples lead along the head to the ears.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless, unit
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, ring_triangles, strandless, unit
 
 GLASSES = ("round", "rectangular", "square", "aviator", "half-rim")
 
@@ -15,10 +17,19 @@ _EYES = ((36, 39), (42, 45))  # landmarks of the corners
 _GAP_M = 0.0012  # between frame and skin
 _NEAR_M = 0.003  # radius around a point in which skin counts
 _TUBE = 10  # vertices around a tube
+_LENS_RADIUS_M, _LENS_RINGS = 0.12, 5  # of the sphere whose cap a lens is
 
 
-def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Generator) -> HeadMesh:
-    """Draw glasses without lenses, as part "frame", for a bare head with these landmarks [68, 3]."""
+@dataclass(frozen=True, eq=False)
+class Glasses:
+    """A frame, as part "frame", and lenses, which are transparent and so no part of the head's mesh."""
+
+    frame: HeadMesh
+    lenses: HeadMesh
+
+
+def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Generator) -> Glasses:
+    """Draw glasses for a bare head with these landmarks [68, 3]."""
     kind = str(random.choice(GLASSES))
     metal = kind == "aviator" or random.random() < 0.4
     # Half the depth and half the width of the frame.
@@ -36,7 +47,23 @@ def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Gene
         parts.append(_bridge(rims, surface, width, depth, 0.75))
     high = width if metal else random.uniform(0.0018, 0.004)
     parts += [_temple(rim, surface, depth, high) for rim in rims]
-    return joined(*parts)
+    return Glasses(joined(*parts), joined(*(_lens(rim) for rim in rims)))
+
+
+def _lens(rim: np.ndarray) -> HeadMesh:
+    """The front of a lens in its rim [64, 3]: a cap of a sphere."""
+    count, centre = len(rim), rim.mean(0)
+    axis = np.linalg.svd(rim - centre)[2][2]
+    axis = axis * np.sign(axis[2])
+    shares = np.linspace(0, 1, _LENS_RINGS)[:, None, None]
+    flat = centre + shares * (rim - centre)
+    away = flat - centre
+    squares = (away**2).sum(-1, keepdims=True)
+    bulge = (squares[-1:] - squares) / (2 * _LENS_RADIUS_M)
+    points = (flat + bulge * axis).reshape(-1, 3)
+    normals = unit(axis + away / _LENS_RADIUS_M).reshape(-1, 3)
+    triangles = ring_triangles(_LENS_RINGS, count)
+    return strandless("frame", points, normals, triangles, np.zeros((len(points), 2)))
 
 
 class _HeadSurface:

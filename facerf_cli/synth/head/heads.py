@@ -18,8 +18,9 @@ from torch import Tensor
 from facerf_cli.face.importers.source import EXPRESSION_STD
 from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.labels import class_index, ears_of, part_class, skin_classes
+from facerf_cli.synth.head.labels import ears_of, part_class, skin_classes
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.head.slits import Slit, eye_slit, lip_slit

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.head.hull import hull_of
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.makehuman import packed_mesh
 from facerf_cli.synth.head.mesh import HeadMesh, cloth_like, joined, ring_surface, unit
 from facerf_cli.synth.head.subdivision import loop_step

@@ -3,24 +3,9 @@
 import numpy as np
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, LANDMARK_UV, TOP_M, inside_mm
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.head.cranium import average_head_mm
 
-CLASSES = (
-    "background",
-    "skin",
-    "brows",
-    "eyes",
-    "lips",
-    "mouth",
-    "hair",
-    "beard",
-    "ears",
-    "neck",
-    "glasses",
-    "headwear",
-    "garment",
-    "hand",
-)
 CLASS_OF_PART = {
     "skin": "skin",
     "eye": "eyes",
@@ -38,11 +23,6 @@ _JAW_M = (-0.0755, -0.072, -0.064, -0.053, -0.046, -0.042, -0.041, -0.046, -0.05
 # The ear on the mean head juts out from it, between these azimuths and heights.
 _EAR_DEG, _EAR_M, _EAR_OUT_MM = (66.0, 125.0), (-0.045, 0.06), 4.0
 _MARGIN_UV = 0.02  # around the landmarks, within which features of the face are looked for
-
-
-def class_index(name: str) -> int:
-    """Index of a class."""
-    return CLASSES.index(name)
 
 
 def part_class(part: str) -> int:

@@ -6,6 +6,7 @@ from importlib.resources import files
 import numpy as np
 from safetensors.numpy import load
 
+MAKEHUMAN_LICENCE = "bodies and clothes: CC0 1.0 (MakeHuman)"
 STEP_M = 2e-5  # unit of the stored coordinates
 GARMENTS = (
     "tee",

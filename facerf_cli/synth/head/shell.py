@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, UV_SIZE_MM, landmark_weights
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head import mouth
 from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface
 from facerf_cli.synth.head.ear import ear_hollow_mm, ear_surface
 from facerf_cli.synth.head.eyes import RADIUS_MM, eyeball, fitted_centre
-from facerf_cli.synth.head.labels import class_index, part_class, skin_classes
+from facerf_cli.synth.head.labels import part_class, skin_classes
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, unit
 from facerf_cli.synth.head.openings import Sheet, lips, outline, skin_sheet
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.synth.head import body, neckwear
 from facerf_cli.synth.head.body import chin_height_m, draw_body
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.makehuman import GARMENTS, packed_mesh
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 

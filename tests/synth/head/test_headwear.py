@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.head import headwear
 from facerf_cli.synth.head.body import chin_height_m
 from facerf_cli.synth.head.hair import grow_hair
 from facerf_cli.synth.head.hair_styles import draw_style
 from facerf_cli.synth.head.headwear import HEADWEAR, Headwear, draw_headwear
-from facerf_cli.synth.head.labels import class_index
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 
 

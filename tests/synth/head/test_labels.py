@@ -3,7 +3,8 @@
 import numpy as np
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.synth.head.labels import CLASSES, class_index, ears_of, part_class, skin_classes
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.synth.head.labels import ears_of, part_class, skin_classes
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 
 

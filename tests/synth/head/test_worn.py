@@ -35,7 +35,7 @@ def test_glasses_sit_in_front_of_the_eyes_and_not_in_the_skin(
     head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(glasses, "GLASSES", (kind,))
-    frame = draw_glasses(head, landmarks, np.random.default_rng(2))
+    frame = draw_glasses(head, landmarks, np.random.default_rng(2)).frame
     require_sound(frame, "frame")
     front = frame.vertices[frame.vertices[:, 2] > 0.09]
     eyes = landmarks[36:48]
@@ -58,7 +58,7 @@ def test_glasses_sit_in_front_of_the_eyes_and_not_in_the_skin(
 
 def test_the_same_numbers_give_the_same_things(head: HeadMesh, landmarks: np.ndarray) -> None:
     for draw in (
-        lambda r: draw_glasses(head, landmarks, r),
+        lambda r: draw_glasses(head, landmarks, r).frame,
         lambda r: draw_body(head, r)[0],
         lambda r: draw_headwear(head, chin_height_m(head), r).mesh,
     ):

@@ -1,0 +1,169 @@
+"""The Parsing Network on real people: landmarks against dlib's, classes against drawn outlines, speed.
+
+    python benchmarks/parsing.py [--every 3] [--yale-b DIR] [--photos DIR] [--portraits DIR]
+
+Landmarks: distance to those of dlib's predictor (the extra `dlib`), in distances of the outer eye corners, on
+the frontal images of each subject, on those under flashes up to 60 degrees, and on photos; and on how many
+images each finds a face, by the angle of the flash. Regions: share of each outlined
+region that gets its class, and the largest share that another class takes. Speed: seconds of one core at
+1024 x 1024, for facerf's boxes, landmarks, classes and matte, and for dlib's detection alone.
+"""
+
+import json
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import skimage.data
+import torch
+from _common import PHOTOS, SHARED, YALE_B, arguments
+from PIL import Image, ImageDraw
+from skimage.transform import resize
+
+from facerf_cli.capture.yale_b import read_yale_b
+from facerf_cli.face.dlib_landmarks import detect_landmarks
+from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
+from facerf_cli.files.images import read_image
+from facerf_cli.portrait.find import faces_of
+from facerf_cli.portrait.segment import segment
+
+ANGLES_DEG = (0, 20, 40, 60, 80, 180)
+REGIONS = {  # classes that count as each region
+    "face": ("skin", "brows", "eyes", "lips", "mouth", "beard", "glasses"),
+    "hair": ("hair", "headwear"),
+    "ears": ("ears",),
+    "neck": ("neck",),
+}
+
+
+def main() -> None:
+    """Print the figures that the given data allow."""
+    parser = arguments(__doc__)
+    parser.add_argument("--yale-b", type=Path, default=YALE_B)
+    parser.add_argument("--every", type=int, default=3, help="of the flashes of a subject")
+    parser.add_argument("--photos", type=Path, default=PHOTOS)
+    parser.add_argument("--portraits", type=Path, default=SHARED / "data" / "yale_b_full")
+    parser.add_argument("--regions", type=Path, default=SHARED / "bench" / "portrait" / "regions.json")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    if options.portraits.is_dir() and options.regions.is_file():
+        measure_regions(options.portraits, json.loads(options.regions.read_text()))
+    measure_speed()
+    if options.photos.is_dir():
+        measure_photos(options.photos)
+    if options.yale_b.is_dir():
+        measure_yale_b(options.yale_b, options.every)
+
+
+def distances(own_px: np.ndarray, other_px: np.ndarray) -> tuple[float, float]:
+    """Mean distances of all and of the inner landmarks, in percent of the outer eye corners' distance."""
+    left, right = OUTER_EYE_CORNERS
+    percent = (
+        100 * np.linalg.norm(own_px - other_px, axis=-1) / np.linalg.norm(other_px[left] - other_px[right])
+    )
+    return float(percent.mean()), float(percent[len(CONTOUR) :].mean())
+
+
+def measure_yale_b(folder: Path, every: int) -> None:
+    """Print distances and counts on Extended Yale B."""
+    database = read_yale_b(folder)
+    apart: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    counts: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
+    for subject in database.subjects:
+        frontal = min(database.flashes(subject), key=lambda flash: flash.angle_deg)
+        for index, flash in enumerate(database.flashes(subject)):
+            if index % every and flash != frontal:
+                continue
+            image = to_display(np.repeat(database.image(subject, flash)[..., None], 3, -1))
+            own, other = faces_of(image), detect_landmarks(image)
+            angle = flash.angle_deg
+            bin_ = next(f"{a}-{b} deg" for a, b in pairwise(ANGLES_DEG) if angle < b)
+            counts[bin_] += np.array([1, bool(own), bool(other)])
+            if own and other:
+                both = distances(own[0].landmarks_px, other[0].landmarks_px)
+                apart["frontal"] += [both] if flash == frontal else []
+                apart["up to 60 deg"] += [both] if angle <= 60 else []
+                apart["beyond 60 deg"] += [both] if angle > 60 else []
+    for name, values in apart.items():
+        everything, inner = np.mean(values, 0)
+        print(f"Yale B, {name}: {len(values)} images, all {everything:.2f} %, inner {inner:.2f} %")
+    for name, (images, own_count, other_count) in sorted(
+        counts.items(), key=lambda x: int(x[0].split("-")[0])
+    ):
+        print(f"Yale B, found under {name}: facerf {own_count}, dlib {other_count} of {images}")
+
+
+def measure_photos(folder: Path) -> None:
+    """Print distances on the photos of a folder."""
+    for path in sorted(folder.iterdir()):
+        image = to_display(read_image(path).pixels)
+        own, other = faces_of(image), detect_landmarks(image)
+        print(f"{path.name}: facerf {len(own)} faces, dlib {len(other)}", end="")
+        for face in own:
+            near = min(
+                other,
+                key=lambda x: np.linalg.norm(x.landmarks_px.mean(0) - face.landmarks_px.mean(0)),
+                default=None,
+            )
+            if near is not None:
+                print(
+                    "; all {:.2f} %, inner {:.2f} %".format(*distances(face.landmarks_px, near.landmarks_px)),
+                    end="",
+                )
+        print(flush=True)
+
+
+def outlines(
+    regions: dict[str, list[list[list[float]]]], size: tuple[int, int]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Masks [H, W] of the outlined regions of a subject; the face's is cut out of the others."""
+    masks = {}
+    for name in REGIONS:
+        picture = Image.new("L", size)
+        for polygon in regions[name]:
+            ImageDraw.Draw(picture).polygon([tuple(point) for point in polygon], fill=1)
+        masks[name] = np.asarray(picture, bool)
+    for name, mask in masks.items():
+        yield name, mask if name == "face" else mask & ~masks["face"]
+
+
+def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[float]]]]]) -> None:
+    """Print, for each subject's reference frame, which class each outlined region got."""
+    for subject, drawn in regions.items():
+        for path in sorted(folder.glob(f"{subject}_P00*{drawn['reference']}*")):
+            grey = np.asarray(Image.open(path).convert("L"), np.float32) / 255
+            image = to_display(np.repeat(grey[..., None], 3, -1))
+            faces = faces_of(image)
+            if not faces:
+                print(f"{path.name}: no face found")
+                continue
+            found = segment(image, max(faces, key=lambda face: face.area_px).landmarks_px)
+            shares = {name: sum(found.layer(of) for of in classes) for name, classes in REGIONS.items()}
+            for name, mask in outlines(drawn, (image.shape[1], image.shape[0])):
+                got = {of: float((share[mask] > 0.5).mean()) for of, share in shares.items()}
+                matte = float((found.matte[mask] > 0.5).mean())
+                others = ", ".join(f"{of} {value:.3f}" for of, value in got.items() if of != name)
+                print(f"{subject} {name}: {got[name]:.3f} (matte {matte:.3f}; {others})")
+
+
+def measure_speed() -> None:
+    """Print seconds of one core at 1024 x 1024."""
+    photo = (255 * resize(skimage.data.astronaut(), (1024, 1024))).astype(np.uint8)
+    steps = {
+        "facerf, boxes and landmarks": lambda: faces_of(photo),
+        "facerf, classes and matte": lambda: segment(photo, faces_of(photo)[0].landmarks_px),
+        "dlib, boxes and landmarks": lambda: detect_landmarks(photo),
+    }
+    for name, step in steps.items():
+        step()
+        begun = time.process_time()
+        step()
+        print(f"{name}: {time.process_time() - begun:.2f} s of a core at 1024 x 1024")
+
+
+if __name__ == "__main__":
+    main()

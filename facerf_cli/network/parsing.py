@@ -1,0 +1,142 @@
+"""The Parsing Network: from a crop around a person to classes, matte and landmarks.
+
+A small U-Net. Landmarks are the means of heatmaps (Sun et al., *Integral human pose regression*, 2018), each
+with its own expected error, as in Wood et al., *3D face reconstruction with dense landmarks*, 2022. Its
+training on synthetic portraits alone follows Wood et al., *Fake it till you make it*, 2021.
+"""
+
+import itertools
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+_MAX_WIDTH, _MAX_OUTPUTS = 512, 256  # in a checkpoint that is read
+_ALPHA_STEPS = 2  # pixels of the classes along each side of a pixel of the features
+
+
+@dataclass(frozen=True)
+class ParsingSettings:
+    """Channels at 1/2, 1/4, ... of the crop's side; side in pixels; numbers of classes and landmarks."""
+
+    widths: tuple[int, ...] = (20, 40, 88, 152, 184)
+    blocks: tuple[int, ...] = (0, 1, 2, 3, 2)
+    side: int = 256
+    classes: int = 14
+    landmarks: int = 92
+
+
+class Parsing(NamedTuple):
+    """Result of the network for B crops of side S."""
+
+    logits: Tensor  # [B, C, S, S] of the classes; class 0 is the background
+    landmarks: Tensor  # [B, N, 2] right and down, in sides of the crop
+    log_error: Tensor  # [B, N] logarithm of each landmark's expected error, in sides of the crop
+    presence: Tensor  # [B] logit of a head being there
+
+    @property
+    def classes(self) -> Tensor:
+        """Shares [B, C, S, S] of the classes; they sum to 1, and the matte is 1 less the background's."""
+        return self.logits.float().softmax(1)
+
+
+class ParsingNetwork(nn.Module):
+    """Parse crops [B, 3, S, S] as a screen shows them (sRGB), of any brightness and contrast."""
+
+    def __init__(self, settings: ParsingSettings = ParsingSettings()) -> None:
+        super().__init__()
+        self.settings = settings
+        self.side = settings.side
+        widths = settings.widths
+        self.stem = _Halving(3, widths[0], settings.blocks[0])
+        self.encode = nn.ModuleList(
+            _Halving(a, b, count)
+            for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
+        )
+        pairs = list(itertools.pairwise(widths))
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.decode = nn.ModuleList(_Residual(a) for a, _ in pairs)
+        self.classify = nn.Conv2d(widths[0], settings.classes * _ALPHA_STEPS**2, 1)
+        self.heat = nn.Conv2d(widths[1], settings.landmarks, 1)
+        self.judge = nn.Sequential(
+            nn.Linear(widths[-1], widths[-1]), nn.SiLU(), nn.Linear(widths[-1], settings.landmarks + 1)
+        )
+
+    def forward(self, crops: Tensor) -> Parsing:
+        """Parse crops; they may have any side that is a multiple of 32."""
+        x = self.stem(_normalised(crops))
+        skips = []
+        for halving in self.encode:
+            skips.append(x)
+            x = halving(x)
+        judged = self.judge(x.mean((2, 3))).float()
+        features = []
+        for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
+            x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
+            features.append(x)
+        logits = F.pixel_shuffle(self.classify(x), _ALPHA_STEPS)
+        landmarks = _means(self.heat(features[-2]).float())
+        return Parsing(logits, landmarks, judged[:, 1:], judged[:, 0])
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "default", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
+        widths, blocks = (tuple(int(x) for x in metadata[name]) for name in ("widths", "blocks"))
+        side, classes, landmarks = (int(metadata[name]) for name in ("side", "classes", "landmarks"))
+        if (
+            not 3 <= len(widths) == len(blocks) <= 6
+            or not all(4 <= width <= _MAX_WIDTH and width % 4 == 0 for width in widths)
+            or not all(0 <= count <= 8 for count in blocks)
+            or not (2 <= classes <= _MAX_OUTPUTS and 68 <= landmarks <= _MAX_OUTPUTS)
+            or side % 2 ** len(widths)
+        ):
+            raise ValueError(f"no Parsing Network has the settings {metadata}")
+        return cls(ParsingSettings(widths, blocks, side, classes, landmarks))
+
+
+def _normalised(crops: Tensor) -> Tensor:
+    """Crops of zero mean and unit deviation each."""
+    centred = crops - crops.mean((1, 2, 3), keepdim=True)
+    return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
+
+
+def _means(heat: Tensor) -> Tensor:
+    """Mean places [B, N, 2], right and down in sides, of heatmaps with logits [B, N, H, W]."""
+    height, width = heat.shape[-2:]
+    share = heat.flatten(2).softmax(-1).view_as(heat)
+    x = (torch.arange(width, device=heat.device) + 0.5) / width
+    y = (torch.arange(height, device=heat.device) + 0.5) / height
+    return torch.stack([share.sum(2) @ x, share.sum(3) @ y], -1)
+
+
+class _Residual(nn.Module):
+    """Two convolutions whose result is added to their input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(4, channels)
+        self.inner = nn.Conv2d(channels, channels, 3, padding=1)
+        self.outer = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = x + self.outer(F.silu(self.inner(F.silu(self.norm(x)))))
+        return result
+
+
+class _Halving(nn.Module):
+    """Halve the side, then apply residual blocks."""
+
+    def __init__(self, channels_in: int, channels_out: int, blocks: int) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=2, padding=1)
+        self.blocks = nn.Sequential(*(_Residual(channels_out) for _ in range(blocks)))
+
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = self.blocks(F.silu(self.enter(x)))
+        return result

@@ -1,0 +1,183 @@
+"""People in a photo: their faces, each with landmarks and how sure they are, and what is seen around them.
+
+dlib's HOG detector proposes squares, and so does the whole photo. The Parsing Network looks at each, and
+again at the face that it sees there, upright; what it is not sure of is dropped.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Box, box_of, from_landmarks
+from facerf_cli.face.detector import detected_boxes
+from facerf_cli.face.landmarks import Face, FaceBox, choose_face, to_display
+from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.portrait.parse import Seen, Square, look
+
+_FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
+_BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
+_LEAST_PRESENCE, _MOST_ERROR = 0.5, 0.06  # of a face; the error in extents of the landmarks
+_SAME = 0.35  # overlap over union from which on two boxes hold one face
+_COARSE_PX, _FINE_PX = 512, 1600  # longest side of the image that the detector looks at first, and then
+_TURNS = (math.pi / 2, -math.pi / 2, math.pi)
+_TILES = 3  # along each side of the photo, half as large as it
+
+
+@dataclass(frozen=True, eq=False)
+class FoundBox(FaceBox):
+    """A face, and what is seen in a square around it."""
+
+    seen: Seen
+
+
+@dataclass(frozen=True, eq=False)
+class FoundFace(Face):
+    """A face with its landmarks [68, 2]; `seen` holds also the others and what is expected of them."""
+
+    seen: Seen
+
+    @property
+    def box(self) -> FaceBox:
+        """The face without its landmarks."""
+        return FoundBox(self.box_px, self.score, self.seen)
+
+
+LandmarksFrom = Literal["facerf", "dlib"]
+_NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
+
+
+def find_faces(
+    pixels_linear: np.ndarray,
+    name: str,
+    which: str = "largest",
+    landmarks_from: LandmarksFrom = "facerf",
+) -> list[Face]:
+    """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
+
+    Raises InputError, with the image's name, where no face is found.
+    """
+    faces = detect_faces(to_display(pixels_linear), landmarks_from)
+    if not faces:
+        raise InputError(f"{name}: {_NO_FACE}, or give its landmarks with --landmarks FILE")
+    return choose_face(faces, which, name)
+
+
+def detect_faces(image_srgb: np.ndarray, landmarks_from: LandmarksFrom = "facerf") -> list[Face]:
+    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none."""
+    if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
+        raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
+    if landmarks_from == "dlib":
+        from facerf_cli.face.dlib_landmarks import detect_landmarks  # an extra
+
+        return detect_landmarks(image_srgb)
+    return list(faces_of(image_srgb))
+
+
+def faces_of(image_srgb: np.ndarray) -> list[FoundFace]:
+    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
+
+    Large faces are looked for first; small ones, turned ones, and ones that only a part of the photo shows
+    well, where there are none.
+    """
+    for squares in _attempts(image_srgb):
+        seen = [one for one in _looked_at(image_srgb, squares) if _is_face(one, image_srgb)]
+        seen = [again for one in _distinct(seen) if (again := _refined(image_srgb, one))]
+        if seen:
+            return sorted(map(_as_face, _distinct(seen)), key=lambda face: face.box_px[0])
+    return []
+
+
+def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
+    """Squares to look at, the likeliest first."""
+    yield [*_proposed(image, _COARSE_PX), _whole(image)]
+    yield _proposed(image, _FINE_PX)
+    yield [_whole(image, turn_rad) for turn_rad in _TURNS]
+    yield _tiles(image)
+
+
+def _looked_at(image: np.ndarray, squares: list[Square]) -> list[Seen]:
+    return look(image, squares) if squares else []
+
+
+def _refined(image: np.ndarray, seen: Seen) -> Seen | None:
+    """Look twice more at a face, large and upright; None where it turns out to be none."""
+    for last in (False, True):
+        seen = look(image, [_around(seen)], mirrored=last)[0]
+        if not _is_face(seen, image):
+            return None
+    return seen if seen.relative_error <= _MOST_ERROR else None
+
+
+def _as_face(seen: Seen) -> FoundFace:
+    landmarks_px = seen.landmarks_px[:68]
+    return FoundFace(box_of(from_landmarks(landmarks_px, 1)), _score(seen), landmarks_px, seen)
+
+
+def _score(seen: Seen) -> float:
+    """Rate from 0 to 1 how surely a face is there and well seen."""
+    return seen.presence * math.exp(-seen.relative_error / _MOST_ERROR)
+
+
+def _is_face(seen: Seen, image: np.ndarray) -> bool:
+    """Tell if a head is there, with its middle in the photo."""
+    x_px, y_px = seen.landmarks_px[:68].mean(0)
+    inside = 0 <= x_px <= image.shape[1] and 0 <= y_px <= image.shape[0]
+    return bool(seen.presence >= _LEAST_PRESENCE and inside)
+
+
+def _around(seen: Seen) -> Square:
+    """The square that shows a face large and upright."""
+    face = seen.landmarks_px[:68]
+    x_px, y_px = (face.min(0) + face.max(0)) / 2
+    left, right = face[list(OUTER_EYE_CORNERS)]
+    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    return Square(float(x_px), float(y_px), _FACE_SIDES * max(seen.extent_px, 1.0), turn_rad)
+
+
+def _proposed(image: np.ndarray, side_px: int) -> list[Square]:
+    """Squares around what the detector takes for faces in a copy of the image of that side."""
+    return [_square(box) for box in detected_boxes(image, side_px)]
+
+
+def _square(box_px: Box) -> Square:
+    left, top, right, bottom = box_px
+    return Square((left + right) / 2, (top + bottom) / 2, _BOX_SIDES * (right - left + bottom - top) / 2)
+
+
+def _whole(image: np.ndarray, turn_rad: float = 0.0) -> Square:
+    height, width = image.shape[:2]
+    return Square(width / 2, height / 2, float(max(height, width)), turn_rad)
+
+
+def _tiles(image: np.ndarray) -> list[Square]:
+    """Overlapping squares that cover the photo."""
+    height, width = image.shape[:2]
+    side_px = max(height, width) / 2
+    columns, rows = (
+        np.linspace(min(side_px, length) / 2, length - min(side_px, length) / 2, _TILES)
+        for length in (width, height)
+    )
+    return [Square(float(x), float(y), side_px) for y in np.unique(rows) for x in np.unique(columns)]
+
+
+def _distinct(seen: list[Seen]) -> list[Seen]:
+    """Faces without the less sure ones of those that lie on each other."""
+    kept: list[Seen] = []
+    for face in sorted(seen, key=lambda one: -_score(one)):
+        if all(_overlap(face, other) < _SAME for other in kept):
+            kept.append(face)
+    return kept
+
+
+def _overlap(first: Seen, second: Seen) -> float:
+    """Area that the bounds of the landmarks of two faces share, over that of both together."""
+    lows, highs = zip(
+        *((x.landmarks_px[:68].min(0), x.landmarks_px[:68].max(0)) for x in (first, second)), strict=True
+    )
+    shared = float((np.minimum(*highs) - np.maximum(*lows)).clip(0).prod())
+    areas = [float((high - low).prod()) for low, high in zip(lows, highs, strict=True)]
+    return shared / max(sum(areas) - shared, 1e-9)

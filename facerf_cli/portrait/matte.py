@@ -1,0 +1,91 @@
+"""The matte of a person at the photo's own resolution, and the person's colours without the background's."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from torch import Tensor
+
+_REACH = 0.016  # of the guided filter, in longest sides of the guide
+_SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
+_STRETCH = 0.1  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
+_SURE = 0.02  # a matte this close to 0 or 1 all around is taken as 0 or 1
+_COLOUR_REACH = (
+    0.03,
+    0.006,
+)  # of the means that colours are taken from, in longest sides, one after the other
+_TINY = 1e-5
+
+
+def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarray) -> np.ndarray:
+    """Refine a matte [h, w] by the edges of a photo [H, W, 3] uint8; return it [H, W] in 0..1.
+
+    The guide [h, w, 3] in 0..1 is the photo at the matte's size. A guided filter (He et al., *Guided image
+    filtering*, 2013) in its fast form (He and Sun, 2015): a local linear function of the colour, found at the
+    small size and applied at the large one.
+    """
+    reach = max(1, round(_REACH * max(matte.shape)))
+    slope, offset = _local_lines(matte, guide_srgb, reach)
+    size = photo_srgb.shape[:2]
+    sure = _enlarged(
+        np.stack([minimum_filter(matte, 2 * reach + 1), maximum_filter(matte, 2 * reach + 1)]), size
+    )
+    lines = _enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
+    refined = lines[3]
+    for channel in range(3):
+        refined += lines[channel] * photo_srgb[..., channel] / np.float32(255)
+    refined = ((refined - _STRETCH) / (1 - 2 * _STRETCH)).clip(0, 1)
+    refined[sure[0] > 1 - _SURE] = 1
+    refined[sure[1] < _SURE] = 0
+    return np.asarray(refined)
+
+
+def _local_lines(matte: np.ndarray, guide: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes [h, w, 3] and offsets [h, w] of the matte as a linear function of colour around each pixel."""
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray(
+            uniform_filter(values, (2 * reach + 1,) * 2 + (1,) * (values.ndim - 2), mode="nearest")
+        )
+
+    colour, share = mean(guide), mean(matte)
+    products = guide[..., :, None] * guide[..., None, :]
+    covariance = mean(products.reshape(*matte.shape, 9)).reshape(products.shape)
+    covariance = (
+        covariance - colour[..., :, None] * colour[..., None, :] + _SMOOTHNESS * np.eye(3, dtype=np.float32)
+    )
+    common = mean(guide * matte[..., None]) - colour * share[..., None]
+    slope = np.linalg.solve(covariance, common[..., None])[..., 0]
+    offset = share - (slope * colour).sum(-1)
+    return mean(slope), mean(offset)
+
+
+def person_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """The person's own colours [H, W, 3] where a matte [H, W] mixes them with the background's.
+
+    Means of sure colours nearby, corrected by the mixture that the photo shows (Forte, *Approximate fast
+    foreground colour estimation*, 2021).
+    """
+    person = background = photo
+    for reach in _COLOUR_REACH:
+        size = max(3, 2 * round(reach * max(matte.shape)) + 1)
+        own = _weighted_mean(person, matte, size)
+        other = _weighted_mean(background, 1 - matte, size)
+        rest = photo - matte[..., None] * own - (1 - matte[..., None]) * other
+        person = (own + matte[..., None] * rest).clip(min=0)
+        background = other
+    return np.where(matte[..., None] > 0, person, 0).astype(np.float32)
+
+
+def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
+    """Means [H, W, 3] over squares of `size` pixels, under weights [H, W]."""
+    total = uniform_filter(colours * weight[..., None], (size, size, 1), mode="nearest")
+    return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))
+
+
+def _enlarged(maps: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Maps [C, h, w] at another size [C, H, W]."""
+    tensor: Tensor = torch.from_numpy(np.ascontiguousarray(maps, np.float32))[None]
+    return np.asarray(
+        F.interpolate(tensor, size=tuple(size), mode="bilinear", align_corners=False)[0].numpy()
+    )

@@ -1,0 +1,133 @@
+"""Squares of a photo, as the Parsing Network sees them."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.topology import LAYOUT_VERSION, MIRROR_68
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.parsing import Parsing, ParsingNetwork
+from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
+from facerf_cli.raster.camera import PIXEL_CENTRE
+
+SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
+LANDMARKS = 68 + len(MORE_LANDMARKS)
+MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
+
+
+@dataclass(frozen=True)
+class Square:
+    """A square of a photo: its centre and side in the photo's pixels, turned counter-clockwise."""
+
+    x_px: float
+    y_px: float
+    side_px: float
+    turn_rad: float = 0.0
+
+    def to_photo(self, share: np.ndarray) -> np.ndarray:
+        """Convert places [..., 2], in sides of the square from its corner, to the photo's pixels."""
+        return (np.asarray(share) - 0.5) @ self._matrix.T + (self.x_px, self.y_px)
+
+    def to_share(self, photo_px: np.ndarray) -> np.ndarray:
+        """Convert the photo's pixels [..., 2] to places in sides of the square."""
+        return (np.asarray(photo_px) - (self.x_px, self.y_px)) @ np.linalg.inv(self._matrix).T + 0.5
+
+    @property
+    def _matrix(self) -> np.ndarray:
+        cos, sin = math.cos(self.turn_rad), math.sin(self.turn_rad)
+        return self.side_px * np.array([[cos, sin], [-sin, cos]])
+
+    def cut(self, image_srgb: np.ndarray, size_px: int) -> Tensor:
+        """Resample an sRGB uint8 image [H, W, 3] to [3, size, size] in 0..1; its border goes on outside."""
+        height, width = image_srgb.shape[:2]
+        corners = self.to_photo(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+        step = max(1, int(self.side_px / size_px))  # photo pixels that are averaged first
+        low = (np.floor(corners.min(0)).astype(int) - 2 * step).clip(0, (width - 1, height - 1))
+        high = (np.ceil(corners.max(0)).astype(int) + 2 * step).clip(low + 1, (width, height))
+        low = np.maximum(0, np.minimum(low, high - step))
+        count = np.maximum(1, (high - low) // step)
+        region = image_srgb[low[1] : low[1] + count[1] * step, low[0] : low[0] + count[0] * step]
+        small = torch.from_numpy(_averaged(region, step)).permute(2, 0, 1)[None] / 255
+        at = (np.arange(size_px) + PIXEL_CENTRE) / size_px
+        place = self.to_photo(np.stack(np.meshgrid(at, at), -1))
+        size = np.array(small.shape[:1:-1])
+        grid = torch.from_numpy(2 * (place - low) / step / size - 1).float()[None]
+        return F.grid_sample(small, grid, padding_mode="border", align_corners=False)[0]
+
+
+def _averaged(region: np.ndarray, step: int) -> np.ndarray:
+    """Means [H / step, W / step, 3] float32 of blocks of a uint8 image; less than a block stays as it is."""
+    height, width = (max(1, length // step) for length in region.shape[:2])
+    if step == 1 or min(region.shape[:2]) < step:
+        return region.astype(np.float32)
+    rows = np.add.reduceat(region, np.arange(height) * step, axis=0, dtype=np.float32)
+    blocks = np.add.reduceat(rows, np.arange(width) * step, axis=1)
+    return np.asarray(blocks / step**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """View of a square by the network: shares [C, S, S] of the classes; landmarks [N, 2] in the photo.
+
+    error_px [N] are the landmarks' expected errors; presence, in 0..1, says how surely a head is there.
+    """
+
+    square: Square
+    classes: Tensor
+    landmarks_px: np.ndarray
+    error_px: np.ndarray
+    presence: float
+
+    @property
+    def extent_px(self) -> float:
+        """Larger side of the bounds of the 68 landmarks."""
+        return float(np.ptp(self.landmarks_px[:68], axis=0).max())
+
+    @property
+    def relative_error(self) -> float:
+        """Median expected error of the 68 landmarks, in their extent."""
+        return float(np.median(self.error_px[:68])) / max(self.extent_px, 1e-6)
+
+
+@cache
+def parsing_network(path: Path = SHIPPED) -> ParsingNetwork:
+    """Load a Parsing Network, by default the shipped one; raises InputError where the file holds none."""
+    network = load_networks(path, LAYOUT_VERSION)[0].get("parsing")
+    if not isinstance(network, ParsingNetwork) or (
+        network.settings.classes,
+        network.settings.landmarks,
+    ) != (len(CLASSES), LANDMARKS):
+        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
+    return network.eval()
+
+
+@torch.inference_mode()
+def look(image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False) -> list[Seen]:
+    """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
+    network = parsing_network()
+    crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
+    found: Parsing = network(crops)
+    classes, places, log_error = found.classes, found.landmarks.double(), found.log_error.double()
+    if mirrored:
+        other: Parsing = network(crops.flip(-1))
+        flipped = other.landmarks.double()[:, MIRROR] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
+        classes, places = (classes + other.classes.flip(-1)) / 2, (places + flipped) / 2
+        log_error = (log_error + other.log_error.double()[:, MIRROR]) / 2
+    return [
+        Seen(
+            square,
+            classes[index],
+            square.to_photo(places[index].numpy()),
+            log_error[index].exp().numpy() * square.side_px,
+            float(found.presence[index].sigmoid()),
+        )
+        for index, square in enumerate(squares)
+    ]

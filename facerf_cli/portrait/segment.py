@@ -1,0 +1,129 @@
+"""Classes and matte of a person over the whole frame of a photo, as layers.
+
+The Parsing Network looks twice: at the whole body, and, for detail, at head and shoulders.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import label
+from torch import Tensor
+
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.matte import refine_matte
+from facerf_cli.portrait.parse import Seen, Square, look
+from facerf_cli.raster.camera import PIXEL_CENTRE
+
+# Sides of the squares around head and shoulders and around the body, in extents of the landmarks, and how far
+# their centres lie above the middle of the landmarks.
+_NEAR_SIDES, _NEAR_ABOVE = 3.4, 0.1
+_BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
+_FEATHER = 0.08  # border of the near square where it gives way to the other one, in its sides
+_LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
+_SMALL_PX = 512  # longest side at which classes are joined
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Shares [C, h, w] of the classes at a small size, and the matte [H, W] at the photo's."""
+
+    classes: Tensor
+    matte: np.ndarray
+
+    def layer(self, name: str) -> np.ndarray:
+        """Share [H, W] float32 of a class; those of all classes but the background sum to the matte."""
+        share = self._shares[class_index(name) - 1]
+        wide = F.interpolate(share[None, None], size=self.matte.shape, mode="bilinear", align_corners=False)
+        return np.asarray(wide[0, 0].numpy() * self.matte)
+
+    @cached_property
+    def _shares(self) -> Tensor:
+        """Shares [C - 1, h, w] of the person; where nothing is seen of it, those of the whole person."""
+        person = self.classes[1:]
+        whole = person.sum((1, 2), keepdim=True)
+        person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
+        return person / person.sum(0).clamp_min(1e-6)
+
+    def layers(self) -> dict[str, np.ndarray]:
+        """The matte and all classes of the person by the names that they have in an EXR file."""
+        classes = {f"class.{name}": self.layer(name) for name in CLASSES[1:]}
+        return {"person.A": self.matte, **classes}
+
+
+def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
+    """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3]."""
+    height, width = image_srgb.shape[:2]
+    near = _around(landmarks_px, _NEAR_SIDES, _NEAR_ABOVE)
+    body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
+    scale = min(1.0, _SMALL_PX / max(height, width))
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    wide, close = look(image_srgb, [body, near])
+    share = _feather(near, size, image_srgb.shape)
+    classes = torch.lerp(
+        _over_photo(wide, size, image_srgb.shape), _over_photo(close, size, image_srgb.shape), share
+    )
+    classes = _connected(classes, share)
+    classes = classes / classes.sum(0).clamp_min(1e-6)
+    guide = F.interpolate(
+        torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255, size=size, mode="area"
+    )
+    matte = refine_matte(1 - classes[0].numpy(), guide[0].permute(1, 2, 0).numpy(), image_srgb)
+    return Segmentation(classes, matte)
+
+
+def _around(landmarks_px: np.ndarray, sides: float, above: float) -> Square:
+    """A square around a face; its side and the height of its centre are in extents of the landmarks."""
+    low, high = landmarks_px.min(0), landmarks_px.max(0)
+    extent_px = float((high - low).max())
+    x_px, y_px = (low + high) / 2
+    return Square(float(x_px), float(y_px) - above * extent_px, sides * extent_px)
+
+
+def _within(square: Square, height: int, width: int) -> Square:
+    """The square moved, and made smaller where it must be, to show little of what lies beyond the photo."""
+    side_px = min(square.side_px, float(max(height, width)))
+    x_px, y_px = (
+        min(max(at, side_px / 2), length - side_px / 2) if length > side_px else length / 2
+        for at, length in ((square.x_px, width), (square.y_px, height))
+    )
+    return Square(x_px, y_px, side_px)
+
+
+def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+    """Centres [h, w, 2] of the pixels of a small image, in the photo's pixels."""
+    y = (np.arange(size[0]) + PIXEL_CENTRE) * shape[0] / size[0]
+    x = (np.arange(size[1]) + PIXEL_CENTRE) * shape[1] / size[1]
+    return np.stack(np.meshgrid(x, y), -1)
+
+
+def _over_photo(seen: Seen, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
+    """Classes [C, h, w] of a square, over the whole photo; the background lies around it."""
+    grid = torch.from_numpy(2 * seen.square.to_share(_places(size, shape)) - 1).float()[None]
+    found = F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
+    outside = (grid[0].abs() > 1).any(-1)
+    return torch.where(outside, _only_background(), found)
+
+
+def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
+    """Weight [h, w] of a square over the photo: 1 well inside it, 0 outside."""
+    share = square.to_share(_places(size, shape))
+    inside = np.minimum(share, 1 - share).min(-1) / _FEATHER
+    return torch.from_numpy(inside.clip(0, 1)).float()
+
+
+def _connected(classes: Tensor, near: Tensor) -> Tensor:
+    """Classes without people who do not touch what is seen of this one in the near square."""
+    person = classes[0].numpy() < 0.5
+    parts, _ = label(person)
+    kept = np.unique(parts[person & (near.numpy() > 0.5)])
+    other = torch.from_numpy(person & ~np.isin(parts, kept))
+    return torch.where(other, _only_background(), classes)
+
+
+def _only_background() -> Tensor:
+    shares = torch.zeros(len(CLASSES), 1, 1)
+    shares[0] = 1
+    return shares

@@ -1,0 +1,322 @@
+"""Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
+
+A stored photo (`portrait_bank.py`) is mirrored or not, turned, scaled and shifted in the crop, over a
+background, sometimes with another person in it or something before the face. A camera then degrades it.
+Wide variation is what makes training on synthetic people serve for real ones (Wood et al., *Fake it till you
+make it*, 2021).
+"""
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from safetensors import safe_open
+from torch import Tensor
+
+from facerf_cli.colour import linear_to_srgb
+from facerf_cli.errors import InputError
+from facerf_cli.face.topology import MIRROR_68
+from facerf_cli.portrait.classes import class_index, mirrored_landmarks
+from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.synth.face_crops import blurred
+from facerf_cli.synth.random_fields import Uniform
+
+# Shares of samples: without a person, of a body without its head, grey, turned far, with a second person, and
+# with something before the face.
+_EMPTY, _HEADLESS, _GREY, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.25, 0.15, 0.3, 0.25
+_TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
+# Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
+_SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
+_SHIFT = (0.08, 0.12, 0.24)  # largest distance of the face from the crop's centre, in sides, for these
+_BORDERED = 0.2  # share of crops that reach beyond the photo, where its border goes on
+_BUST_BELOW = 0.7  # share of crops that end where the stored photo ends, or above
+_MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
+
+
+@dataclass(frozen=True)
+class PortraitCrops:
+    """Crops of B photos as a screen shows them, and what the Parsing Network should see in them.
+
+    crops [B, 3, S, S] in 0..1; alpha [B, S, S] in 0..1; label [B, S, S] long, class of what is covered;
+    weight [B, S, S], 0 where the truth is unknown; landmarks [B, N, 2] in sides of the crop; known [B, N]:
+    whether a landmark is in the crop; present [B]: whether there is a person.
+    """
+
+    crops: Tensor
+    alpha: Tensor
+    label: Tensor
+    weight: Tensor
+    landmarks: Tensor
+    known: Tensor
+    present: Tensor
+
+    def to(self, device: torch.device) -> "PortraitCrops":
+        """Move the crops to `device`."""
+        return PortraitCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """One stored photo: radiance [3, P, P] times alpha, alpha [P, P], label [P, P], landmarks [N, 2]."""
+
+    radiance: Tensor
+    alpha: Tensor
+    label: Tensor
+    landmarks_px: Tensor
+
+    @property
+    def side_px(self) -> int:
+        return self.alpha.shape[-1]
+
+    def mirrored(self) -> "_Photo":
+        """The mirrored photo."""
+        flipped = self.landmarks_px[torch.from_numpy(_MIRROR)] * torch.tensor([-1.0, 1.0])
+        moved = flipped + torch.tensor([float(self.side_px), 0.0])
+        return _Photo(self.radiance.flip(-1), self.alpha.flip(-1), self.label.flip(-1), moved)
+
+
+class StoredPortraits:
+    """The bank's photos, read when they are drawn."""
+
+    def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
+        self.paths = sorted(folder.glob("[0-9]*.safetensors"))
+        if not self.paths:
+            raise InputError(f"{folder}: no portraits; make them with `facerf train --stage parsing`")
+        self.backgrounds = backgrounds
+        self.provenance = provenance
+
+    def people(self, held_out: int) -> tuple[list[int], list[int]]:
+        """Indices of the people to train on, and of the first `held_out` ones."""
+        return list(range(held_out, len(self.paths))), list(range(held_out))
+
+    def draw(self, people: Sequence[int], side: int, generator: torch.Generator) -> PortraitCrops:
+        """Draw one crop [1, ...] of one of some people."""
+        photo = self._photo(people, generator)
+        headless = torch.rand((), generator=generator) < _HEADLESS
+        move = _Placement.below(photo, generator) if headless else _Placement.draw(photo, generator)
+        crop = move.crop(photo, side)
+        if headless:
+            crop = replace(crop, known=torch.zeros_like(crop.known), present=torch.zeros(1))
+        if torch.rand((), generator=generator) < _EMPTY:
+            crop = _without_person(crop)
+        image = self._composed(crop, people, side, generator)
+        if torch.rand((), generator=generator) < _OCCLUDED:
+            cover = _occluder(crop, generator)
+            other = self._background(side, generator)
+            image = image + cover * (other - image)
+            crop = replace(crop, alpha=crop.alpha * (1 - cover))
+        crop = replace(crop, crops=_as_taken(image, generator)[None])
+        return _bordered(crop, generator) if torch.rand((), generator=generator) < _BORDERED else crop
+
+    def _photo(self, people: Sequence[int], generator: torch.Generator) -> _Photo:
+        """Read a random photo of one of some people, mirrored or not."""
+        path = self.paths[people[int(torch.randint(len(people), (), generator=generator))]]
+        with safe_open(path, framework="pt") as file:
+            views, photos = file.get_slice("pictures").get_shape()[:2]
+            view, picture = (int(torch.randint(count, (), generator=generator)) for count in (views, photos))
+            stored = file.get_slice("pictures")[view, picture]
+            alpha, label = (file.get_slice(name)[view] for name in ("alpha", "label"))
+            landmarks_px = file.get_slice("landmarks_px")[view]
+        photo = _Photo((stored.float() / 255).square(), alpha.float() / 255, label, landmarks_px)
+        return photo.mirrored() if torch.rand((), generator=generator) < 0.5 else photo
+
+    def _background(self, side: int, generator: torch.Generator) -> Tensor:
+        """Draw a background [3, side, side]: a part of a stored one, blurred by a lens, of any exposure."""
+        uniform = Uniform(generator)
+        stored = self.backgrounds[int(torch.randint(len(self.backgrounds), (), generator=generator))]
+        reach = float(uniform(0.25, 1.0))
+        centre = (1 - reach) * uniform(-1, 1, 2)
+        at = torch.linspace(-1, 1, side) * reach
+        y, x = torch.meshgrid(at + centre[1], at + centre[0], indexing="ij")
+        grid = torch.stack([x, y], -1)[None]
+        seen = F.grid_sample((stored.float() / 255).square()[None], grid, align_corners=False)[0]
+        if torch.rand((), generator=generator) < 0.25:  # a plain wall
+            seen = blurred(seen, side / 6)
+        elif torch.rand((), generator=generator) < 0.6:
+            seen = blurred(seen, float(uniform(0, 8)))
+        exposure = torch.exp(uniform(-3.0, 1.0)) / 6 / seen.mean().clamp_min(1e-4)
+        return seen * exposure * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))
+
+    def _composed(
+        self, crop: PortraitCrops, people: Sequence[int], side: int, generator: torch.Generator
+    ) -> Tensor:
+        """Place the crop's person over a background, and perhaps before another person: [3, side, side]."""
+        image = self._background(side, generator)
+        if torch.rand((), generator=generator) < _SECOND:
+            other = self._photo(people, generator)
+            behind = _Placement.aside(other, generator).crop(other, side)
+            cover = behind.alpha * (behind.weight > 0)
+            blur_px = float(4 * Uniform(generator)(0, 1) ** 2)
+            shown, cover = (blurred(x, blur_px) for x in (behind.crops[0] * (behind.weight > 0), cover))
+            image = shown + (1 - cover) * image
+        return crop.crops[0] + (1 - crop.alpha) * image
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """A similarity from the crop to a stored photo: place [2] = at [2, 2] @ (x - 0.5) + centre, in pixels."""
+
+    matrix: Tensor
+    centre: Tensor
+
+    @staticmethod
+    def draw(photo: _Photo, generator: torch.Generator) -> "_Placement":
+        """Draw how a crop lies around a face."""
+        uniform = Uniform(generator)
+        framing = int(torch.multinomial(torch.tensor(_SIDE_SHARES), 1, generator=generator))
+        low, high = _SIDES[framing]
+        side_px = _extent(photo) * float(torch.exp(uniform(math.log(low), math.log(high))))
+        far = torch.rand((), generator=generator) < _TURNED_FAR
+        degrees = (
+            uniform(-_FAR_TURN_DEG, _FAR_TURN_DEG)
+            if far
+            else _TURN_DEG * torch.randn((), generator=generator)
+        )
+        matrix = _turn(math.radians(float(degrees))) * side_px
+        shift = uniform(-_SHIFT[framing], _SHIFT[framing], 2)
+        centre = _middle(photo) - matrix @ shift
+        if torch.rand((), generator=generator) < _BUST_BELOW:
+            centre[1] = torch.minimum(centre[1], torch.tensor(photo.side_px - side_px / 2))
+        return _Placement(matrix, centre)
+
+    @staticmethod
+    def below(photo: _Photo, generator: torch.Generator) -> "_Placement":
+        """Draw a crop of the body below the head, where badges and folds can look like faces."""
+        uniform = Uniform(generator)
+        extent_px = _extent(photo)
+        side_px = float(uniform(0.5, 1.3)) * extent_px
+        x, y = uniform(-0.8, 0.8), 0.75 + uniform(0, 0.6) + side_px / extent_px / 2
+        return _Placement(torch.eye(2) * side_px, _middle(photo) + extent_px * torch.stack([x, y]))
+
+    @staticmethod
+    def aside(photo: _Photo, generator: torch.Generator) -> "_Placement":
+        """Draw how a crop lies beside a face that is near its border or cut by it."""
+        uniform = Uniform(generator)
+        matrix = torch.eye(2) * _extent(photo) * float(torch.exp(uniform(math.log(2.2), math.log(9))))
+        x = (uniform(0.3, 0.6) * (1 - 2 * (torch.rand((), generator=generator) < 0.5).float())).view(1)
+        return _Placement(matrix, _middle(photo) - matrix @ torch.cat([x, uniform(-0.35, 0.2, 1)]))
+
+    def crop(self, photo: _Photo, side: int) -> PortraitCrops:
+        """Resample a photo: the image is radiance times alpha over black.
+
+        Below the stored photo its lowest row goes on, and is true where it shows a garment. Beside it nothing
+        is known of a person who touches the border there.
+        """
+        along = (torch.arange(side) + PIXEL_CENTRE) / side - 0.5
+        y, x = torch.meshgrid(along, along, indexing="ij")
+        place = torch.stack([x, y], -1) @ self.matrix.T + self.centre
+        grid = 2 * place / photo.side_px - 1
+        stored = torch.cat([photo.radiance, photo.alpha[None]])[None]
+        smaller = float(self.matrix.norm()) / 2**0.5 / side  # stored pixels in a pixel
+        if smaller > 1.5:
+            stored = F.avg_pool2d(stored, round(smaller), ceil_mode=True, count_include_pad=False)
+        seen = F.grid_sample(stored, grid[None], padding_mode="border", align_corners=False)[0]
+        label = F.grid_sample(
+            photo.label[None, None].float(), grid[None], "nearest", "border", align_corners=False
+        )[0, 0]
+        beside = (grid[..., 0].abs() > 1) | (grid[..., 1] < -1)
+        below = (grid[..., 1] > 1) & (label != class_index("garment"))
+        lost = (beside | below) & (seen[3] > 0)
+        landmarks = (photo.landmarks_px - self.centre) @ torch.linalg.inv(self.matrix).T + 0.5
+        known = ((landmarks > 0.01) & (landmarks < 0.99)).all(-1)  # false for NaN
+        return PortraitCrops(
+            crops=seen[:3][None],
+            alpha=seen[3][None],
+            label=label.long()[None],
+            weight=(~lost).float()[None],
+            landmarks=landmarks.nan_to_num(0.5)[None],
+            known=known[None],
+            present=torch.ones(1),
+        )
+
+
+def _extent(photo: _Photo) -> float:
+    """Larger side of the bounds of the 68 landmarks, in stored pixels."""
+    face = photo.landmarks_px[:68]
+    return float((face.amax(0) - face.amin(0)).max())
+
+
+def _middle(photo: _Photo) -> Tensor:
+    face = photo.landmarks_px[:68]
+    return (face.amax(0) + face.amin(0)) / 2
+
+
+def _turn(radians: float) -> Tensor:
+    cos, sin = math.cos(radians), math.sin(radians)
+    return torch.tensor([[cos, sin], [-sin, cos]])
+
+
+def _without_person(crop: PortraitCrops) -> PortraitCrops:
+    return replace(
+        crop,
+        crops=torch.zeros_like(crop.crops),
+        alpha=torch.zeros_like(crop.alpha),
+        weight=torch.ones_like(crop.weight),
+        known=torch.zeros_like(crop.known),
+        present=torch.zeros(1),
+    )
+
+
+def _bordered(crop: PortraitCrops, generator: torch.Generator) -> PortraitCrops:
+    """End the photo somewhere in the crop: from there on its border goes on, as in `parse.Square.cut`."""
+    side = crop.alpha.shape[-1]
+    ends = [int(float(end) * side) for end in Uniform(generator)(0, 0.18, 4)]
+    at = torch.arange(side)
+    rows, columns = at.clamp(ends[0], side - 1 - ends[1]), at.clamp(ends[2], side - 1 - ends[3])
+    inside = ((rows == at)[:, None] & (columns == at)).float()
+    x, y = (crop.landmarks[0] * side).long().clamp(0, side - 1).unbind(-1)
+    return replace(
+        crop,
+        crops=crop.crops[..., rows, :][..., columns],
+        weight=crop.weight * inside,
+        known=crop.known & (inside[y, x] > 0)[None],
+    )
+
+
+def _occluder(crop: PortraitCrops, generator: torch.Generator) -> Tensor:
+    """Draw the cover [S, S] of something before the person: an ellipse, a bar or a box, mostly aside."""
+    uniform, side = Uniform(generator), crop.alpha.shape[-1]
+    angle, distance = uniform(0, 2 * math.pi), uniform(0.1, 0.6)
+    centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
+    long, wide = torch.exp(uniform(-3.2, -0.9)), torch.exp(uniform(-3.5, -1.4))
+    tilt = uniform(0, math.pi)
+    along = (torch.arange(side) + PIXEL_CENTRE) / side
+    y, x = torch.meshgrid(along - centre[1], along - centre[0], indexing="ij")
+    a, b = (x * tilt.cos() + y * tilt.sin()) / long, (y * tilt.cos() - x * tilt.sin()) / wide
+    round_one = torch.rand((), generator=generator) < 0.5
+    distance = a.square() + b.square() if round_one else torch.maximum(a.abs(), b.abs()) ** 2
+    return ((1 - distance) * side * float(torch.minimum(long, wide)) / 2 + 0.5).clamp(0, 1)
+
+
+def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
+    """Take a photo of a scene [3, S, S]: colour cast, exposure, blur, tone curve, noise, JPEG; in 0..1."""
+    uniform = Uniform(generator)
+    image = image * torch.exp(uniform(-0.25, 0.25, 3, 1, 1))
+    if torch.rand((), generator=generator) < _GREY:
+        image = image.mean(0, keepdim=True).expand(3, -1, -1)
+    white = torch.exp(uniform(0.3, 2.2)) * image.mean().clamp_min(1e-4)
+    image = (image / white).clamp(0, 1)
+    if torch.rand((), generator=generator) < 0.5:
+        image = blurred(image, float(uniform(0, 1) ** 2 * 2.5))
+    encoded = torch.from_numpy(linear_to_srgb(image.numpy())) ** torch.exp(uniform(-0.45, 0.45))
+    encoded = ((encoded - 0.5) * uniform(0.7, 1.15) + 0.5 + uniform(-0.08, 0.08)).clamp(0, 1)
+    encoded = encoded + uniform(0, 1) ** 3 * 0.12 * torch.randn(encoded.shape, generator=generator)
+    encoded = encoded.clamp(0, 1)
+    if torch.rand((), generator=generator) < 0.4:
+        return _jpeg(encoded, int(uniform(15, 95)))
+    return encoded
+
+
+def _jpeg(image: Tensor, quality: int) -> Tensor:
+    """Compress and restore an image [3, S, S] in 0..1."""
+    pixels = (255 * image).round().byte().permute(1, 2, 0).numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=quality)
+    return torch.from_numpy(np.array(Image.open(buffer))).permute(2, 0, 1).float() / 255

@@ -1,0 +1,161 @@
+"""Stage `parsing`: the Parsing Network, on crops of synthetic portraits.
+
+The classes' loss is a cross-entropy with the matte as a soft target; it is the matte's, too, with an error of
+the matte and of its gradient. A landmark's error is weighed by the error that the network expects of it
+(Wood et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.colour import srgb_to_linear
+from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.network.parsing import Parsing, ParsingNetwork
+from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_VALIDATION_SEED = 20212
+_SHEET_ROWS, _SHEET_COLUMNS = 6, 4
+_RARE = ("brows", "eyes", "lips", "mouth", "beard", "ears", "glasses", "headwear", "hand")
+_LEAST_EYES = 0.03  # sides of the crop; smaller distances of the eyes are taken as this
+
+
+@dataclass(frozen=True)
+class ParsingObjectiveSettings:
+    """Weights of the terms, and the held-out people and draws of each for validation."""
+
+    classes: float = 1.0
+    rare: float = 2.0  # weight of a pixel of small classes, relative to others
+    matte: float = 1.0
+    landmarks: float = 0.15  # of their negative log-likelihood
+    distance: float = 12.0  # of their distance, in sides
+    presence: float = 0.1
+    held_out_people: int = 12
+    held_out_draws: int = 12
+
+
+class ParsingObjective(Objective):
+    """Errors of classes, matte, landmarks and presence on synthetic portraits."""
+
+    rarity: Tensor
+
+    def __init__(
+        self,
+        portraits: StoredPortraits,
+        network: ParsingNetwork | None = None,
+        settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
+    ) -> None:
+        super().__init__()
+        network = network or ParsingNetwork()
+        self.networks = nn.ModuleDict({"parsing": network})
+        self.chooses_by = "total"
+        self.provenance = portraits.provenance
+        self.portraits = portraits
+        self.side = network.side
+        self.settings = settings
+        self.people, self.held_out = portraits.people(settings.held_out_people)
+        rarity = [settings.rare if name in _RARE else 1.0 for name in CLASSES]
+        self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
+        self._validation: PortraitCrops | None = None
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> PortraitCrops:
+        """Draw `count` crops of random people."""
+        return concatenate(
+            [self.portraits.draw(self.people, self.side, generator_of(i)) for i in range(count)]
+        )
+
+    def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
+        """Compute the weighted terms, each a mean over crops."""
+        with self.mixed_precision():
+            found: Parsing = self.networks["parsing"](batch.crops)
+        settings = self.settings
+        log_share = found.logits.float().log_softmax(1)
+        covered = log_share.gather(1, batch.label[:, None])[:, 0]
+        entropy = -(batch.alpha * self.rarity[batch.label] * covered + (1 - batch.alpha) * log_share[:, 0])
+        matte = 1 - log_share[:, 0].exp()
+        off = (matte - batch.alpha) * batch.weight
+        edges = off.diff(dim=1).abs().mean() + off.diff(dim=2).abs().mean()
+        distance = (found.landmarks - batch.landmarks).norm(dim=-1)
+        log_error = found.log_error.clamp(-7, 1)
+        likelihood = distance * (-log_error).exp() + 2 * log_error
+        known = batch.known.float() * batch.present[:, None]
+        count = known.sum().clamp_min(1)
+        presence = F.binary_cross_entropy_with_logits(found.presence, batch.present)
+        return {
+            "classes": settings.classes * (entropy * batch.weight).mean(),
+            "matte": settings.matte * (off.abs().mean() + edges),
+            "landmarks": settings.landmarks * (likelihood * known).sum() / count,
+            "distance": settings.distance * (distance * known).sum() / count,
+            "presence": settings.presence * presence,
+        }
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Measure held-out people: IoU by class, error of the matte, landmarks in inter-ocular distances."""
+        if self._validation is None:
+            self._validation = self._drawn()
+        batch = self._validation.to(next(self.networks.parameters()).device)
+        found = self._found(batch)
+        label = torch.where(batch.alpha >= 0.5, batch.label, 0)
+        chosen, counted = found.logits.argmax(1), batch.weight > 0
+        overlap = {}
+        for index, name in enumerate(CLASSES):
+            either = ((label == index) | (chosen == index)) & counted
+            both = (label == index) & (chosen == index) & counted
+            if (label == index).any():
+                overlap[f"iou_{name}"] = float(both.sum() / either.sum())
+        left, right = OUTER_EYE_CORNERS
+        eyes = (batch.landmarks[:, left] - batch.landmarks[:, right]).norm(dim=-1).clamp_min(_LEAST_EYES)
+        percent = 100 * (found.landmarks - batch.landmarks).norm(dim=-1) / eyes[:, None]
+        known = batch.known & (batch.present > 0)[:, None]
+        whole = known[:, :68].all(1)
+        matte = ((1 - found.classes[:, 0]) - batch.alpha).abs()[counted].mean()
+        metrics = {
+            "mean_iou": float(np.mean(list(overlap.values()))),
+            "matte_error": float(matte),
+            "landmarks_percent": float(percent[:, :68][whole].median(1).values.mean()),
+            "more_percent": float(percent[:, 68:][whole][known[whole, 68:]].median()),
+            "presence_wrong": float(((found.presence > 0) != (batch.present > 0)).float().mean()),
+            **overlap,
+        }
+        metrics["total"] = 1 - metrics["mean_iou"] + metrics["landmarks_percent"] / 20
+        return Validation(metrics, self._sheet(batch, found))
+
+    def _found(self, batch: PortraitCrops) -> Parsing:
+        parts = [self.networks["parsing"](crops) for crops in torch.split(batch.crops, 16)]
+        return Parsing(*(torch.cat(part) for part in zip(*parts, strict=True)))
+
+    def _drawn(self) -> PortraitCrops:
+        return concatenate(
+            [
+                self.portraits.draw([person], self.side, seeded(_VALIDATION_SEED, person, index))
+                for index in range(self.settings.held_out_draws)
+                for person in self.held_out
+            ]
+        )
+
+    def _sheet(self, batch: PortraitCrops, found: Parsing) -> np.ndarray:
+        """Held-out crops with true landmarks in green and found ones in red, beside the found classes."""
+        palette = torch.from_numpy(np.random.default_rng(2).uniform(0.15, 1, (len(CLASSES), 3))).float()
+        palette[0] = 0
+        count, side = min(_SHEET_ROWS * _SHEET_COLUMNS, len(batch.crops)), batch.crops.shape[-1]
+        cells = []
+        for index in range(count):
+            image = batch.crops[index].cpu().permute(1, 2, 0).clone()
+            for points, colour in (
+                (batch.landmarks[index][batch.known[index]], (0.0, 1.0, 0.0)),
+                (found.landmarks[index][batch.known[index]], (1.0, 0.0, 0.0)),
+            ):
+                for x, y in (points.cpu() * side).long().clamp(0, side - 2).tolist():
+                    image[y : y + 2, x : x + 2] = torch.tensor(colour)
+            shares = found.classes[index].permute(1, 2, 0).cpu()
+            cells.append(torch.cat([image, shares @ palette], 1))
+        rows = [cells[first : first + _SHEET_COLUMNS] for first in range(0, count, _SHEET_COLUMNS)]
+        shown = torch.cat([torch.cat(row, 1) for row in rows if len(row) == len(rows[0])], 0)
+        return np.asarray(srgb_to_linear(shown.numpy()))

@@ -1,0 +1,84 @@
+"""`facerf segment` from the command line: layers that sum to the matte, and a person to put elsewhere."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.files.images import read_image
+from facerf_cli.main import main
+from facerf_cli.portrait.classes import CLASSES
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+ENDINGS = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("cut")
+    assert main(["segment", str(PHOTO), "-o", str(output)]) == 0
+    return output
+
+
+@pytest.fixture(scope="module")
+def layers(cut: Path) -> dict[str, np.ndarray]:
+    image = oiio.ImageBuf(str(cut / "astronaut_segment.exr"))
+    pixels = image.get_pixels(oiio.FLOAT)
+    return {name: pixels[..., index] for index, name in enumerate(image.spec().channelnames)}
+
+
+def test_every_file_is_there_and_in_the_report(cut: Path) -> None:
+    row = json.loads((cut / "report.jsonl").read_text())
+    assert row["outputs"] == [f"astronaut{ending}" for ending in ENDINGS]
+    assert all((cut / name).is_file() for name in row["outputs"])
+    assert 0 < row["confidence"] <= 1 and row["certainty"] in ("sure", "unsure", "doubtful")
+    assert set(row["factors"]) == {"unclear", "small", "profile", "covered"}
+
+
+def test_classes_sum_to_the_matte_over_the_whole_frame(layers: dict[str, np.ndarray]) -> None:
+    matte = layers["person.A"]
+    photo = read_image(PHOTO).pixels
+    assert matte.shape == photo.shape[:2] and matte.min() >= 0 and matte.max() <= 1
+    names = [f"class.{name}" for name in CLASSES[1:]]
+    assert np.abs(sum(layers[name] for name in names) - matte).max() < 0.01  # half floats
+    assert {"R", "G", "B", "A", "person.A", *names} == set(layers)
+
+
+def test_the_person_over_the_photos_background_is_the_photo(layers: dict[str, np.ndarray]) -> None:
+    photo = read_image(PHOTO).pixels
+    own = np.stack([layers[letter] for letter in "RGB"], -1)
+    inside = layers["person.A"] == 1
+    assert inside.mean() > 0.1 and np.abs(own - photo)[inside].max() < 0.02
+    assert (own[layers["A"] == 0] == 0).all()
+
+
+def test_face_hair_and_garment_lie_where_they_are(layers: dict[str, np.ndarray], cut: Path) -> None:
+    points = read_landmarks(cut / "astronaut_landmarks.json")
+    nose, brow = points[30].astype(int), points[19:25].mean(0)
+    up = int(brow[1] - 0.55 * (points[8, 1] - brow[1]))
+    assert layers["class.skin"][nose[1], nose[0]] > 0.5
+    assert layers["class.hair"][up, int(brow[0])] > 0.5
+    assert layers["class.garment"][-20, int(nose[0])] > 0.5
+    assert layers["person.A"][5, -5] < 0.5  # the flag behind her is no part of her
+
+
+def test_the_landmarks_serve_as_input(cut: Path, tmp_path: Path) -> None:
+    document = json.loads((cut / "astronaut_landmarks.json").read_text())
+    assert len(document["landmarks"]) == len(document["expected_error_px"]) == 68
+    assert "left iris" in document["more"]
+    given = str(cut / "astronaut_landmarks.json")
+    assert main(["segment", str(PHOTO), "-o", str(tmp_path), "--landmarks", given]) == 0
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert "confidence" not in row  # they are the user's
+
+
+def test_a_photo_without_a_face_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    noise = np.random.default_rng(0).random((64, 80, 3)).astype(np.float32)
+    buffer = oiio.ImageBuf(oiio.ImageSpec(80, 64, 3, "uint8"))
+    buffer.set_pixels(oiio.ROI(), noise)
+    buffer.write(str(tmp_path / "noise.png"))
+    assert main(["segment", str(tmp_path / "noise.png"), "-o", str(tmp_path / "out")]) == 1
+    assert "no face found" in " ".join(capsys.readouterr().err.split())

@@ -1,0 +1,97 @@
+"""The Parsing Network: shares, means of heatmaps, contrast, and its settings in a checkpoint."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.network import parsing
+from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
+
+SMALL = ParsingSettings((8, 8, 12, 16), (0, 1, 1, 1), 64, 5, 70)
+
+
+@pytest.fixture(scope="module")
+def network() -> ParsingNetwork:
+    torch.manual_seed(0)
+    return ParsingNetwork(SMALL).eval()
+
+
+def crops(count: int = 2, side: int = 64) -> torch.Tensor:
+    return torch.rand(count, 3, side, side, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize("side", [64, 96])
+def test_sizes(network: ParsingNetwork, side: int) -> None:
+    found = network(crops(side=side))
+    assert found.logits.shape == (2, 5, side, side) and found.landmarks.shape == (2, 70, 2)
+    assert found.log_error.shape == (2, 70) and found.presence.shape == (2,)
+    assert torch.allclose(found.classes.sum(1), torch.ones(2, side, side), atol=1e-5)
+
+
+def test_brightness_and_contrast_do_not_matter(network: ParsingNetwork) -> None:
+    plain, other = network(crops()), network(0.2 + 0.5 * crops())
+    # the deviation has a floor of 0.02 under it
+    assert (plain.classes - other.classes).abs().max() < 0.02
+    assert (plain.landmarks - other.landmarks).abs().max() < 0.005
+
+
+def test_a_photo_in_a_batch_is_parsed_as_alone(network: ParsingNetwork) -> None:
+    both, alone = network(crops()), network(crops()[1:])
+    assert torch.allclose(both.logits[1:], alone.logits, atol=1e-4)
+
+
+def test_landmarks_are_the_means_of_their_heatmaps() -> None:
+    heat = torch.full((1, 2, 4, 8), -30.0)
+    heat[0, 0, 1, 6] = 30.0  # right of the middle, above it
+    heat[0, 1, 3, 0] = heat[0, 1, 3, 4] = 30.0
+    means = parsing._means(heat)[0]
+    assert torch.allclose(means, torch.tensor([[6.5 / 8, 1.5 / 4], [2.5 / 8, 3.5 / 4]]), atol=1e-6)
+
+
+def test_every_weight_takes_part(network: ParsingNetwork) -> None:
+    found = network(crops())
+    total = found.logits.square().mean() + found.landmarks.square().mean()
+    (total + found.log_error.square().mean() + found.presence.square().mean()).backward()
+    dead = [
+        name for name, weight in network.named_parameters() if weight.grad is None or not weight.grad.any()
+    ]
+    assert not dead
+
+
+def test_a_checkpoint_gives_the_same_network(network: ParsingNetwork, tmp_path: Path) -> None:
+    save_networks(tmp_path / "a.safetensors", {"parsing": network}, {"layout_version": LAYOUT_VERSION})
+    loaded = load_networks(tmp_path / "a.safetensors", LAYOUT_VERSION)[0]["parsing"]
+    assert isinstance(loaded, ParsingNetwork) and loaded.settings == SMALL
+    assert (loaded(crops()).landmarks - network(crops()).landmarks).abs().max() < 0.01  # halves are stored
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"widths": [8, 8]},
+        {"widths": [8, 8, 12, 999]},
+        {"blocks": [0, 1, 1]},
+        {"blocks": [0, 1, 1, 99]},
+        {"classes": 1},
+        {"landmarks": 7},
+        {"side": 65},
+    ],
+)
+def test_settings_that_make_no_network_are_refused(change: dict[str, object], tmp_path: Path) -> None:
+    described = ParsingNetwork(SMALL).as_metadata() | change
+    with pytest.raises(ValueError, match="no Parsing Network"):
+        ParsingNetwork.from_metadata(described)
+
+
+def test_a_file_without_the_network_is_named(tmp_path: Path) -> None:
+    from facerf_cli.portrait.parse import parsing_network
+
+    save_networks(
+        tmp_path / "a.safetensors", {"parsing": ParsingNetwork(SMALL)}, {"layout_version": LAYOUT_VERSION}
+    )
+    with pytest.raises(InputError, match="no Parsing Network of this version"):
+        parsing_network(tmp_path / "a.safetensors")

@@ -1,0 +1,128 @@
+"""Faces are found in small, dark, turned and large images and in tight crops; by facerf and by dlib."""
+
+import io
+
+import numpy as np
+import pytest
+import skimage.data
+import skimage.transform
+from PIL import Image
+
+from facerf_cli.colour import srgb_to_linear
+from facerf_cli.errors import InputError
+from facerf_cli.face.dlib_landmarks import predictor_path
+from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.portrait.find import detect_faces, find_faces
+
+PHOTO = skimage.data.astronaut()[:400, 40:400]  # not square
+INNER = slice(len(CONTOUR), None)
+
+
+@pytest.fixture(scope="module", params=["facerf", "dlib"])
+def source(request):
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def landmarks_px(source):
+    (face,) = detect_faces(PHOTO, source)
+    return face.landmarks_px
+
+
+def iod_px(landmarks_px):
+    left, right = OUTER_EYE_CORNERS
+    return np.linalg.norm(landmarks_px[left] - landmarks_px[right])
+
+
+def error_iod(found, expected):
+    return np.linalg.norm(found - expected, axis=1).mean() / iod_px(expected)
+
+
+def resized(image, scale):
+    size = [round(length * scale) for length in image.shape[:2]]
+    return np.round(255 * skimage.transform.resize(image, size, anti_aliasing=True)).astype(np.uint8)
+
+
+def test_a_mirrored_photo_has_mirrored_landmarks(source, landmarks_px):
+    (face,) = detect_faces(PHOTO[:, ::-1], source)
+    back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
+    assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
+    assert error_iod(back, landmarks_px) < 0.02
+
+
+@pytest.mark.parametrize("turns", [1, 2, 3])
+def test_turned_photos(source, landmarks_px, turns):
+    height, width = PHOTO.shape[:2]
+    x, y = landmarks_px.T
+    expected = {1: (y, width - x), 2: (width - x, height - y), 3: (height - y, x)}[turns]
+    (face,) = detect_faces(np.rot90(PHOTO, turns), source)
+    assert error_iod(face.landmarks_px, np.stack(expected, -1)) < 0.02
+    left, top, right, bottom = face.box_px
+    assert left < face.landmarks_px[30, 0] < right and top < face.landmarks_px[30, 1] < bottom
+
+
+def test_a_badge_beside_a_sure_face_is_no_face(source, landmarks_px):
+    (face,) = detect_faces(
+        skimage.data.astronaut(), source
+    )  # whose sleeve badge alone the detector would take
+    assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.02
+
+
+def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(source, landmarks_px):
+    buffer = io.BytesIO()
+    Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
+    (face,) = detect_faces(np.array(Image.open(buffer)), source)
+    assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
+
+
+def test_a_small_face(source, landmarks_px):
+    (face,) = detect_faces(resized(PHOTO, 0.4), source)
+    assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
+
+
+def test_a_large_image(source, landmarks_px):
+    large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
+    (face,) = detect_faces(large, source)
+    assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
+
+
+def test_a_tight_crop(source, landmarks_px):
+    low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
+    (face,) = detect_faces(PHOTO[low[1] : high[1], low[0] : high[0]], source)
+    assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
+
+
+def test_a_dark_photo(source, landmarks_px):
+    linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
+    (face,) = detect_faces(np.round(PHOTO * 0.03).astype(np.uint8), source)
+    assert error_iod(face.landmarks_px, landmarks_px) < 0.08
+    (face,) = find_faces(linear * 1e-3, "dark.exr", landmarks_from=source)
+    assert error_iod(face.landmarks_px, landmarks_px) < 0.02
+
+
+def test_several_faces_from_left_to_right(source, landmarks_px):
+    small = np.zeros_like(PHOTO)
+    small[100:300, 90:270] = resized(PHOTO, 0.5)
+    pair = np.concatenate([small, PHOTO], 1)
+    faces = detect_faces(pair, source)
+    assert len(faces) == 2 and faces[0].area_px < faces[1].area_px
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3), (200, 300, 3)])
+def test_no_face_names_the_image_and_a_way_out(shape):
+    with pytest.raises(InputError, match=r"holiday\.png: no face found.*--landmarks"):
+        find_faces(np.random.default_rng(0).random(shape, np.float32), "holiday.png")
+
+
+def test_only_display_images_are_searched():
+    with pytest.raises(ValueError, match="uint8"):
+        detect_faces(np.zeros((5, 5, 3), np.float32), source)
+
+
+def test_both_find_the_same_landmarks():
+    own, other = (detect_faces(PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib"))
+    assert error_iod(own[INNER], other[INNER]) < 0.08
+
+
+def test_the_predictor_is_found_without_importing_its_package():
+    assert predictor_path().is_file()

@@ -1,0 +1,53 @@
+"""The matte follows the photo's edges; the person's colours lose the background's."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from facerf_cli.portrait.matte import person_colours, refine_matte
+
+SIDE = 96
+
+
+def disc(side: int, radius: float = 0.3) -> np.ndarray:
+    """A disc [side, side] whose edge is a pixel wide."""
+    at = (np.arange(side) + 0.5) / side - 0.5
+    away = np.hypot(*np.meshgrid(at, at))
+    return ((radius - away) * side + 0.5).clip(0, 1).astype(np.float32)
+
+
+def photo_of(matte: np.ndarray) -> np.ndarray:
+    """An orange disc over green, sRGB uint8."""
+    mixed = matte[..., None] * [230, 140, 60] + (1 - matte[..., None]) * [30, 120, 70]
+    return np.round(mixed).astype(np.uint8)
+
+
+def test_a_blurred_matte_gets_the_photos_edge_at_the_photos_size() -> None:
+    true = disc(4 * SIDE)
+    photo = photo_of(true)
+    small = disc(SIDE)
+    rough = gaussian_filter(small, 0.8)
+    refined = refine_matte(rough, photo_of(small) / np.float32(255), photo)
+    assert refined.shape == true.shape
+    plain = np.repeat(np.repeat(rough, 4, 0), 4, 1)
+    assert np.abs(refined - true).mean() < 0.1 * np.abs(plain - true).mean()
+
+
+def test_where_the_matte_is_sure_no_pattern_of_the_photo_shows() -> None:
+    pattern = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)
+    for value in (0.0, 1.0):
+        sure = np.full((SIDE, SIDE), value, np.float32)
+        assert (refine_matte(sure, pattern / np.float32(255), pattern) == value).all()
+
+
+@pytest.mark.parametrize("value", [0.25, 0.5, 0.9])
+def test_mixed_pixels_get_the_persons_colour_back(value: float) -> None:
+    own, other = np.array([0.6, 0.2, 0.05]), np.array([0.05, 0.3, 0.1])
+    matte = disc(SIDE)
+    matte[(matte > 0) & (matte < 1)] = value
+    photo = (matte[..., None] * own + (1 - matte[..., None]) * other).astype(np.float32)
+    found = person_colours(photo, matte)
+    edge = (matte > 0) & (matte < 1)
+    assert np.abs(found[edge] - own).max() < 0.05 < np.abs(photo[edge] - own).max()
+    assert (found[matte == 0] == 0).all()
+    assert np.abs(found[matte == 1] - own).max() < 1e-3

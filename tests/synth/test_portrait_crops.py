@@ -1,0 +1,144 @@
+"""Training crops: landmarks and classes move with the pixels, whatever is drawn."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from facerf_cli.errors import InputError
+from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
+from facerf_cli.synth import portrait_crops
+from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+
+SIDE, STORED = 64, 96
+LANDMARKS = 68 + len(MORE_LANDMARKS)
+EAR_BACKS = [68 + MORE_LANDMARKS.index(f"{side} ear back") for side in ("left", "right")]
+
+
+@pytest.fixture(scope="module")
+def portraits(tmp_path_factory: pytest.TempPathFactory) -> StoredPortraits:
+    """Two people: discs of skin on a garment, with landmarks in a ring around the disc's middle."""
+    folder = tmp_path_factory.mktemp("portraits")
+    at = torch.arange(STORED) + 0.5
+    disc = (at[:, None] - 40).square() + (at - 50).square() < 18**2
+    garment = (at[:, None] > 62).expand(STORED, STORED)
+    angle = torch.arange(LANDMARKS) / 68 * 2 * torch.pi
+    ring = torch.stack([50 + 14 * angle.cos(), 40 + 14 * angle.sin()], -1)
+    ring[EAR_BACKS] = torch.nan
+    for person in range(2):
+        label = torch.where(disc, class_index("skin"), class_index("garment")).byte()
+        picture = torch.where(disc, 200, 60)[None] * torch.ones(3, 1, 1) * (disc | garment)
+        save_file(
+            {
+                "pictures": picture.byte().expand(2, 3, 3, STORED, STORED).contiguous(),
+                "alpha": (255 * (disc | garment)).byte().expand(2, STORED, STORED).contiguous(),
+                "label": label.expand(2, STORED, STORED).contiguous(),
+                "landmarks_px": ring.expand(2, -1, 2).contiguous(),
+                "rotation": torch.eye(3).expand(2, 3, 3).contiguous(),
+            },
+            folder / f"{person:05}.safetensors",
+        )
+    backgrounds = torch.randint(0, 60, (3, 3, 32, 32), generator=torch.Generator().manual_seed(0)).byte()
+    return StoredPortraits(folder, backgrounds, {"licence": "MIT"})
+
+
+def drawn(portraits: StoredPortraits, seed: int) -> PortraitCrops:
+    return portraits.draw([0, 1], SIDE, torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every sample shows a person, uncovered and whole."""
+    for name in ("_EMPTY", "_HEADLESS", "_OCCLUDED", "_BORDERED", "_SECOND"):
+        monkeypatch.setattr(portrait_crops, name, 0.0)
+
+
+def test_a_draw_is_a_function_of_its_generator(portraits: StoredPortraits) -> None:
+    for seed in range(12):
+        one, two = drawn(portraits, seed), drawn(portraits, seed)
+        assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in vars(one))
+        assert one.crops.min() >= 0 and one.crops.max() <= 1 and one.crops.isfinite().all()
+
+
+@pytest.mark.usefixtures("plain")
+def test_landmarks_and_classes_move_with_the_pixels(portraits: StoredPortraits) -> None:
+    seen = 0
+    for seed in range(40):
+        crop = drawn(portraits, seed)
+        assert not crop.known[0, EAR_BACKS].any()  # they are missing in the stored photo
+        ring = crop.landmarks[0, :68]
+        middle = ring.mean(0)
+        radius = (ring - middle).norm(dim=-1).mean() * SIDE
+        at = (torch.arange(SIDE) + 0.5) / SIDE
+        away = ((at[:, None] - middle[1]).square() + (at - middle[0]).square()).sqrt() * SIDE
+        inside, around = away < radius - 2, (away > radius * 18 / 14 + 2) & (away < radius * 18 / 14 + 3)
+        skin = (crop.label[0] == class_index("skin")) & (crop.alpha[0] > 0.5)
+        if crop.known[0, :68].all() and inside.any():
+            seen += 1
+            assert skin[inside].float().mean() > 0.95 and not skin[around].any()
+    assert seen > 20
+
+
+@pytest.mark.usefixtures("plain")
+def test_a_mirrored_photo_has_mirrored_landmarks(portraits: StoredPortraits) -> None:
+    photo = portraits._photo([0], torch.Generator().manual_seed(0))
+    mirrored = photo.mirrored()
+    assert torch.equal(mirrored.alpha, photo.alpha.flip(-1))
+    ear, other = (68 + MORE_LANDMARKS.index(f"{side} ear top") for side in ("left", "right"))
+    assert torch.allclose(
+        mirrored.landmarks_px[ear],
+        photo.landmarks_px[other] * torch.tensor([-1.0, 1]) + torch.tensor([STORED, 0.0]),
+    )
+    again = mirrored.mirrored()
+    assert torch.allclose(again.landmarks_px.nan_to_num(-1), photo.landmarks_px.nan_to_num(-1), atol=1e-4)
+
+
+def test_an_empty_crop_has_no_person(portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portrait_crops, "_EMPTY", 1.0)
+    crop = drawn(portraits, 3)
+    assert crop.present.tolist() == [0] and not crop.known.any() and not crop.alpha.any()
+    assert crop.crops.std() > 0.01
+
+
+def test_a_body_without_its_head_is_no_head(
+    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, share in (("_EMPTY", 0.0), ("_HEADLESS", 1.0), ("_BORDERED", 0.0)):
+        monkeypatch.setattr(portrait_crops, name, share)
+    crops = [drawn(portraits, seed) for seed in range(12)]
+    assert all(crop.present.tolist() == [0] and not crop.known.any() for crop in crops)
+    assert not any(
+        ((crop.label == class_index("skin")) & (crop.alpha > 0.5)).float().mean() > 0.2 for crop in crops
+    )
+    assert sum(bool((crop.label == class_index("garment")).any()) for crop in crops) > 6
+
+
+def test_what_stands_before_a_person_is_background(
+    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    covered = 0
+    for seed in range(20):
+        monkeypatch.setattr(portrait_crops, "_OCCLUDED", 1.0)
+        with_one = drawn(portraits, seed)
+        monkeypatch.setattr(portrait_crops, "_OCCLUDED", 0.0)
+        without = drawn(portraits, seed)
+        assert (with_one.alpha <= without.alpha + 1e-6).all()
+        covered += int(float(with_one.alpha.sum()) < float(without.alpha.sum()) - 5)
+    assert covered > 5
+
+
+def test_beyond_the_photos_border_nothing_is_known(
+    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(portrait_crops, "_BORDERED", 1.0)
+    crop = drawn(portraits, 5)
+    outside = crop.weight[0, 0] == 0
+    assert outside.all() and torch.equal(crop.crops[0, :, 0], crop.crops[0, :, 1])
+    px = (crop.landmarks[0] * SIDE).long().clamp(0, SIDE - 1)
+    assert not crop.known[0][crop.weight[0][px[:, 1], px[:, 0]] == 0].any()
+
+
+def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no portraits"):
+        StoredPortraits(tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
