@@ -3,13 +3,12 @@
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
+from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 _REACH = 0.016  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
 _STRETCH = 0.1  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
-_SURE = 0.02  # a matte this close to 0 or 1 all around is taken as 0 or 1
 _COLOUR_REACH = (
     0.03,
     0.006,
@@ -27,16 +26,11 @@ def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarr
     reach = max(1, round(_REACH * max(matte.shape)))
     slope, offset = _local_lines(matte, guide_srgb, reach)
     size = photo_srgb.shape[:2]
-    sure = _enlarged(
-        np.stack([minimum_filter(matte, 2 * reach + 1), maximum_filter(matte, 2 * reach + 1)]), size
-    )
     lines = _enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
     refined = lines[3]
     for channel in range(3):
         refined += lines[channel] * photo_srgb[..., channel] / np.float32(255)
     refined = ((refined - _STRETCH) / (1 - 2 * _STRETCH)).clip(0, 1)
-    refined[sure[0] > 1 - _SURE] = 1
-    refined[sure[1] < _SURE] = 0
     return np.asarray(refined)
 
 

@@ -1,6 +1,6 @@
 """Classes and matte of a person over the whole frame of a photo, as layers.
 
-The Parsing Network looks twice: at the whole body, and, for detail, at head and shoulders.
+The Parsing Network looks at the whole body and, for detail, at squares of several sizes around the head.
 """
 
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ from facerf_cli.portrait.matte import refine_matte
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
-# Sides of the squares around head and shoulders and around the body, in extents of the landmarks, and how far
-# their centres lie above the middle of the landmarks.
-_NEAR_SIDES, _NEAR_ABOVE = 3.4, 0.1
+# Sides of the squares around the head and around the body, in extents of the landmarks, and how far their
+# centres lie above the middle of the landmarks. Views of squares of several sizes are averaged.
+_NEAR_SIDES, _NEAR_ABOVE = (2.2, 4.0), 0.1
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
-_FEATHER = 0.08  # border of the near square where it gives way to the other one, in its sides
+_FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 512  # longest side at which classes are joined
 
@@ -56,16 +56,17 @@ class Segmentation:
 def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3]."""
     height, width = image_srgb.shape[:2]
-    near = _around(landmarks_px, _NEAR_SIDES, _NEAR_ABOVE)
     body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
+    near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     scale = min(1.0, _SMALL_PX / max(height, width))
     size = max(1, round(height * scale)), max(1, round(width * scale))
-    wide, close = look(image_srgb, [body, near])
-    share = _feather(near, size, image_srgb.shape)
-    classes = torch.lerp(
-        _over_photo(wide, size, image_srgb.shape), _over_photo(close, size, image_srgb.shape), share
-    )
-    classes = _connected(classes, share)
+    wide, *close = look(image_srgb, [body, *near])
+    shares = torch.stack([_feather(square, size, image_srgb.shape) for square in near])
+    seen = torch.stack([_over_photo(one, size, image_srgb.shape) for one in close])
+    mean = (shares[:, None] * seen).sum(0) / shares.sum(0).clamp_min(1e-6)
+    largest = shares.amax(0)
+    classes = torch.lerp(_over_photo(wide, size, image_srgb.shape), mean, largest)
+    classes = _connected(classes, largest)
     classes = classes / classes.sum(0).clamp_min(1e-6)
     guide = F.interpolate(
         torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255, size=size, mode="area"

@@ -1,0 +1,26 @@
+"""Views of squares as a network could give them, made up for tests."""
+
+import numpy as np
+import torch
+
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import LANDMARKS, Seen, Square
+
+SIDE = 64
+
+
+def places() -> tuple[torch.Tensor, torch.Tensor]:
+    """Places right and down [S, S] of the pixels of a square, in its sides."""
+    at = (torch.arange(SIDE) + 0.5) / SIDE
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    return x, y
+
+
+def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 1.0) -> Seen:
+    """A view that gives each region [S, S] bool its class, later ones over earlier, on background."""
+    label = torch.zeros(SIDE, SIDE, dtype=torch.long)
+    for name, inside in regions.items():
+        label[inside] = class_index(name)
+    classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
+    landmarks = square.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (LANDMARKS, 2)))
+    return Seen(square, classes, landmarks, np.full(LANDMARKS, 0.01 * square.side_px), presence)

@@ -1,0 +1,56 @@
+"""Confidence falls with each thing that makes a photo hard, and names it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.portrait.confidence import Confidence, confidence_in
+from facerf_cli.portrait.find import FoundFace
+from facerf_cli.portrait.parse import LANDMARKS, Square
+from tests.portrait.seen import places, seen_of
+
+
+def face(
+    size_px: float = 300.0,
+    error: float = 0.01,
+    turned: float = 1.0,
+    covered: bool = False,
+    presence: float = 1.0,
+) -> FoundFace:
+    """A face seen well, but for what a test changes; `turned` narrows it."""
+    everywhere = torch.ones_like(places()[0], dtype=torch.bool)
+    seen = seen_of(Square(0, 0, 2 * size_px), {"hand" if covered else "skin": everywhere}, presence)
+    flat = LANDMARKS_M[:, :2] * [turned, -1]
+    points = np.zeros((LANDMARKS, 2))
+    points[:68] = size_px * flat / np.ptp(flat, axis=0).max()
+    seen = replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
+    return FoundFace((0, 0, size_px, size_px), 1.0, points[:68], seen)
+
+
+def test_a_good_face_is_sure() -> None:
+    confidence = confidence_in(face())
+    assert confidence.word == "sure" and confidence.score > 0.9
+
+
+@pytest.mark.parametrize(
+    "reason, hard",
+    [
+        ("small", face(size_px=45)),
+        ("unclear", face(error=0.05)),
+        ("unclear", face(presence=0.2)),
+        ("profile", face(turned=0.2)),
+        ("covered", face(covered=True)),
+    ],
+)
+def test_what_makes_a_photo_hard_is_named(reason: str, hard: FoundFace) -> None:
+    confidence = confidence_in(hard)
+    assert confidence.word == "doubtful" and confidence.reason == reason
+
+
+def test_the_words_follow_the_score() -> None:
+    words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
+    assert words == ["sure", "unsure", "doubtful"]
+    assert Confidence({"small": 0.5, "profile": 0.5}).score == pytest.approx(0.25)

@@ -1,0 +1,87 @@
+"""Layers lie where the network saw them; others in the photo are left out."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.portrait import segment as module
+from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.parse import Seen, Square
+from facerf_cli.portrait.segment import Segmentation, segment
+from tests.portrait.seen import places, seen_of
+
+HEIGHT, WIDTH = 240, 320
+FACE = np.random.default_rng(0).uniform([135, 45], [185, 95], (68, 2))  # around (160, 70), 50 pixels large
+
+
+def photo_share(square: Square) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where in the photo the pixels of a square lie, in pixels."""
+    x, y = places()
+    at = square.to_photo(torch.stack([x, y], -1).numpy())
+    return torch.from_numpy(at[..., 0]), torch.from_numpy(at[..., 1])
+
+
+@pytest.fixture
+def squares(monkeypatch: pytest.MonkeyPatch) -> list[Square]:
+    """A network that sees a head, a garment below it, and another person on the left."""
+    looked: list[Square] = []
+
+    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+        looked.extend(wanted)
+        found = []
+        for square in wanted:
+            x, y = photo_share(square)
+            head = (x - 160).square() + (y - 70).square() < 30**2
+            body = ((x - 160).abs() < 50) & (y > 110)
+            other = (x - 30).square() + (y - 120).square() < 20**2
+            found.append(
+                seen_of(square, {"garment": body, "skin": head, "hair": head & (y < 55), "hand": other})
+            )
+        return found
+
+    monkeypatch.setattr(module, "look", look)
+    return looked
+
+
+def photo() -> np.ndarray:
+    """Grey, with the person white, so that the matte's edges are the photo's."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    person = ((x - 160) ** 2 + (y - 70) ** 2 < 30**2) | ((abs(x - 160) < 50) & (y > 110))
+    return np.repeat(np.where(person, 220, 90)[..., None], 3, -1).astype(np.uint8)
+
+
+def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
+    found = segment(photo(), FACE)
+    assert found.matte.shape == (HEIGHT, WIDTH)
+    assert found.layer("hair")[45, 160] > 0.9 and found.layer("skin")[85, 160] > 0.9
+    assert found.layer("garment")[200, 160] > 0.9 and found.matte[200, 230] < 0.1
+    layers = found.layers()
+    total = sum(layers[f"class.{name}"] for name in CLASSES[1:])
+    assert np.abs(total - layers["person.A"]).max() < 1e-5
+
+
+def test_another_person_is_left_out(squares: list[Square]) -> None:
+    found = segment(photo(), FACE)
+    assert found.matte[120, 30] < 0.05 and found.layer("hand").max() < 0.05
+
+
+def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(squares: list[Square]) -> None:
+    segment(photo(), FACE)
+    body, *_, near = squares
+    assert near.side_px < body.side_px <= WIDTH
+    for square in (body, near):
+        share = square.to_share(FACE.mean(0))
+        assert (share > 0.1).all() and (share < 0.9).all()
+    assert body.x_px - body.side_px / 2 >= 0 and body.x_px + body.side_px / 2 <= WIDTH
+
+
+def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
+    classes = torch.zeros(len(CLASSES), 8, 8)
+    classes[0] = 1
+    classes[:, :, 4:] = 0
+    classes[CLASSES.index("hair"), :, 4:] = 1
+    found = Segmentation(classes, np.full((16, 16), 0.5, np.float32))
+    total = sum(found.layer(name) for name in CLASSES[1:])
+    assert np.allclose(total, 0.5, atol=1e-6) and found.layer("hair").min() > 0.4
