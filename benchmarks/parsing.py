@@ -1,12 +1,14 @@
 """The Parsing Network on real people: landmarks against dlib's, classes against drawn outlines, speed.
 
-    python benchmarks/parsing.py [--every 3] [--yale-b DIR] [--photos DIR] [--portraits DIR]
+    python benchmarks/parsing.py [--every 3] [--yale-b DIR] [--photos DIR] [--portraits DIR] [--bank DIR]
 
 Landmarks: distance to those of dlib's predictor (the extra `dlib`), in distances of the outer eye corners, on
 the frontal images of each subject, on those under flashes up to 60 degrees, and on photos; and on how many
-images each finds a face, by the angle of the flash. Regions: share of each outlined
-region that gets its class, and the largest share that another class takes. Speed: seconds of one core at
-1024 x 1024, for facerf's boxes, landmarks, classes and matte, and for dlib's detection alone.
+images each finds a face, by the angle of the flash. Regions: share of each outlined region that gets its
+class, and the shares of other classes. Held-out people (--bank, a folder of portraits that `facerf train
+--stage parsing` made of another seed): IoU and F1 by class, and of the matte the sum of absolute differences
+and the gradient error in thousands, as Rhemann et al., *A perceptually motivated online benchmark for image
+matting*, 2009. Speed: seconds of one core at 1024 x 1024, and of dlib.
 """
 
 import json
@@ -21,6 +23,7 @@ import skimage.data
 import torch
 from _common import PHOTOS, SHARED, YALE_B, arguments
 from PIL import Image, ImageDraw
+from scipy.ndimage import gaussian_gradient_magnitude
 from skimage.transform import resize
 
 from facerf_cli.capture.yale_b import read_yale_b
@@ -28,9 +31,15 @@ from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
+from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
+from facerf_cli.portrait.parse import parsing_network
 from facerf_cli.portrait.segment import segment
+from facerf_cli.synth.backgrounds import heaps_of, views_of_map
+from facerf_cli.synth.portrait_crops import StoredPortraits
+from facerf_cli.training.objective import seeded
 
+SEED = 7
 ANGLES_DEG = (0, 20, 40, 60, 80, 180)
 REGIONS = {  # classes that count as each region
     "face": ("skin", "brows", "eyes", "lips", "mouth", "beard", "glasses"),
@@ -48,10 +57,13 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, default=PHOTOS)
     parser.add_argument("--portraits", type=Path, default=SHARED / "data" / "yale_b_full")
     parser.add_argument("--regions", type=Path, default=SHARED / "bench" / "portrait" / "regions.json")
+    parser.add_argument("--bank", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     if options.portraits.is_dir() and options.regions.is_file():
         measure_regions(options.portraits, json.loads(options.regions.read_text()))
+    if options.bank:
+        measure_held_out(options.bank)
     measure_speed()
     if options.photos.is_dir():
         measure_photos(options.photos)
@@ -148,6 +160,50 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
                 matte = float((found.matte[mask] > 0.5).mean())
                 others = ", ".join(f"{of} {value:.3f}" for of, value in got.items() if of != name)
                 print(f"{subject} {name}: {got[name]:.3f} (matte {matte:.3f}; {others})")
+
+
+def measure_held_out(folder: Path) -> None:
+    """Print IoU and F1 by class and errors of the matte on crops of held-out synthetic people."""
+    backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
+    portraits = StoredPortraits(folder, backgrounds, {})
+    network, counts = parsing_network(), np.zeros((len(CLASSES), 3))
+    differences, gradients, error_percent = [], [], []
+    for person in range(len(portraits.paths)):
+        for draw in range(8):
+            crop = portraits.draw([person], network.side, seeded(SEED, person, draw))
+            with torch.inference_mode():
+                found = network(crop.crops)
+            known = crop.weight[0] > 0
+            true = torch.where(crop.alpha[0] >= 0.5, crop.label[0], 0)
+            chosen = found.logits[0].argmax(0)
+            for index in range(len(CLASSES)):
+                is_true, is_chosen = (true == index)[known], (chosen == index)[known]
+                counts[index] += [int(x.sum()) for x in (is_true & is_chosen, is_true, is_chosen)]
+            matte, alpha = (x * crop.weight[0] for x in (1 - found.classes[0, 0], crop.alpha[0]))
+            differences.append(float((matte - alpha).abs().sum()) / 1000)
+            slopes = [gaussian_gradient_magnitude(x.numpy(), 1.4) for x in (matte, alpha)]
+            gradients.append(float(((slopes[0] - slopes[1]) ** 2).sum()) / 1000)
+            if crop.present[0] and crop.known[0, :68].all():
+                error_percent.append(
+                    distances(found.landmarks[0, :68].numpy(), crop.landmarks[0, :68].numpy())
+                )
+    both, true_count, chosen_count = counts.T
+    scores = {
+        name: (
+            both[k] / (true_count[k] + chosen_count[k] - both[k]),
+            2 * both[k] / (true_count[k] + chosen_count[k]),
+        )
+        for k, name in enumerate(CLASSES)
+        if true_count[k]
+    }
+    for name, (overlap, f1) in scores.items():
+        print(f"held-out {name}: IoU {overlap:.3f}, F1 {f1:.3f}")
+    print("held-out mean: IoU {:.3f}, F1 {:.3f}".format(*np.mean(list(scores.values()), 0)))
+    sad, gradient = np.mean(differences), np.mean(gradients)
+    print(f"held-out matte: SAD {sad:.2f}, gradient {gradient:.3f} ({len(gradients)} crops)")
+    everything, inner = np.median(error_percent, 0)
+    count = len(error_percent)
+    print(f"held-out landmarks, median: all {everything:.2f} %, inner {inner:.2f} % ({count} crops)")
 
 
 def measure_speed() -> None:

@@ -36,7 +36,7 @@ _TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest
 _SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
 _SHIFT = (0.08, 0.12, 0.24)  # largest distance of the face from the crop's centre, in sides, for these
 _BORDERED = 0.2  # share of crops that reach beyond the photo, where its border goes on
-_BUST_BELOW = 0.7  # share of crops that end where the stored photo ends, or above
+_BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the stored photo ends, or above
 _MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
@@ -182,7 +182,7 @@ class _Placement:
         matrix = _turn(math.radians(float(degrees))) * side_px
         shift = uniform(-_SHIFT[framing], _SHIFT[framing], 2)
         centre = _middle(photo) - matrix @ shift
-        if torch.rand((), generator=generator) < _BUST_BELOW:
+        if torch.rand((), generator=generator) < _BUST_BELOW[framing]:
             centre[1] = torch.minimum(centre[1], torch.tensor(photo.side_px - side_px / 2))
         return _Placement(matrix, centre)
 

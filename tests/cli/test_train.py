@@ -11,6 +11,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
+from facerf_cli.portrait.parse import LANDMARKS
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 
@@ -208,6 +209,32 @@ def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, t
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert networks["reflectance"].settings.normals is False
     assert metadata["provenance"]["fitted_with"].startswith("builtin-mean")
+
+
+def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> None:
+    """Its people are made up here; `tests/synth/test_portrait_bank.py` has a real one."""
+    bank = tmp_path / "bank"
+    (bank / "portraits").mkdir(parents=True)
+    save_file({"backgrounds": torch.full((2, 3, 16, 16), 90).byte()}, bank / "backgrounds.safetensors")
+    for person in range(5):
+        person_of = {
+            "pictures": torch.full((1, 1, 3, 96, 96), 120).byte(),
+            "alpha": torch.full((1, 96, 96), 255).byte(),
+            "label": torch.ones(1, 96, 96).byte(),
+            "landmarks_px": 30 + 36 * torch.rand(1, LANDMARKS, 2),
+        }
+        save_file(person_of, bank / "portraits" / f"{person:05}.safetensors")
+    line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "5"]
+    assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
+    assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
+
+
+def test_too_few_people_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "4"]
+    assert main(line) == 2
+    assert "4 people are held out; give more" in " ".join(capsys.readouterr().err.split())
 
 
 def test_help_has_its_options_in_groups(capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.backgrounds import load_backgrounds
 from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
@@ -54,6 +54,7 @@ from facerf_cli.training.texture_objective import TextureObjective, TextureObjec
 _WORKERS_ON_GPU = 4
 _MAPS, _HEAPS = 60, 240  # backgrounds: surroundings, each seen from several sides, and heaps of shapes
 _TINY_WIDTHS = (8, 12, 16)
+_TINY_PARSING = (8, 8, 12, 16)
 _TINY_LIGHTS = 20  # of the rig that the preset `tiny` bakes heads under
 _TINY_FORMS: dict[str, dict[str, Any]] = {  # settings of the forms with the preset `tiny`
     "default": {
@@ -211,7 +212,8 @@ def _parsing(options: TrainOptions, networks: Networks) -> Objective:
         ),
     }
     stored = StoredPortraits(folder / "portraits", backgrounds, provenance)
-    network: Any = networks.get("parsing") or ParsingNetwork()
+    own = ParsingSettings(_TINY_PARSING, (0, 1, 1, 1), side=64) if tiny else ParsingSettings()
+    network: Any = networks.get("parsing") or ParsingNetwork(own)
     settings = ParsingObjectiveSettings(held_out_people=sizes.held_out_heads)
     return ParsingObjective(stored, network, settings)
 
