@@ -111,7 +111,7 @@ def segment(photo: np.ndarray, landmarks_px: np.ndarray | None = None) -> dict[s
     photo = _checked(photo)
     if landmarks_px is None:
         landmarks_px = find_faces(photo, "photo")[0].landmarks_px
-    return segment_image(to_display(photo), check_landmarks(landmarks_px)).layers()
+    return dict(segment_image(to_display(photo), check_landmarks(landmarks_px)).layers())
 
 
 def fit_photo(

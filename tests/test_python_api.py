@@ -37,6 +37,7 @@ def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
     assert page["image"].shape == photo.shape and np.isfinite(page["image"]).all()
     assert page["envmap"].shape == (256, 512, 3)
     assert page["olats"].shape == (24, 256, 256, 3) and page["directions"].shape == (24, 3)
+    assert page["matte"].shape == page["hair"].shape == photo.shape[:2] and 0.1 < page["matte"].mean() < 0.9
     assert page["turned"].shape == page["alone"].shape == (*photo.shape[:2], 4)
     assert sorted(path.name for path in page["folder"].glob("relit.*")) == ["relit.exr", "relit.png"]
 

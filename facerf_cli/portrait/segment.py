@@ -3,6 +3,7 @@
 The Parsing Network looks at the whole body and, for detail, at squares of several sizes around the head.
 """
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,6 +23,7 @@ from facerf_cli.raster.camera import PIXEL_CENTRE
 _NEAR_SIDES, _NEAR_ABOVE = (2.2, 4.0), 0.1
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
+_MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 512  # longest side at which classes are joined
 
@@ -47,10 +49,26 @@ class Segmentation:
         person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
         return person / person.sum(0).clamp_min(1e-6)
 
-    def layers(self) -> dict[str, np.ndarray]:
+    def layers(self) -> Mapping[str, np.ndarray]:
         """The matte and all classes of the person by the names that they have in an EXR file."""
-        classes = {f"class.{name}": self.layer(name) for name in CLASSES[1:]}
-        return {"person.A": self.matte, **classes}
+        return _Layers(self)
+
+
+@dataclass(frozen=True, eq=False)
+class _Layers(Mapping[str, np.ndarray]):
+    """Layers by name, each made when it is asked for: large photos have more of them than fit in memory."""
+
+    of: Segmentation
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.of.matte if name == _MATTE else self.of.layer(name.removeprefix("class."))
+
+    def __iter__(self) -> Iterator[str]:
+        yield _MATTE
+        yield from (f"class.{name}" for name in CLASSES[1:])
+
+    def __len__(self) -> int:
+        return len(CLASSES)
 
 
 def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:

@@ -9,7 +9,8 @@ import skimage.transform
 from PIL import Image
 
 from facerf_cli.colour import srgb_to_linear
-from facerf_cli.errors import InputError
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.dlib_landmarks import predictor_path
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.portrait.find import detect_faces, find_faces
@@ -122,6 +123,14 @@ def test_only_display_images_are_searched():
 def test_both_find_the_same_landmarks():
     own, other = (detect_faces(PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib"))
     assert error_iod(own[INNER], other[INNER]) < 0.08
+
+
+def test_without_the_extra_only_its_option_fails(monkeypatch):
+    monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
+    dlib_landmarks._predictor.cache_clear()
+    assert detect_faces(PHOTO)
+    with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
+        detect_faces(PHOTO, "dlib")
 
 
 def test_the_predictor_is_found_without_importing_its_package():

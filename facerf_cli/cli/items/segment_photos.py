@@ -1,5 +1,6 @@
 """The person of one photo, cut out of it, as files."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from facerf_cli.portrait.matte import person_colours
 from facerf_cli.portrait.segment import Segmentation, segment
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
+_OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 # Hues of the classes but the background, in the order of CLASSES; near ones differ.
 _HUES = np.array([0.07, 0.6, 0.5, 0.95, 0.9, 0.78, 0.7, 0.33, 0.14, 0.45, 0.85, 0.62, 0.25])
@@ -49,12 +51,13 @@ def _write(
 
 
 def _overlay(display: np.ndarray, found: Segmentation, face: Face) -> np.ndarray:
-    """Colours of the classes and landmarks over the photo, scene-linear."""
-    shown = display / np.float32(255) * (1 - _SHOWN * found.matte[..., None])
+    """Colours of the classes and landmarks over a small copy of the photo, scene-linear."""
+    step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
+    shown = display[::step, ::step] / np.float32(255) * (1 - _SHOWN * found.matte[::step, ::step, None])
     for name, colour in zip(CLASSES[1:], _colours(), strict=True):
-        shown += _SHOWN * found.layer(name)[..., None] * colour
-    half = max(1, round(_DOT * max(display.shape[:2]) / 2))
-    for x, y in np.round(face.landmarks_px).astype(int).clip(0):
+        shown += _SHOWN * found.layer(name)[::step, ::step, None] * colour
+    half = max(1, round(_DOT * max(shown.shape[:2]) / 2))
+    for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
         shown[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)
     return np.asarray(srgb_to_linear(shown.clip(0, 1)))
 
