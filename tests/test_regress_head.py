@@ -10,14 +10,13 @@ import torch
 from torch import nn
 
 from facerf_cli.errors import UsageError
-from facerf_cli.face import landmarks
 from facerf_cli.face.crop import from_box, from_landmarks
-from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.face.landmarks import Face, FaceBox
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.files.images import read_image
 from facerf_cli.models import Models, Sides, load_models
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.pipeline import fit_photo, head_of, regress_head, regress_photo
+from facerf_cli.pipeline import find_for, fit_photo, head_of, regress_head, regress_photo
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
@@ -119,16 +118,11 @@ def test_without_a_geometry_network_there_is_nothing_to_regress(models: Models) 
         head_of(replace(models, geometry=None), PHOTO, FaceBox(BOX, 1.0), SIDES)
 
 
-def test_boxes_are_found_without_the_landmark_predictor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_box_gives_about_the_crop_of_its_landmarks() -> None:
     photo = read_image(ASTRONAUT).pixels
     whole = find_faces(photo, "astronaut")[0]
-
-    def never() -> None:
-        raise AssertionError("the predictor was loaded")
-
-    monkeypatch.setattr(landmarks, "_predictor", never)
-    box = find_faces(photo, "astronaut")[0].box
-    assert box.box_px == whole.box_px and box.score == whole.score
+    box = find_for("network", photo, "astronaut")[0]
+    assert not isinstance(box, Face) and box.box_px == whole.box_px and box.score == whole.score
     by_box, by_landmarks = from_box(box.box_px, 64), from_landmarks(whole.landmarks_px, 64)
     assert by_box.side_px == pytest.approx(by_landmarks.side_px, rel=0.15)
     off_px = [by_box.x0_px - by_landmarks.x0_px, by_box.y0_px - by_landmarks.y0_px]

@@ -20,9 +20,11 @@ from facerf_cli.portrait.parse import Seen, Square, look
 
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
 _BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
-_LEAST_PRESENCE, _MOST_ERROR = 0.5, 0.06  # of a face; the error in extents of the landmarks
+_LEAST_PRESENCE = 0.5  # of a face
+# Expected errors of a face, in extents of the landmarks: at most; of a sure one; of one beside a sure one.
+_MOST_ERROR, _SURE_ERROR, _KEPT_ERROR = 0.06, 0.018, 0.025
 _SAME = 0.35  # overlap over union from which on two boxes hold one face
-_COARSE_PX, _FINE_PX = 512, 1600  # longest side of the image that the detector looks at first, and then
+_DETECTOR_PX = 1280  # longest side of the image that the detector looks at
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
 _TILES = 3  # along each side of the photo, half as large as it
 
@@ -80,21 +82,23 @@ def detect_faces(image_srgb: np.ndarray, landmarks_from: LandmarksFrom = "facerf
 def faces_of(image_srgb: np.ndarray) -> list[FoundFace]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
-    Large faces are looked for first; small ones, turned ones, and ones that only a part of the photo shows
-    well, where there are none.
+    Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
+    sure; then the surest alone is returned.
     """
+    found: list[Seen] = []
     for squares in _attempts(image_srgb):
         seen = [one for one in _looked_at(image_srgb, squares) if _is_face(one, image_srgb)]
-        seen = [again for one in _distinct(seen) if (again := _refined(image_srgb, one))]
-        if seen:
-            return sorted(map(_as_face, _distinct(seen)), key=lambda face: face.box_px[0])
-    return []
+        refined = [again for one in _distinct(seen) if (again := _refined(image_srgb, one))]
+        found = _distinct([*found, *refined])
+        if found and found[0].relative_error <= _SURE_ERROR:
+            sure = [one for one in found if one.relative_error <= _KEPT_ERROR]
+            return sorted(map(_as_face, sure), key=lambda face: face.box_px[0])
+    return [_as_face(found[0])] if found else []
 
 
 def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     """Squares to look at, the likeliest first."""
-    yield [*_proposed(image, _COARSE_PX), _whole(image)]
-    yield _proposed(image, _FINE_PX)
+    yield [*map(_square, detected_boxes(image, _DETECTOR_PX)), _whole(image)]
     yield [_whole(image, turn_rad) for turn_rad in _TURNS]
     yield _tiles(image)
 
@@ -138,11 +142,6 @@ def _around(seen: Seen) -> Square:
     return Square(float(x_px), float(y_px), _FACE_SIDES * max(seen.extent_px, 1.0), turn_rad)
 
 
-def _proposed(image: np.ndarray, side_px: int) -> list[Square]:
-    """Squares around what the detector takes for faces in a copy of the image of that side."""
-    return [_square(box) for box in detected_boxes(image, side_px)]
-
-
 def _square(box_px: Box) -> Square:
     left, top, right, bottom = box_px
     return Square((left + right) / 2, (top + bottom) / 2, _BOX_SIDES * (right - left + bottom - top) / 2)
@@ -165,7 +164,7 @@ def _tiles(image: np.ndarray) -> list[Square]:
 
 
 def _distinct(seen: list[Seen]) -> list[Seen]:
-    """Faces without the less sure ones of those that lie on each other."""
+    """Faces, the surest first, without the less sure ones of those that lie on each other."""
     kept: list[Seen] = []
     for face in sorted(seen, key=lambda one: -_score(one)):
         if all(_overlap(face, other) < _SAME for other in kept):

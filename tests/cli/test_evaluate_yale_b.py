@@ -36,7 +36,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
     monkeypatch.setattr(evaluate_images, "load_methods", lambda _: (Lambert("field", models),))
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
 
 
 @pytest.mark.usefixtures("toys")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.face import landmarks
+from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -25,7 +25,7 @@ def no_predictor(monkeypatch: pytest.MonkeyPatch) -> None:
     def never() -> None:
         raise AssertionError("the landmark predictor was loaded")
 
-    monkeypatch.setattr(landmarks, "_predictor", never)
+    monkeypatch.setattr(dlib_landmarks, "_predictor", never)
 
 
 def fit(output: Path, *words: str) -> int:

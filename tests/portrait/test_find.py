@@ -57,7 +57,8 @@ def test_turned_photos(source, landmarks_px, turns):
     x, y = landmarks_px.T
     expected = {1: (y, width - x), 2: (width - x, height - y), 3: (height - y, x)}[turns]
     (face,) = detect_faces(np.rot90(PHOTO, turns), source)
-    assert error_iod(face.landmarks_px, np.stack(expected, -1)) < 0.02
+    # dlib looks at the photo turned back; facerf's network finds an upright square of its own
+    assert error_iod(face.landmarks_px, np.stack(expected, -1)) < (0.02 if source == "dlib" else 0.05)
     left, top, right, bottom = face.box_px
     assert left < face.landmarks_px[30, 0] < right and top < face.landmarks_px[30, 1] < bottom
 
@@ -122,7 +123,8 @@ def test_only_display_images_are_searched():
 
 def test_both_find_the_same_landmarks():
     own, other = (detect_faces(PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib"))
-    assert error_iod(own[INNER], other[INNER]) < 0.08
+    off = np.linalg.norm(own - other, axis=1) / iod_px(other)
+    assert off[INNER].mean() < 0.06 and off.mean() < 0.08
 
 
 def test_without_the_extra_only_its_option_fails(monkeypatch):

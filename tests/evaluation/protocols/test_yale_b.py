@@ -103,7 +103,7 @@ def test_scores_are_the_benchmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
     comparisons = list(compare_sitter(databases[0], "yaleB05", []))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
@@ -142,7 +142,7 @@ def small(tmp_path: Path) -> YaleB:
 
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
@@ -187,7 +187,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
     models = load_models(None, "builtin", torch.device("cpu"))
     sitter = Sitter(small, "yaleB07")
     photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
