@@ -47,12 +47,6 @@ def reduced(image: np.ndarray, scale: float) -> np.ndarray:
     return resized.permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
 
 
-def brightened(image: np.ndarray) -> np.ndarray:
-    """A tone curve [256] that lifts shadows: the 99th percentile becomes white, then a gamma of 1/2."""
-    white = max(float(np.percentile(image, 99)), 1.0)
-    return np.round(255 * (np.arange(256) / white).clip(0, 1) ** 0.5).astype(np.uint8)
-
-
 @cache
 def detector() -> Any:
     """The detector, once a process."""

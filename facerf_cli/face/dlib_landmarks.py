@@ -16,7 +16,7 @@ import numpy as np
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.detector import brightened, detector, reduced
+from facerf_cli.face.detector import detector, reduced
 from facerf_cli.face.landmarks import Face, FaceBox
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -93,7 +93,7 @@ def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[_Detection]:
     turned = np.rot90(image, attempt.turns)
     height, width = turned.shape[:2]
     small = reduced(turned, min(attempt.side_px / max(height, width), attempt.enlarge))
-    curve = brightened(small) if attempt.brighten else np.arange(256, dtype=np.uint8)
+    curve = _brightened(small) if attempt.brighten else np.arange(256, dtype=np.uint8)
     pad = round(attempt.padding * max(small.shape[:2]))
     padded = np.ascontiguousarray(curve[np.pad(small, ((pad, pad), (pad, pad), (0, 0)), mode="edge")])
     to_photo = np.array([width / small.shape[1], height / small.shape[0]])
@@ -147,6 +147,12 @@ def _turn_back(points_px: np.ndarray, turns: int, shape: tuple[int, ...]) -> np.
     height, width = shape[:2]
     x, y = points_px.T
     return np.stack([(x, y), (width - y, x), (width - x, height - y), (y, height - x)][turns], -1)
+
+
+def _brightened(image: np.ndarray) -> np.ndarray:
+    """A tone curve [256] that lifts shadows: the 99th percentile becomes white, then a gamma of 1/2."""
+    white = max(float(np.percentile(image, 99)), 1.0)
+    return np.round(255 * (np.arange(256) / white).clip(0, 1) ** 0.5).astype(np.uint8)
 
 
 @cache

@@ -18,6 +18,9 @@ from facerf_cli.face.landmarks import Face, FaceBox, choose_face, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.portrait.parse import Seen, Square, look
 
+LandmarksFrom = Literal["facerf", "dlib"]
+
+_NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
 _BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
 _LEAST_PRESENCE = 0.5  # of a face
@@ -46,10 +49,6 @@ class FoundFace(Face):
     def box(self) -> FaceBox:
         """The face without its landmarks."""
         return FoundBox(self.box_px, self.score, self.seen)
-
-
-LandmarksFrom = Literal["facerf", "dlib"]
-_NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 
 
 def find_faces(

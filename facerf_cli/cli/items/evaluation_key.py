@@ -18,7 +18,7 @@ from facerf_cli.models import DEFAULT_CHECKPOINT
 # Fields that change no figure; and fields that hold a name or a file's path.
 _WITHOUT_EFFECT = {"output", "jobs", "overwrite", "dry_run", "verbosity", "log_json", "device", "checkpoint"}
 _WITHOUT_EFFECT |= {"shard", "ray", "output_base"}
-_MEASURING = 3  # raised when the same options give other figures
+_MEASURING = 4  # raised when the same options give other figures
 _NAME_OR_PATH = {"face_model", "vgg_weights"}
 
 
