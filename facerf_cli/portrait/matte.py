@@ -6,9 +6,9 @@ import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-_REACH = 0.016  # of the guided filter, in longest sides of the guide
+_REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
-_STRETCH = 0.1  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
+_STRETCH = 0.2  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
 _COLOUR_REACH = (
     0.03,
     0.006,

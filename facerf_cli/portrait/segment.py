@@ -20,7 +20,7 @@ from facerf_cli.raster.camera import PIXEL_CENTRE
 
 # Sides of the squares around the head and around the body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of squares of several sizes are averaged.
-_NEAR_SIDES, _NEAR_ABOVE = (1.9, 2.2, 2.6, 3.6), 0.1
+_NEAR_SIDES, _NEAR_ABOVE = (1.8, 2.2, 3.2), 0.1
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _MATTE = "person.A"
