@@ -24,8 +24,7 @@ _NO_FACE = "no face found; try a larger or brighter image that shows the whole f
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
 _BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
 _LEAST_PRESENCE = 0.5  # of a face
-# Expected errors of a face, in extents of the landmarks: at most; of a sure one; of one beside a sure one.
-_MOST_ERROR, _SURE_ERROR, _KEPT_ERROR = 0.06, 0.018, 0.025
+_MOST_ERROR, _SURE_ERROR = 0.06, 0.018  # expected, of a face and of a sure one, in extents of the landmarks
 _SAME = 0.35  # overlap over union from which on two boxes hold one face
 _DETECTOR_PX = 1280  # longest side of the image that the detector looks at
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
@@ -61,38 +60,47 @@ def find_faces(
 
     Raises InputError, with the image's name, where no face is found.
     """
-    faces = detect_faces(to_display(pixels_linear), landmarks_from)
+    faces = detect_faces(to_display(pixels_linear), landmarks_from, everyone=which != "largest")
     if not faces:
         raise InputError(f"{name}: {_NO_FACE}, or give its landmarks with --landmarks FILE")
     return choose_face(faces, which, name)
 
 
-def detect_faces(image_srgb: np.ndarray, landmarks_from: LandmarksFrom = "facerf") -> list[Face]:
-    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none."""
+def detect_faces(
+    image_srgb: np.ndarray, landmarks_from: LandmarksFrom = "facerf", everyone: bool = False
+) -> list[Face]:
+    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
+
+    `everyone`: see `faces_of`; dlib's detector always looks for all.
+    """
     if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
         raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
     if landmarks_from == "dlib":
         from facerf_cli.face.dlib_landmarks import detect_landmarks  # an extra
 
         return detect_landmarks(image_srgb)
-    return list(faces_of(image_srgb))
+    return list(faces_of(image_srgb, everyone))
 
 
-def faces_of(image_srgb: np.ndarray) -> list[FoundFace]:
+def faces_of(image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
     Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
-    sure; then the surest alone is returned.
+    sure, or for `everyone`. Where no face at all is sure, the surest alone is returned.
     """
     found: list[Seen] = []
     for squares in _attempts(image_srgb):
         seen = [one for one in _looked_at(image_srgb, squares) if _is_face(one, image_srgb)]
         refined = [again for one in _distinct(seen) if (again := _refined(image_srgb, one))]
         found = _distinct([*found, *refined])
-        if found and found[0].relative_error <= _SURE_ERROR:
-            sure = [one for one in found if one.relative_error <= _KEPT_ERROR]
-            return sorted(map(_as_face, sure), key=lambda face: face.box_px[0])
-    return [_as_face(found[0])] if found else []
+        if not everyone and _sure(found):
+            break
+    faces = map(_as_face, _sure(found) or found[:1])
+    return sorted(faces, key=lambda face: face.box_px[0])
+
+
+def _sure(found: list[Seen]) -> list[Seen]:
+    return [one for one in found if one.relative_error <= _SURE_ERROR]
 
 
 def _attempts(image: np.ndarray) -> Iterator[list[Square]]:

@@ -108,6 +108,7 @@ def test_several_faces_from_left_to_right(source, landmarks_px):
     pair = np.concatenate([small, PHOTO], 1)
     faces = detect_faces(pair, source)
     assert len(faces) == 2 and faces[0].area_px < faces[1].area_px
+    assert len(detect_faces(pair, source, everyone=True)) == 2
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 900, 3), (200, 300, 3)])
