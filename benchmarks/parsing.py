@@ -4,7 +4,7 @@
 
 Landmarks: distance to those of dlib's predictor (the extra `dlib`), in distances of the outer eye corners, on
 photos, and on images of Extended Yale B to those that dlib finds in the subject's frontal image, for under
-hard light it finds few (heads hardly move, and the jaw is not in the pictures: read *inner*); and on how many
+hard light it finds few (heads hardly move, and the jaw is not in the images: read *inner*); and on how many
 images each finds a face, by the angle of the flash. Regions: share of each outlined region that gets its
 class, and the shares of other classes. Held-out people (--bank, a folder of portraits that `facerf train
 --stage parsing` made of another seed): IoU and F1 by class, and of the matte the sum of absolute differences

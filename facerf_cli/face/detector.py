@@ -14,7 +14,7 @@ from facerf_cli.face.crop import Box
 
 DETECTOR_LICENCE = "dlib HOG frontal face detector: Boost Software License 1.0"
 _ENLARGE = 2.0  # largest enlargement of a small image
-_LEAST_SCORE = -0.15  # of a box; those that are no face are told apart later
+_LEAST_SCORE = -0.15  # of a box; the Parsing Network drops those that are no face
 
 
 def detected_boxes(image_srgb: np.ndarray, side_px: int) -> list[Box]:

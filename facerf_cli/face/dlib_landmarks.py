@@ -17,7 +17,7 @@ import numpy as np
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.detector import detector, reduced
-from facerf_cli.face.landmarks import Face, FaceBox
+from facerf_cli.face.landmarks import Face, FaceBox, check_display
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -56,8 +56,7 @@ _ATTEMPTS = (
 
 def detect_landmarks(image_srgb: np.ndarray) -> list[Face]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none."""
-    if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
-        raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
+    check_display(image_srgb)
     for attempt in _ATTEMPTS:
         if faces := _trusted([found.face() for found in _detect(image_srgb, attempt)]):
             return faces

@@ -81,6 +81,12 @@ def to_display(pixels_linear: np.ndarray) -> np.ndarray:
     return display
 
 
+def check_display(image_srgb: np.ndarray) -> None:
+    """Raise ValueError for anything but an sRGB uint8 image [H, W, 3], as `to_display` gives it."""
+    if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
+        raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
+
+
 def read_landmarks(path: Path) -> np.ndarray:
     """Read landmarks [68, 2] in the photo's pixels; raises InputError for any other file.
 

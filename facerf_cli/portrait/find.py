@@ -14,7 +14,7 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Box, box_of, from_landmarks
 from facerf_cli.face.detector import detected_boxes
-from facerf_cli.face.landmarks import Face, FaceBox, choose_face, to_display
+from facerf_cli.face.landmarks import Face, FaceBox, check_display, choose_face, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.portrait.parse import Seen, Square, look
 
@@ -73,8 +73,7 @@ def detect_faces(
 
     `everyone`: see `faces_of`; dlib's detector always looks for all.
     """
-    if image_srgb.ndim != 3 or image_srgb.shape[2] != 3 or image_srgb.dtype != np.uint8:
-        raise ValueError(f"image: it is {image_srgb.dtype} {image_srgb.shape}, not uint8 [H, W, 3]")
+    check_display(image_srgb)
     if landmarks_from == "dlib":
         from facerf_cli.face.dlib_landmarks import detect_landmarks  # an extra
 

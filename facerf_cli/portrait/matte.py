@@ -9,10 +9,7 @@ from torch import Tensor
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
 _STRETCH = 0.2  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
-_COLOUR_REACH = (
-    0.03,
-    0.006,
-)  # of the means that colours are taken from, in longest sides, one after the other
+_COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
 _TINY = 1e-5
 
 
@@ -26,7 +23,7 @@ def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarr
     reach = max(1, round(_REACH * max(matte.shape)))
     slope, offset = _local_lines(matte, guide_srgb, reach)
     size = photo_srgb.shape[:2]
-    lines = _enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
+    lines = enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
     refined = lines[3]
     for channel in range(3):
         refined += lines[channel] * photo_srgb[..., channel] / np.float32(255)
@@ -77,9 +74,8 @@ def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.nda
     return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))
 
 
-def _enlarged(maps: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+def enlarged(maps: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Maps [C, h, w] at another size [C, H, W]."""
     tensor: Tensor = torch.from_numpy(np.ascontiguousarray(maps, np.float32))[None]
-    return np.asarray(
-        F.interpolate(tensor, size=tuple(size), mode="bilinear", align_corners=False)[0].numpy()
-    )
+    wide = F.interpolate(tensor, size=tuple(size), mode="bilinear", align_corners=False)
+    return np.asarray(wide[0].numpy())

@@ -14,7 +14,7 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.matte import refine_matte
+from facerf_cli.portrait.matte import enlarged, refine_matte
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -38,8 +38,7 @@ class Segmentation:
     def layer(self, name: str) -> np.ndarray:
         """Share [H, W] float32 of a class; those of all classes but the background sum to the matte."""
         share = self._shares[class_index(name) - 1]
-        wide = F.interpolate(share[None, None], size=self.matte.shape, mode="bilinear", align_corners=False)
-        return np.asarray(wide[0, 0].numpy() * self.matte)
+        return enlarged(share[None].numpy(), self.matte.shape)[0] * self.matte
 
     @cached_property
     def _shares(self) -> Tensor:

@@ -22,8 +22,8 @@ from torch import Tensor
 
 from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError
-from facerf_cli.face.topology import MIRROR_68
-from facerf_cli.portrait.classes import class_index, mirrored_landmarks
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.synth.face_crops import blurred
 from facerf_cli.synth.random_fields import Uniform
@@ -37,7 +37,6 @@ _SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
 _SHIFT = (0.08, 0.12, 0.24)  # largest distance of the face from the crop's centre, in sides, for these
 _BORDERED = 0.2  # share of crops that reach beyond the photo, where its border goes on
 _BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the stored photo ends, or above
-_MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class _Photo:
 
     def mirrored(self) -> "_Photo":
         """The mirrored photo."""
-        flipped = self.landmarks_px[torch.from_numpy(_MIRROR)] * torch.tensor([-1.0, 1.0])
+        flipped = self.landmarks_px[torch.from_numpy(MIRROR)] * torch.tensor([-1.0, 1.0])
         moved = flipped + torch.tensor([float(self.side_px), 0.0])
         return _Photo(self.radiance.flip(-1), self.alpha.flip(-1), self.label.flip(-1), moved)
 

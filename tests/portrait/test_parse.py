@@ -1,4 +1,4 @@
-"""Squares are cut where they lie; landmarks of mirrored images are told apart."""
+"""Squares are cut where they lie; landmarks of mirrored images change sides."""
 
 import math
 
