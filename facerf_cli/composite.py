@@ -8,14 +8,15 @@ the relit one R, a photo pixel P becomes
 
 For bright sources both are the quotient P R / S. Where the source is nearly black the quotient would be
 noise, and e, a small share of the source's mean, keeps the pixel near R. Under the photo's own light (R = S)
-the photo comes back. Hair and background follow by `Surround`. All steps are linear in light: two lights
-composed apart add up to both composed at once, but for a slight undershoot of the surround, which is clipped.
-A light with negative weights, such as the paper's plain least squares gives, can make pixels negative.
+the photo comes back. What lies around the face follows by `Surround`, or is relit as a whole person. All
+steps are linear in light: two lights composed apart add up to both composed at once, but for a slight
+undershoot of the surround, which is clipped, and for the photo's background, which no light changes. A light
+with negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
-from facerf_cli.light.sphere import RigLight
+from facerf_cli.portrait.matte import person_colours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
 
@@ -46,20 +47,22 @@ _REACH = 0.22  # of that change to the side, in crop sides; beyond it all follow
 _DARKER, _BRIGHTER = 12.0, 1.6  # that change is at most so far below and above the mean change of a light
 _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and below are hair and neck
 
+Background = Literal["photo", "none", "given"]
+
 
 @dataclass(frozen=True, eq=False)
 class Target:
     """The pose and the surroundings in which a relit head is shown.
 
-    `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its face
-    relit, or the rendered face alone. In the photo, hair and background follow the light on the face, unless
-    `keep_background`; a `matte` [H, W] in 0..1 limits what may change.
+    `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its
+    person relit, or the rendered face alone. A `matte` [H, W] in 0..1 says what is relit, by default all.
+    Behind it stays the photo, or nothing, or what is given with each light.
     """
 
     fit: FaceFit | None = None
     composite: Literal["photo", "face"] = "photo"
-    keep_background: bool = False
     matte: np.ndarray | None = None
+    background: Background = "photo"
 
 
 AS_IN_PHOTO = Target()
@@ -67,9 +70,9 @@ AS_IN_PHOTO = Target()
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """A head under one light: its texture [3, T, T], and the change of light around it (`Surround`).
+    """A head under one light: its texture [3, T, T], and the light around it [C, s, s] (`AroundFace`).
 
-    `surround` [3, s, s] is None where nothing around the head follows the light.
+    `surround` is None where the face is shown alone.
     """
 
     texture: Tensor
@@ -85,14 +88,31 @@ class RelitImage:
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
+class AroundFace(Protocol):
+    """What is relit around the face: `Surround`, or the whole person of a portrait field."""
+
+    @property
+    def nbytes(self) -> int:
+        """Size of one light's tensor."""
+
+    def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
+        """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]."""
+
+
 class Composition:
     """Compose relit textures of one head into one frame: the photo's, or without a photo the crop's own.
 
-    What does not depend on the light is computed once.
+    What does not depend on the light is computed once. `person` relights all of the photo's person; without
+    it what lies around the face follows the face's light.
     """
 
     def __init__(
-        self, model: MorphableModel, photo: np.ndarray | None, head: Head, target: Target = AS_IN_PHOTO
+        self,
+        model: MorphableModel,
+        photo: np.ndarray | None,
+        head: Head,
+        target: Target = AS_IN_PHOTO,
+        person: AroundFace | None = None,
     ) -> None:
         fit = head.fit if target.fit is None else target.fit
         vertices = fit.vertices_camera(model)
@@ -101,48 +121,43 @@ class Composition:
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
         self._photo = photo if target.composite == "photo" else None
         self._face, self._target = head.face, target
-        self._detail = None if self._photo is None else PhotoDetail(self._photo, head.face, self.view)
-        follows = self._photo is not None and not target.keep_background
-        self.surround = Surround(vertices, crop, head.face.texture, *size_px) if follows else None
+        self._detail: PhotoDetail | None = None
+        self.surround: AroundFace | None = None
         self._mask = self.view.full(self.view.mask)
-        self._layers = {"face.A": self._mask} if self._photo is not None else {}
+        self._layers: dict[str, np.ndarray] = {}
+        if self._photo is not None:
+            matte = target.matte
+            self._matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
+            self._own = self._photo if matte is None else person_colours(self._photo, self._matte)
+            self._detail = PhotoDetail(self._own, head.face, self.view)
+            self.surround = person or Surround(vertices, crop, head.face.texture, *size_px)
+            self._layers |= {"face.A": self._mask, "person.A": self._matte}
         places = {"normal": self.view.normal, "position": self.view.position_m, "uv": self.view.uv}
         self._layers |= {name: self.view.full(values) for name, values in places.items()}
 
-    def image(self, light: RigLight, relit: Relit) -> RelitImage:
-        """The head in its frame under `light`, as relit by it.
+    def image(self, relit: Relit, ev: float = 0.0, behind: np.ndarray | None = None) -> RelitImage:
+        """The head in its frame as relit, scene-linear.
 
-        What is relit determines the image; `light` is for relighters of what lies around the face.
+        The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
-        if self._photo is None or self._detail is None:
+        if self._photo is None or self._detail is None or self.surround is None or relit.surround is None:
             return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask, self._layers)
-        result = self._photo.copy()
-        if self.surround is not None and relit.surround is not None:
-            result *= self.surround.over_photo(relit.surround)
+        person = self.surround.over_photo(self._own, relit.surround)
         mask = self.view.mask.numpy()[..., None]
-        result[self.view.window] += mask * (self._detail.relit(relit.texture) - result[self.view.window])
-        if (matte := self._target.matte) is not None:
-            result = self._photo + matte[..., None] * (result - self._photo)
-        return RelitImage(result, None, self._layers)
-
-    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
-        """The image's pixels at an exposure in EV; where the photo is kept, of its new light."""
-        gain = 2**ev
-        if not self._keeps_photo:
-            return image.pixels * gain
-        surround = None if relit.surround is None else relit.surround * gain
-        return self.image(light, Relit(relit.texture * gain, surround)).pixels
+        person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
+        matte = self._matte[..., None]
+        if self._target.background == "none":
+            return RelitImage(person * matte, self._matte, self._layers)
+        if behind is not None:
+            return RelitImage(behind + matte * (person - behind), None, self._layers)
+        shown = np.float32(2.0**-ev)
+        return RelitImage(self._photo * shown + matte * (person - self._own * shown), None, self._layers)
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
-        """The exposure that shows the lit face well; in a kept photo, as bright as it was there."""
+        """The exposure that shows the lit face well; before the photo's background, as bright as it was."""
         chosen_ev = _auto_exposure_ev(relit, self._face.visible)
-        own_ev = _auto_exposure_ev(self._face.texture, self._face.visible) if self._keeps_photo else 0.0
-        return chosen_ev - own_ev
-
-    @property
-    def _keeps_photo(self) -> bool:
-        kept = self._target.keep_background or self._target.matte is not None
-        return self._photo is not None and kept
+        keeps = self._photo is not None and self._target.background == "photo"
+        return chosen_ev - (_auto_exposure_ev(self._face.texture, self._face.visible) if keeps else 0.0)
 
 
 def _auto_exposure_ev(texture: Tensor, visible: Tensor) -> float:
@@ -221,12 +236,12 @@ class Surround:
         """Size of one change of light."""
         return 3 * self._mask.nbytes
 
-    def over_photo(self, change: Tensor) -> np.ndarray:
-        """A change of light [3, s, s] over the photo [H, W, 3]."""
+    def over_photo(self, photo: np.ndarray, change: Tensor) -> np.ndarray:
+        """The photo [H, W, 3] under a change of light [3, s, s]."""
         over = F.grid_sample(
             change[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
         )
-        return over[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
+        return photo * over[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
 
     def _mean_and_blur(self, textures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean colours [N, 3, 1, 1] of textures [N, 3, T, T] on the face, and their blur [N, 3, s, s]."""

@@ -13,7 +13,7 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence, estimate_weights
 from facerf_cli.light.quotient import Quotient
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
 from facerf_cli.network.inputs import without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
@@ -77,16 +77,27 @@ class Field:
         return max(1, min(most, self.memory_bytes // bytes_per_light))
 
 
-def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
-    """Compute the quotient image by which the network's field is corrected to its own photo.
+@dataclass(frozen=True, eq=False)
+class OwnLight:
+    """The estimated light of a photo over a coarse rig, and the field's quotient under it."""
 
-    The photo's light is estimated over a coarse rig, on small textures.
-    """
+    light: RigLight
+    quotient: Quotient
+
+
+def own_light(models: Models, face: FaceTexture) -> OwnLight:
+    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it."""
     small = shrunk(face)
     olats = torch.cat(list(Field(models, small).olats(_coarse_rig())))
     seen = small.visible > _SEEN_WELL
     weights = estimate_weights(olats[..., seen], small.texture[:, seen])
-    return Quotient.of(small.texture, weighted_sum([olats], weights[None])[0], small.visible)
+    quotient = Quotient.of(small.texture, weighted_sum([olats], weights[None])[0], small.visible)
+    return OwnLight(RigLight(_coarse_rig(), weights), quotient)
+
+
+def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
+    """Compute the quotient image by which the network's field is corrected to its own photo."""
+    return own_light(models, face).quotient
 
 
 def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:

@@ -20,14 +20,22 @@ from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
-from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Target
+from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import Face, FaceBox
-from facerf_cli.field import MEMORY_BYTES, Field, photo_evidence, photo_quotient, shrunk, weighted_sums
+from facerf_cli.face.landmarks import Face, FaceBox, to_display
+from facerf_cli.field import (
+    MEMORY_BYTES,
+    Field,
+    own_light,
+    photo_evidence,
+    photo_quotient,
+    shrunk,
+    weighted_sums,
+)
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
@@ -35,6 +43,9 @@ from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
 from facerf_cli.portrait.occluders import uncovered
+from facerf_cli.portrait.segment import segment
+from facerf_cli.portrait_field import PortraitField
+from facerf_cli.whole_person import WholePerson
 
 
 def fit_photo(
@@ -114,16 +125,36 @@ def reflectance_of(
     kind: Kind = "field",
     network_alone: bool = False,
     memory_bytes: int = MEMORY_BYTES,
+    photo: np.ndarray | None = None,
 ) -> Reflectance:
-    """Read the reflectance of a head from its photo.
+    """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
 
-    The field is corrected by the photo's quotient image, so that the photo comes back under its own light;
-    with `network_alone` it is not. The models that the paper compares with have no such correction.
+    The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
+    with `network_alone` they are not. The models that the paper compares with have no such correction.
     """
-    if kind != "field":
+    if kind not in ("field", "portrait"):
         return explain(models, head, kind).reflectance
-    quotient = None if network_alone else photo_quotient(models, head.face)
-    return Field(models, head.face, quotient, memory_bytes)
+    own = None if network_alone else own_light(models, head.face)
+    field = Field(models, head.face, own.quotient if own else None, memory_bytes)
+    if kind == "field" or photo is None:
+        return field
+    return PortraitField.of(models.face, photo, head, field, own)
+
+
+def composition_of(
+    models: Models,
+    photo: np.ndarray | None,
+    head: Head,
+    reflectance: Reflectance,
+    target: Target = AS_IN_PHOTO,
+) -> Composition:
+    """Compose a head in its photo; of a portrait field the whole person is relit."""
+    if photo is None or target.composite == "face":
+        return Composition(models.face, photo, head, target)
+    person = WholePerson(photo, reflectance) if isinstance(reflectance, PortraitField) else None
+    if target.matte is None:
+        target = replace(target, matte=person.matte if person else person_matte(photo, head))
+    return Composition(models.face, photo, head, target, person)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +255,11 @@ def estimate_light(
     return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
 
 
+def person_matte(photo: np.ndarray, head: Head) -> np.ndarray:
+    """Matte [H, W] of the person whose head was fitted in a photo."""
+    return segment(to_display(photo), head.fit.crop.to_photo(head.landmarks_px)).matte
+
+
 def relight(
     models: Models,
     photo: np.ndarray | None,
@@ -239,10 +275,10 @@ def relight(
     """
     if reflectance is None:
         reflectance = reflectance_of(models, head)
-    composition = Composition(models.face, photo, head, target)
+    composition = composition_of(models, photo, head, reflectance, target)
     weights = light.weights[None]
     relit = next(relit_by(composition, head, reflectance, light.directions, weights, target))
-    return composition.image(light, relit)
+    return composition.image(relit)
 
 
 def relit_by(
@@ -261,11 +297,17 @@ def relit_by(
     """
     surround = composition.surround
     turn = None if target.fit is None else head.fit.turn_to(target.fit.rotation)
-    if surround is not None and isinstance(reflectance, Field):
+    if isinstance(surround, WholePerson) and isinstance(reflectance, PortraitField):
+        lit = reflectance.lit(directions, weights)
+        textures = reflectance.blended(reflectance.field.relit(directions, weights), lit)
+        yield from map(Relit, textures, torch.cat([lit.shading, lit.highlights], 1))
+        return
+    if isinstance(surround, Surround) and isinstance(reflectance, Field):
         summed = weighted_sums(
             reflectance.olats(directions, turn), weights, lambda olats: olats, surround.changes
         )
         yield from map(Relit, *summed)
         return
     for texture in reflectance.relit(directions, weights, turn):
-        yield Relit(texture, None if surround is None else surround.changes(texture[None])[0])
+        change = surround.changes(texture[None])[0] if isinstance(surround, Surround) else None
+        yield Relit(texture, change)

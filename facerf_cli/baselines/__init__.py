@@ -2,5 +2,6 @@
 
 from typing import Literal
 
-# Values of `--reflectance`: the paper's neural field, or one of the models that it is compared with.
-Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]
+# Values of `--reflectance`: the whole portrait, the paper's neural field of the face, or one of the models
+# that the field is compared with.
+Kind = Literal["portrait", "field", "diffuse-sh", "specular-sh", "prt"]

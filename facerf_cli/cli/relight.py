@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.baselines import Kind
+from facerf_cli.cli.backgrounds import BackgroundChoice, parse_background
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
@@ -47,7 +48,8 @@ class Relight:
     sampling: Sampling
     pose: str | None
     composite: Composite
-    keep_background: bool
+    background: BackgroundChoice
+    background_blur: float
     matte: Path | None
     exposure_ev: float | None  # None: auto
     memory_bytes: int
@@ -163,14 +165,23 @@ def relight(
             show_default="photo; face with --pose",
         ),
     ] = None,
-    keep_background: Annotated[
-        bool,
+    background: Annotated[
+        str,
         typer.Option(
-            "--keep-background",
-            help="Leave hair and background as they are, bit for bit; --exposure then applies to the light "
-            "on the face only.",
+            metavar="photo|envmap|none|FILE|COLOUR",
+            help="Show behind the person the photo's background, as it was; the map, seen by the photo's "
+            "camera; nothing (alpha); an image; or a colour, #RRGGBB or linear R,G,B.",
         ),
-    ] = False,
+    ] = "photo",
+    background_blur: Annotated[
+        float,
+        typer.Option(
+            metavar="PERCENT",
+            min=0.0,
+            max=50.0,
+            help="Blur the map behind the person as a lens does, in percent of the longer side.",
+        ),
+    ] = 1.0,
     matte: Annotated[
         Path | None,
         typer.Option(
@@ -215,12 +226,15 @@ def relight(
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
     parse_lights(lights)
-    if network_alone and reflectance != "field":
-        raise UsageError("--network-alone: is for the field; leave it out, or use --reflectance field")
+    if network_alone and reflectance not in ("field", "portrait"):
+        raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
     photo = PhotoOptions(
         settings, input_colourspace, face_model, face, landmarks, geometry, texture_size, landmarks_from
     )
     photo.check()
+    behind = parse_background(background)
+    if behind.kind != "photo" and (composite == "face" or pose is not None):
+        raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file; give one that exists")
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), reflectance))
@@ -231,7 +245,8 @@ def relight(
         sampling=envmap_sampling,
         pose=pose,
         composite=composite or ("photo" if pose is None else "face"),
-        keep_background=keep_background,
+        background=behind,
+        background_blur=background_blur / 100,
         matte=matte,
         exposure_ev=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),

@@ -15,7 +15,8 @@ from facerf_cli.errors import UsageError
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
-_HEAD_STAGES = (*_TEXTURE_STAGES, "geometry", "parsing")  # which draw synthetic heads
+_PEOPLE_STAGES = ("parsing", "portrait")  # which draw whole synthetic people
+_HEAD_STAGES = (*_TEXTURE_STAGES, "geometry", *_PEOPLE_STAGES)  # which draw synthetic heads
 _CROP_STAGES = ("joint", "appearance-features")  # which read a dataset's crops
 _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
@@ -105,7 +106,8 @@ def train(
             help="Train the networks of a stage. reflectance: the Reflectance Network, on textures; "
             "geometry: the Geometry Network, on rendered heads; joint: both, through the rasterizer; "
             "light-features, appearance-features: the networks of those options; diffuse-sh: the network "
-            "of that baseline; parsing: the Parsing Network, on whole synthetic people.",
+            "of that baseline; parsing and portrait: the Parsing Network and the Portrait Network, on whole "
+            "synthetic people.",
             show_default="joint with --preset paper, else reflectance",
         ),
     ] = None,
@@ -152,7 +154,7 @@ def train(
         str,
         _data(
             metavar="NAME|PATH",
-            help="Draw synthetic heads from this face model; of the stage parsing, from several with commas.",
+            help="Draw synthetic heads from this face model; of parsing and portrait, from several with commas.",
         ),
     ] = "builtin",
     fit_with: Annotated[

@@ -8,11 +8,19 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained, Reflectance
-from facerf_cli.composite import Composition, Target
+from facerf_cli.composite import Target
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models
-from facerf_cli.pipeline import DEFAULT_ESTIMATOR, Estimator, explain, reflectance_of, relight, relit_by
+from facerf_cli.pipeline import (
+    DEFAULT_ESTIMATOR,
+    Estimator,
+    composition_of,
+    explain,
+    reflectance_of,
+    relight,
+    relit_by,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +50,8 @@ class Method:
         network_alone: bool,
     ) -> Iterator[np.ndarray]:
         """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
-        reflectance = reflectance_of(self.models, head, self.kind, network_alone)
-        composition = Composition(self.models.face, photo, head, target)
+        reflectance = reflectance_of(self.models, head, self.kind, network_alone, photo=photo)
+        composition = composition_of(self.models, photo, head, reflectance, target)
         relit = relit_by(composition, head, reflectance, directions, weights, target)
-        for row, of_row in zip(weights, relit, strict=True):
-            yield composition.image(RigLight(directions, row), of_row).pixels
+        for of_row in relit:
+            yield composition.image(of_row).pixels

@@ -145,9 +145,9 @@ def ball(
     if kind == "mirror":
         toward_camera = torch.tensor([0.0, 0, 1])
         reflected = 2 * normals[inside][:, 2:] * normals[inside] - toward_camera
-        radiance[inside] = _look_up(_mean_radiance(envmap, 2 * side_px, rotate_deg), reflected)
+        radiance[inside] = look_up(mean_radiance(envmap, 2 * side_px, rotate_deg), reflected)
     else:
-        radiance[inside] = _look_up(_irradiance(envmap, rotate_deg) / math.pi, normals[inside])
+        radiance[inside] = look_up(_irradiance(envmap, rotate_deg) / math.pi, normals[inside])
     return F.avg_pool2d(radiance.permute(2, 0, 1), _BALL_SAMPLES).permute(1, 2, 0)
 
 
@@ -159,7 +159,7 @@ def _ball_normals(side: int) -> tuple[Tensor, Tensor]:
     return torch.stack([x, y, z2.clamp(min=0).sqrt()], -1), z2 > 0
 
 
-def _look_up(latlong: Tensor, directions: Tensor) -> Tensor:
+def look_up(latlong: Tensor, directions: Tensor) -> Tensor:
     """Sample a map [H, W, 3] in directions [P, 3], bilinearly: [P, 3]."""
     width = latlong.shape[1]
     wrapped = torch.cat([latlong[:, -1:], latlong, latlong[:, :1]], 1).permute(2, 0, 1)[None]
@@ -169,7 +169,7 @@ def _look_up(latlong: Tensor, directions: Tensor) -> Tensor:
     return F.grid_sample(wrapped, grid, padding_mode="border", align_corners=False)[0, :, 0].T
 
 
-def _mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
+def mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
     """Rotate a map and average it down to `most_rows` at most [h, 2 h, 3], against aliasing."""
     height = min(most_rows, len(envmap))
     integrals = texel_integrals(envmap, height, 2 * height, rotate_deg)

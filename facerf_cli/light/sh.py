@@ -240,3 +240,11 @@ def _solve(basis: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         step = np.linalg.solve(area * lit.T @ lit + _RIDGE * np.eye(len(series)), gradient)
         series = series - step
     return series
+
+
+def mirror_signs(count: int) -> Tensor:
+    """Factors [K] of 1 and -1 by which coefficients change where x becomes -x."""
+    probe = torch.tensor([[0.36, 0.48, 0.8]], dtype=torch.float64)
+    order = math.isqrt(count) - 1
+    first, mirrored = (sh_basis(probe * torch.tensor([sign, 1.0, 1.0]), order)[0] for sign in (1.0, -1.0))
+    return (first * mirrored).sign().float()

@@ -21,6 +21,7 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
 FORMAT = "facerf-checkpoint-1"
@@ -35,6 +36,7 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
     ("appearance_features", "vgg"): AppearanceNetwork,
     ("diffuse_sh", "default"): DiffuseNetwork,
     ("parsing", "default"): ParsingNetwork,
+    ("portrait", "default"): PortraitNetwork,
 }
 
 

@@ -50,14 +50,13 @@ class ParsingNetwork(nn.Module):
         self.settings = settings
         self.side = settings.side
         widths = settings.widths
-        self.stem = _Halving(3, widths[0], settings.blocks[0])
+        self.stem = Halving(3, widths[0], settings.blocks[0])
         self.encode = nn.ModuleList(
-            _Halving(a, b, count)
-            for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
+            Halving(a, b, count) for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
         )
         pairs = list(itertools.pairwise(widths))
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
-        self.decode = nn.ModuleList(_Residual(a) for a, _ in pairs)
+        self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
         self.classify = nn.Conv2d(widths[0], settings.classes * _ALPHA_STEPS**2, 1)
         self.heat = nn.Conv2d(widths[1], settings.landmarks, 1)
         self.judge = nn.Sequential(
@@ -115,7 +114,7 @@ def _means(heat: Tensor) -> Tensor:
     return torch.stack([share.sum(2) @ x, share.sum(3) @ y], -1)
 
 
-class _Residual(nn.Module):
+class Residual(nn.Module):
     """Two convolutions whose result is added to their input."""
 
     def __init__(self, channels: int) -> None:
@@ -125,18 +124,20 @@ class _Residual(nn.Module):
         self.outer = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Add the result."""
         result: Tensor = x + self.outer(F.silu(self.inner(F.silu(self.norm(x)))))
         return result
 
 
-class _Halving(nn.Module):
+class Halving(nn.Module):
     """Halve the side, then apply residual blocks."""
 
     def __init__(self, channels_in: int, channels_out: int, blocks: int) -> None:
         super().__init__()
         self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=2, padding=1)
-        self.blocks = nn.Sequential(*(_Residual(channels_out) for _ in range(blocks)))
+        self.blocks = nn.Sequential(*(Residual(channels_out) for _ in range(blocks)))
 
     def forward(self, x: Tensor) -> Tensor:
+        """Halve and refine features [B, C, H, W]."""
         result: Tensor = self.blocks(F.silu(self.enter(x)))
         return result

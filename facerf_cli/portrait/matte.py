@@ -21,7 +21,7 @@ def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarr
     small size and applied at the large one.
     """
     reach = max(1, round(_REACH * max(matte.shape)))
-    slope, offset = _local_lines(matte, guide_srgb, reach)
+    slope, offset = local_lines(matte, guide_srgb, reach, _SMOOTHNESS)
     size = photo_srgb.shape[:2]
     lines = enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
     refined = lines[3]
@@ -31,21 +31,26 @@ def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarr
     return np.asarray(refined)
 
 
-def _local_lines(matte: np.ndarray, guide: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes [h, w, 3] and offsets [h, w] of the matte as a linear function of colour around each pixel."""
+def local_lines(
+    values: np.ndarray, guide: np.ndarray, reach: int, smoothness: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes [h, w, 3] and offsets [h, w] of values [h, w] as a linear function of colour around each pixel.
 
-    def mean(values: np.ndarray) -> np.ndarray:
+    `reach` is in pixels; where the variance of the colours is below `smoothness`, values are smoothed.
+    """
+
+    def mean(field: np.ndarray) -> np.ndarray:
         return np.asarray(
-            uniform_filter(values, (2 * reach + 1,) * 2 + (1,) * (values.ndim - 2), mode="nearest")
+            uniform_filter(field, (2 * reach + 1,) * 2 + (1,) * (field.ndim - 2), mode="nearest")
         )
 
-    colour, share = mean(guide), mean(matte)
+    colour, share = mean(guide), mean(values)
     products = guide[..., :, None] * guide[..., None, :]
-    covariance = mean(products.reshape(*matte.shape, 9)).reshape(products.shape)
+    covariance = mean(products.reshape(*values.shape, 9)).reshape(products.shape)
     covariance = (
-        covariance - colour[..., :, None] * colour[..., None, :] + _SMOOTHNESS * np.eye(3, dtype=np.float32)
+        covariance - colour[..., :, None] * colour[..., None, :] + smoothness * np.eye(3, dtype=np.float32)
     )
-    common = mean(guide * matte[..., None]) - colour * share[..., None]
+    common = mean(guide * values[..., None]) - colour * share[..., None]
     slope = np.linalg.solve(covariance, common[..., None])[..., 0]
     offset = share - (slope * colour).sum(-1)
     return mean(slope), mean(offset)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.synth.face_crops import blurred
 from facerf_cli.synth.random_fields import Uniform
 from facerf_cli.synth.sky.skies import draw_sky
 
@@ -104,3 +105,20 @@ def _material(generator: torch.Generator, colour: Tensor) -> Tensor:
     blotches = torch.randn(1, 1, cells, cells, generator=generator) * uniform(0, 0.5)
     wide = F.interpolate(blotches, (SIDE_PX, SIDE_PX), mode="bilinear", align_corners=False)[0]
     return colour * wide.exp()
+
+
+def background_of(stored: Tensor, side: int, generator: torch.Generator) -> Tensor:
+    """Draw a background [3, side, side]: a part of a stored one, blurred by a lens, of any exposure."""
+    uniform = Uniform(generator)
+    reach = float(uniform(0.25, 1.0))
+    centre = (1 - reach) * uniform(-1, 1, 2)
+    at = torch.linspace(-1, 1, side) * reach
+    y, x = torch.meshgrid(at + centre[1], at + centre[0], indexing="ij")
+    grid = torch.stack([x, y], -1)[None]
+    seen = F.grid_sample((stored.float() / 255).square()[None], grid, align_corners=False)[0]
+    if torch.rand((), generator=generator) < 0.25:  # a plain wall
+        seen = blurred(seen, side / 6)
+    elif torch.rand((), generator=generator) < 0.6:
+        seen = blurred(seen, float(uniform(0, 8)))
+    exposure = torch.exp(uniform(-3.0, 1.0)) / 6 / seen.mean().clamp_min(1e-4)
+    return seen * exposure * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))

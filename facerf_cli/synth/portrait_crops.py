@@ -25,6 +25,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.synth.backgrounds import background_of
 from facerf_cli.synth.face_crops import blurred
 from facerf_cli.synth.random_fields import Uniform
 
@@ -127,21 +128,9 @@ class StoredPortraits:
         return photo.mirrored() if torch.rand((), generator=generator) < 0.5 else photo
 
     def _background(self, side: int, generator: torch.Generator) -> Tensor:
-        """Draw a background [3, side, side]: a part of a stored one, blurred by a lens, of any exposure."""
-        uniform = Uniform(generator)
+        """Draw a background [3, side, side]."""
         stored = self.backgrounds[int(torch.randint(len(self.backgrounds), (), generator=generator))]
-        reach = float(uniform(0.25, 1.0))
-        centre = (1 - reach) * uniform(-1, 1, 2)
-        at = torch.linspace(-1, 1, side) * reach
-        y, x = torch.meshgrid(at + centre[1], at + centre[0], indexing="ij")
-        grid = torch.stack([x, y], -1)[None]
-        seen = F.grid_sample((stored.float() / 255).square()[None], grid, align_corners=False)[0]
-        if torch.rand((), generator=generator) < 0.25:  # a plain wall
-            seen = blurred(seen, side / 6)
-        elif torch.rand((), generator=generator) < 0.6:
-            seen = blurred(seen, float(uniform(0, 8)))
-        exposure = torch.exp(uniform(-3.0, 1.0)) / 6 / seen.mean().clamp_min(1e-4)
-        return seen * exposure * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))
+        return background_of(stored, side, generator)
 
     def _composed(
         self, crop: PortraitCrops, people: Sequence[int], side: int, generator: torch.Generator

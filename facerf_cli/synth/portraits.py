@@ -24,7 +24,7 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.raster.camera import project
-from facerf_cli.synth.appearance.materials import Appearance, sample
+from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sample
 from facerf_cli.synth.bake_renderer import irradiance_factors
 from facerf_cli.synth.facets import facets_of
 from facerf_cli.synth.head.body import clearance_m
@@ -178,51 +178,114 @@ def _landmarks_px(subject: Subject, camera: StageCamera) -> Tensor:
 
 
 def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor) -> PortraitPhoto:
-    """Shade a portrait under weights [L, 3] of its lights; no light scatters under the skin."""
-    part = portrait.part.long()
-    surface = sample(appearance, part, portrait.uv)
-    normals, views = portrait.normals.float(), unit(-portrait.positions_m, 1)
-    hair = part == _HAIR
-    strands = Strands(
-        portrait.tangents.float()[hair], views[hair], surface.specular[hair], surface.roughness[hair]
-    )
-    direct = portrait.direct.float()
-    direct[hair] *= strand_cosines(strands.tangents, normals[hair], portrait.directions)
-    lit = direct @ (weights / 255)
-    basis = sh_basis(portrait.directions, _BOUNCE_ORDER)
-    bounced = (portrait.bounce.float() @ (basis.T @ weights)).clamp_min(0)
-    radiance = surface.albedo * (lit + surface.albedo.mean(0) * bounced)
-    highlights = torch.zeros_like(radiance)
-    bright = weights.sum(1).topk(min(_HIGHLIGHTS, len(weights))).indices
-    lights, power, visible = (
-        portrait.directions[bright],
-        weights[bright],
-        portrait.direct[:, bright].float() / 255,
-    )
-    gloss = widened_lobes(
-        normals[~hair],
-        views[~hair],
-        lights,
-        surface.specular[~hair],
-        surface.roughness[~hair],
-        portrait.spread.float()[~hair],
-    )
-    n_dot_l = (normals[~hair] @ lights.T).clamp_min(_LEAST_COSINE)
-    highlights[~hair] = (gloss * (visible[~hair] / n_dot_l).clamp(0, 1)) @ power
-    white, coloured = (lobe * visible[hair] @ power for lobe in strand_highlights(strands, lights))
-    highlights[hair] = white + coloured * surface.albedo[hair]
-    share, pixel = portrait.share.float()[:, None], portrait.pixel.long()
-    columns = torch.cat([radiance + highlights, surface.albedo, normals, highlights], 1) * share
-    side = portrait.side_px
-    summed = torch.zeros(side * side, columns.shape[1]).index_add_(0, pixel, columns)
+    """Shade a portrait under weights [L, 3] of its lights, with the truth of the photo."""
+    surface = materials_of(portrait, appearance)
+    lit = _Lit.of(portrait, surface)
+    highlights = lit.highlights(weights)
+    normals, radiance = portrait.normals.float(), lit.diffuse(weights) + highlights
+    summed = lit.summed(torch.cat([radiance, surface.albedo, normals, highlights], 1))
     specular = summed[:, 9:].mean(1) / summed[:, :3].mean(1).clamp_min(1e-6)
-    lenses = Lenses(portrait.lens_pixel.long(), portrait.lens_normals.float(), portrait.lens_views.float())
-    seen, transmitted = reflections(lenses, portrait.directions)
-    summed[lenses.pixels, :3] = summed[lenses.pixels, :3] * transmitted[:, None] + seen @ weights
-    image, albedo, normal = summed[:, :9].T.view(3, 3, side, side)
+    side = portrait.side_px
+    image = lit.through_lenses(summed[:, :3], weights)
+    albedo, normal = summed[:, 3:9].T.view(2, 3, side, side)
     classes = portrait.classes.permute(2, 0, 1).float() / 255
-    alpha = torch.zeros(side * side).index_add_(0, pixel, share[:, 0]).view(side, side)
+    alpha = lit.summed(torch.ones(len(portrait.pixel), 1)).view(side, side)
     return PortraitPhoto(image, alpha, classes, albedo, unit(normal, 0), specular.view(side, side))
+
+
+def images_under(portrait: BakedPortrait, surface: MaterialPoints, weights: Tensor) -> Tensor:
+    """Images [M, 3, S, S] of a portrait of materials [N] under M sums, weights [M, L, 3], of its lights."""
+    lit = _Lit.of(portrait, surface)
+    return torch.stack(
+        [lit.through_lenses(lit.summed(lit.diffuse(one) + lit.highlights(one)), one) for one in weights]
+    )
+
+
+def albedo_of(portrait: BakedPortrait, surface: MaterialPoints) -> tuple[Tensor, Tensor]:
+    """Albedo and normals [3, S, S] of a portrait of materials [N]; both are times its share of the pixel."""
+    columns = torch.cat([surface.albedo, portrait.normals.float()], 1) * portrait.share.float()[:, None]
+    side = portrait.side_px
+    summed = torch.zeros(side * side, 6).index_add_(0, portrait.pixel.long(), columns)
+    albedo, normals = summed.T.reshape(2, 3, side, side)
+    return albedo, normals
+
+
+@dataclass(frozen=True, eq=False)
+class _Lit:
+    """The shading of a portrait's facets; no light scatters under the skin."""
+
+    portrait: BakedPortrait
+    surface: MaterialPoints
+    hair: Tensor  # [N] bool
+    direct: Tensor  # [N, L], hair's with the cosine of its strands
+    views: Tensor  # [N, 3]
+    strands: Strands
+
+    @classmethod
+    def of(cls, portrait: BakedPortrait, surface: MaterialPoints) -> "_Lit":
+        views = unit(-portrait.positions_m, 1)
+        hair = portrait.part == _HAIR
+        strands = Strands(
+            portrait.tangents.float()[hair], views[hair], surface.specular[hair], surface.roughness[hair]
+        )
+        direct = portrait.direct.float() / 255
+        normals = portrait.normals.float()[hair]
+        direct[hair] *= strand_cosines(strands.tangents, normals, portrait.directions)
+        return cls(portrait, surface, hair, direct, views, strands)
+
+    def diffuse(self, weights: Tensor) -> Tensor:
+        """Radiance [N, 3] without highlights."""
+        basis = sh_basis(self.portrait.directions, _BOUNCE_ORDER)
+        bounced = (self.portrait.bounce.float() @ (basis.T @ weights)).clamp_min(0)
+        albedo = self.surface.albedo
+        return albedo * (self.direct @ weights + albedo.mean(0) * bounced)
+
+    def highlights(self, weights: Tensor) -> Tensor:
+        """Radiance [N, 3] of the brightest lights' highlights."""
+        portrait, surface, smooth = self.portrait, self.surface, ~self.hair
+        bright = weights.sum(1).topk(min(_HIGHLIGHTS, int((weights.sum(1) > 0).sum()))).indices
+        lights, power = portrait.directions[bright], weights[bright]
+        visible = portrait.direct[:, bright].float() / 255
+        normals = portrait.normals.float()[smooth]
+        gloss = widened_lobes(
+            normals,
+            self.views[smooth],
+            lights,
+            surface.specular[smooth],
+            surface.roughness[smooth],
+            portrait.spread.float()[smooth],
+        )
+        n_dot_l = (normals @ lights.T).clamp_min(_LEAST_COSINE)
+        found = torch.zeros(len(surface.albedo), 3)
+        found[smooth] = (gloss * (visible[smooth] / n_dot_l).clamp(0, 1)) @ power
+        white, coloured = (
+            lobe * visible[self.hair] @ power for lobe in strand_highlights(self.strands, lights)
+        )
+        found[self.hair] = white + coloured * surface.albedo[self.hair]
+        return found
+
+    def summed(self, columns: Tensor) -> Tensor:
+        """Values [N, C] of the facets, summed over pixels [S * S, C]."""
+        share, pixels = self.portrait.share.float()[:, None], self.portrait.side_px**2
+        return torch.zeros(pixels, columns.shape[1]).index_add_(
+            0, self.portrait.pixel.long(), columns * share
+        )
+
+    def through_lenses(self, radiance: Tensor, weights: Tensor) -> Tensor:
+        """Radiance [S * S, 3] with the reflections of lenses, as an image [3, S, S]."""
+        portrait, side = self.portrait, self.portrait.side_px
+        lenses = Lenses(
+            portrait.lens_pixel.long(), portrait.lens_normals.float(), portrait.lens_views.float()
+        )
+        seen, transmitted = reflections(lenses, portrait.directions)
+        radiance = radiance.clone()
+        radiance[lenses.pixels] = radiance[lenses.pixels] * transmitted[:, None] + seen @ weights
+        return radiance.T.reshape(3, side, side)
+
+
+def materials_of(portrait: BakedPortrait, appearance: Appearance) -> MaterialPoints:
+    """Sample the materials of the facets [N]."""
+    return sample(appearance, portrait.part.long(), portrait.uv)
 
 
 def visibility_of(portrait: BakedPortrait) -> Tensor:
@@ -237,11 +300,15 @@ def visibility_of(portrait: BakedPortrait) -> Tensor:
     return (summed[:, :-1] / summed[:, -1:].clamp_min(1e-6)).T.view(lights, side, side)
 
 
+def portrait_tensors(portrait: BakedPortrait) -> dict[str, Tensor]:
+    """A portrait's tensors by name, for a file."""
+    return {field.name: getattr(portrait, field.name).contiguous() for field in fields(portrait)}
+
+
 def save_portrait(path: Path, portrait: BakedPortrait) -> None:
     """Write a portrait, whole or not at all."""
-    tensors = {field.name: getattr(portrait, field.name).contiguous() for field in fields(portrait)}
     with atomic_path(path) as temporary:
-        save_file(tensors, temporary)
+        save_file(portrait_tensors(portrait), temporary)
 
 
 def load_portrait(path: Path) -> BakedPortrait:

@@ -9,13 +9,20 @@ from typing import Literal
 
 Preset = Literal["default", "paper", "tiny"]
 Stage = Literal[
-    "reflectance", "geometry", "joint", "light-features", "appearance-features", "diffuse-sh", "parsing"
+    "reflectance",
+    "geometry",
+    "joint",
+    "light-features",
+    "appearance-features",
+    "diffuse-sh",
+    "parsing",
+    "portrait",
 ]
-_PARSING_BATCH = 16
+_BATCHES = {"parsing": 16, "portrait": 8}  # of stages that look at whole people
 FEATURE_STAGES = ("light-features", "appearance-features")  # of networks that a loss compares images with
 
 
-_BESIDE_THE_PAPER = (*FEATURE_STAGES, "parsing")
+_BESIDE_THE_PAPER = (*FEATURE_STAGES, *_BATCHES)
 
 
 @dataclass(frozen=True)
@@ -109,7 +116,8 @@ def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
     It does not say how those of its features were trained.
     """
     settings = PRESETS["default" if preset == "paper" and stage in _BESIDE_THE_PAPER else preset]
-    return replace(settings, batch=_PARSING_BATCH) if stage == "parsing" and preset != "tiny" else settings
+    own = preset != "tiny" and stage in _BATCHES
+    return replace(settings, batch=_BATCHES[stage]) if own else settings
 
 
 # Settings that may differ between a run and its resumption.

@@ -19,7 +19,7 @@ from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks, to_display
+from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
@@ -28,7 +28,6 @@ from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
-from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
 _LANDMARK_SUFFIXES = (".pts", ".json")
@@ -191,11 +190,6 @@ def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOption
             100 * head.fit.error_iod,
         )
     return head
-
-
-def person_matte(image: LinearImage, head: Head) -> np.ndarray:
-    """Matte [H, W] of the person whose head was fitted in a photo."""
-    return segment(to_display(image.pixels), head.fit.crop.to_photo(head.landmarks_px)).matte
 
 
 def read_matte(path: Path, size_px: tuple[int, ...]) -> np.ndarray:

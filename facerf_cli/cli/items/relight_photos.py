@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.items.backdrops import Backdrops
 from facerf_cli.cli.items.light_weights import weights_over_rig, weights_over_stack
 from facerf_cli.cli.items.photos import (
     FittedFace,
@@ -19,7 +20,6 @@ from facerf_cli.cli.items.photos import (
     fit_faces,
     fit_facts,
     load_models_once,
-    person_matte,
     provenance,
     read_matte,
     read_photo,
@@ -32,12 +32,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.face.view import photo_camera
 from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
-from facerf_cli.light.sphere import RigLight
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
-from facerf_cli.pipeline import reflectance_of, relit_by
+from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
@@ -49,11 +49,8 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 class Composer(Protocol):
     """A composer of images: `Composition`, or for a stack of rendered images `_RenderedStack`."""
 
-    def image(self, light: RigLight, relit: Relit) -> RelitImage:
-        """The image of a head under a light, as relit by it."""
-
-    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
-        """The image's pixels at an exposure in EV."""
+    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+        """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
         """The exposure that shows the face well."""
@@ -61,15 +58,13 @@ class Composer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """A head relit by M setups, rgb weights [M, L, 3] of lights [L, 3], and its composer."""
+    """A head relit by setups, and its composer."""
 
     composer: Composer
-    directions: Tensor
-    weights: Tensor
     relit: Callable[[slice], list[Relit]]  # by some of the setups
     bytes_each: int
     alpha: np.ndarray | None = None  # of the photo
-    layers: Mapping[str, np.ndarray] = field(default_factory=dict)  # of every image, beside its own
+    backdrops: Backdrops | None = None
 
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
@@ -92,8 +87,10 @@ def _relight_face(
 ) -> Iterator[tuple[Path, float]]:
     models, head = load_models_once(work.photo), face.head
     target = _target(head.fit, image, work)
-    composition = Composition(models.face, image.pixels, head, target)
-    reflectance = reflectance_of(models, head, work.reflectance, work.network_alone, work.memory_bytes)
+    reflectance = reflectance_of(
+        models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels
+    )
+    composition = composition_of(models, image.pixels, head, reflectance, target)
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
     def relit(rows: slice) -> list[Relit]:
@@ -104,11 +101,12 @@ def _relight_face(
         metadata["facerf:reflectance"] = work.reflectance
     if work.network_alone:
         metadata["facerf:network_alone"] = 1
-    alpha = image.alpha if work.composite == "photo" else None
+    whole = work.composite == "photo"
+    alpha = image.alpha if whole and work.background.kind == "photo" else None
     bytes_each = head.face.texture.nbytes + (composition.surround.nbytes if composition.surround else 0)
-    whole = work.composite == "photo" and work.pose is None
-    layers = {"person.A": person_matte(image, head)} if whole else {}
-    shown = _Shown(composition, directions, weights, relit, bytes_each, alpha, layers)
+    camera = photo_camera(head.fit.crop, *image.pixels.shape[:2])
+    backdrops = Backdrops(work.background, work.background_blur, camera) if whole else None
+    shown = _Shown(composition, relit, bytes_each, alpha, backdrops)
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
 
@@ -116,10 +114,11 @@ def _target(fit: FaceFit, image: LinearImage, work: Relight) -> Target:
     """The head in the pose of `--pose`, composed as the options choose."""
     rotation = rotation_of(work.pose)
     posed = None if rotation is None else replace(fit, rotation=rotation)
-    if work.matte is None or work.composite != "photo":
-        return Target(posed, work.composite, work.keep_background)
-    matte = read_matte(work.matte, image.pixels.shape[:2])
-    return Target(posed, work.composite, work.keep_background, matte)
+    if work.composite != "photo":
+        return Target(posed, work.composite)
+    matte = None if work.matte is None else read_matte(work.matte, image.pixels.shape[:2])
+    kind = work.background.kind
+    return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
 
 
 def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
@@ -127,7 +126,7 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         raise InputError(
             f"{item.input_path}: a stack holds one pose of a face without its photo; give the photo"
         )
-    if work.reflectance != "field":
+    if work.reflectance not in ("field", "portrait"):
         raise InputError(f"{item.input_path}: a stack holds the field; for {work.reflectance} give its photo")
     if work.network_alone:
         raise InputError(f"{item.input_path}: a stack holds the field as predicted; give its photo")
@@ -142,7 +141,7 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 
     metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
     bytes_each = 12 * stack.header.seen.size
-    shown = _Shown(composer, directions, weights, relit, bytes_each)
+    shown = _Shown(composer, relit, bytes_each)
     return dict(_write_setups(item, "", shown, work, metadata)), facts
 
 
@@ -171,11 +170,8 @@ class _RenderedStack:
     seen: np.ndarray
     normals: np.ndarray  # [H, W, 3]
 
-    def image(self, light: RigLight, relit: Relit) -> RelitImage:
+    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
         return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen, {"normal": self.normals})
-
-    def exposed(self, light: RigLight, relit: Relit, image: RelitImage, ev: float) -> np.ndarray:
-        return image.pixels * 2**ev
 
     def auto_exposure_ev(self, relit: Tensor) -> float:
         return auto_exposure_ev(relit.permute(1, 2, 0).numpy(), self.seen)
@@ -197,13 +193,10 @@ def _write_setups(
 
     exposures_ev = _exposures_ev(parts, relit_by_part, shown.composer, work)
     for part in parts:
-        rows = zip(work.setups[part], shown.weights[part], relit_by_part(part), strict=True)
-        for setup, weights, relit in rows:
+        for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
-            light = RigLight(shown.directions, weights)
-            image = shown.composer.image(light, relit)
-            image = replace(image, layers={**image.layers, **shown.layers})
-            _write(path, image, shown.composer.exposed(light, relit, image, ev), shown.alpha, ev, metadata)
+            behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
+            _write(path, shown.composer.image(relit, ev, behind), shown.alpha, ev, metadata)
             yield path, ev
 
 
@@ -224,7 +217,6 @@ def _exposures_ev(
 def _write(
     path: Path,
     image: RelitImage,
-    exposed: np.ndarray,
     photo_alpha: np.ndarray | None,
     exposure_ev: float,
     metadata: Mapping[str, Any],
@@ -232,6 +224,6 @@ def _write(
     """Write an image as EXR, and exposed as PNG."""
     metadata = {**metadata, "facerf:exposure_ev": exposure_ev}  # of the PNG, in both
     alpha = photo_alpha if image.alpha is None else image.alpha
-    write_display(path.with_suffix(".png"), exposed, 0.0, alpha, metadata)
+    write_display(path.with_suffix(".png"), image.pixels, exposure_ev, alpha, metadata)
     write_exr(path, image.pixels, alpha, image.layers, metadata)
     log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
+from facerf_cli.cli.items.train_people import WholePeople, parsing_objective, portrait_objective
 from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.train import TrainOptions
@@ -26,16 +27,11 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.network.reflectance import make_reflectance_network
-from facerf_cli.synth.backgrounds import load_backgrounds
 from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
 from facerf_cli.synth.face_crops import RenderedFaces
-from facerf_cli.synth.head.makehuman import MAKEHUMAN_LICENCE
 from facerf_cli.synth.head_images import add_head_images
 from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
-from facerf_cli.synth.portrait_bank import PortraitBankSettings, add_portraits
-from facerf_cli.synth.portrait_crops import StoredPortraits
 from facerf_cli.synth.texture_samples import SampleSource
 from facerf_cli.training.appearance_objective import AppearanceObjective
 from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
@@ -44,7 +40,6 @@ from facerf_cli.training.joint_objective import JointObjective, JointSettings
 from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
 from facerf_cli.training.loop import Start, train
 from facerf_cli.training.objective import Objective
-from facerf_cli.training.parsing_objective import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.pretrained import load_features, load_vgg
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
@@ -52,9 +47,7 @@ from facerf_cli.training.settings import Preset, Stage
 from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
 
 _WORKERS_ON_GPU = 4
-_MAPS, _HEAPS = 60, 240  # backgrounds: surroundings, each seen from several sides, and heaps of shapes
 _TINY_WIDTHS = (8, 12, 16)
-_TINY_PARSING = (8, 8, 12, 16)
 _TINY_LIGHTS = 20  # of the rig that the preset `tiny` bakes heads under
 _TINY_FORMS: dict[str, dict[str, Any]] = {  # settings of the forms with the preset `tiny`
     "default": {
@@ -140,6 +133,7 @@ def _build_objective(options: TrainOptions, networks: Networks) -> Objective:
         "joint": _joint,
         "diffuse-sh": _diffuse_sh,
         "parsing": _parsing,
+        "portrait": _portrait,
     }
     return builders[options.stage](options, networks)
 
@@ -194,28 +188,28 @@ def _geometry(options: TrainOptions, networks: Networks) -> Objective:
 
 
 def _parsing(options: TrainOptions, networks: Networks) -> Objective:
-    folder, sizes, seed = _bank_folder(options), _sizes(options), options.settings.seed
+    people = _whole_people(options)
+    return parsing_objective(people, _bank_folder(options) / "portraits", networks.get("parsing"))
+
+
+def _portrait(options: TrainOptions, networks: Networks) -> Objective:
+    people = _whole_people(options)
+    return portrait_objective(people, _bank_folder(options) / "transport", networks.get("portrait"))
+
+
+def _whole_people(options: TrainOptions) -> WholePeople:
+    sizes, models = _sizes(options), options.heads_from.split(",")
     if sizes.heads < sizes.held_out_heads + 1:
         raise UsageError(f"--heads {sizes.heads}: {sizes.held_out_heads} people are held out; give more")
-    models = options.heads_from.split(",")
-    drawn = [load_face_model(model) for model in models]
-    tiny = options.preset == "tiny"
-    portraits = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
-    people = range(sizes.heads)
-    add_portraits(folder / "portraits", models, people, options.jobs, seed, portraits)
-    maps, heaps = (1, 4) if tiny else (_MAPS, _HEAPS)
-    backgrounds = load_backgrounds(folder / "backgrounds.safetensors", maps, heaps, seed)
-    provenance = {
-        "heads": f"synthetic people drawn from {' and '.join(model.credit for model in drawn)}",
-        "licence": "; ".join(
-            ["MIT", *(f"the heads' shapes: {model.licence}" for model in drawn), MAKEHUMAN_LICENCE]
-        ),
-    }
-    stored = StoredPortraits(folder / "portraits", backgrounds, provenance)
-    own = ParsingSettings(_TINY_PARSING, (0, 1, 1, 1), side=64) if tiny else ParsingSettings()
-    network: Any = networks.get("parsing") or ParsingNetwork(own)
-    settings = ParsingObjectiveSettings(held_out_people=sizes.held_out_heads)
-    return ParsingObjective(stored, network, settings)
+    return WholePeople(
+        range(sizes.heads),
+        sizes.held_out_heads,
+        models,
+        _bank_folder(options) / "backgrounds.safetensors",
+        options.settings.seed,
+        options.jobs,
+        options.preset == "tiny",
+    )
 
 
 def _joint(options: TrainOptions, networks: Networks) -> Objective:

@@ -23,7 +23,7 @@ from facerf_cli.evaluation.methods import Method
 from facerf_cli.evaluation.people import Person, Portrait, common_mask
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.light.sphere import RigLight, direction_to_azel
+from facerf_cli.light.sphere import direction_to_azel
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_drift_deg
 from facerf_cli.models import Models
@@ -99,7 +99,7 @@ def _lambert(models: Models, head: Head, light: Tensor, view: CropView) -> np.nd
     cosine = torch.einsum("c,cd,dij->ij", light, turn, head.face.normals).clamp_min(0)
     composition = Composition(models.face, None, head, Target(view.fit, "face"))
     relit = Relit(head.face.texture * cosine)
-    return composition.image(RigLight(light[None], _WHITE[0]), relit).pixels
+    return composition.image(relit).pixels
 
 
 def _facts(person: Person, asked: _Question, head: Head, view: CropView) -> dict[str, str | float]:

@@ -1,0 +1,54 @@
+"""Backgrounds of relit photos: images [H, W, 3] behind a person, for each light setup."""
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from facerf_cli.cli.backgrounds import BackgroundChoice
+from facerf_cli.cli.items.light_weights import read_map
+from facerf_cli.cli.lights import LightSetup
+from facerf_cli.files.images import read_image
+from facerf_cli.light.backdrop import backdrop
+from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays
+
+
+class Backdrops:
+    """Draws the chosen background for a photo's camera; what setups share is drawn once."""
+
+    def __init__(self, choice: BackgroundChoice, blur: float, camera: Camera) -> None:
+        self._choice, self._blur, self._camera = choice, blur, camera
+        self._fixed = _fixed(choice, camera.height_px, camera.width_px)
+
+    def behind(self, setup: LightSetup, ev: float) -> np.ndarray | None:
+        """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
+
+        A file and a colour look as they are at an exposure of `ev`. A map is as bright as its light; single
+        lights have a black surrounding.
+        """
+        if self._choice.kind != "envmap":
+            return None if self._fixed is None else self._fixed * np.float32(2.0**-ev)
+        if setup.envmap is None:
+            return np.zeros((self._camera.height_px, self._camera.width_px, 3), np.float32)
+        rays = pixel_rays(pixel_centres_px(self._camera), self._camera)
+        seen: np.ndarray = backdrop(read_map(setup.envmap), rays, setup.rotate_deg, self._blur).numpy()
+        return seen
+
+
+def _fixed(choice: BackgroundChoice, height: int, width: int) -> np.ndarray | None:
+    if choice.colour is not None:
+        return np.broadcast_to(np.array(choice.colour, np.float32), (height, width, 3))
+    return None if choice.path is None else _covering(read_image(choice.path, None).pixels, height, width)
+
+
+def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The middle of an image, scaled to cover a frame."""
+    scale = max(height / image.shape[0], width / image.shape[1])
+    rows, columns = (
+        min(side, round(wanted / scale)) for side, wanted in zip(image.shape, (height, width), strict=False)
+    )
+    top, left = (image.shape[0] - rows) // 2, (image.shape[1] - columns) // 2
+    part = torch.from_numpy(image[top : top + rows, left : left + columns]).permute(2, 0, 1)[None]
+    shrinks = scale < 1
+    sized = F.interpolate(part, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)
+    covered: np.ndarray = sized[0].permute(1, 2, 0).numpy()
+    return covered

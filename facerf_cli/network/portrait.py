@@ -1,0 +1,213 @@
+"""The Portrait Network: from a photo of a person to its light transport, as maps that every light shares.
+
+    OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l sum_j g_j lobe_j(n, t, l)
+
+A is the photo without its light, gain times photo plus bias, so that detail survives; b_k are spherical
+harmonics of the light's direction; P and U hold light with and without the shadows of the proxy V_l; the
+lobes are highlights about normals n, and about strands t of hair. V'_l corrects the proxy's shadows:
+logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pass; a light then costs a few
+products a pixel. The sum over lights is linear in their intensities.
+"""
+
+import itertools
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, Self
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.light.sh import sh_basis
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.parsing import Halving, Residual
+
+SKIN = 1  # index of the class whose mean exposes the image
+_REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
+LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
+_SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
+_STRAND_SHARPNESS = 30.0
+_MAX_WIDTH = 512  # in a checkpoint that is read
+_VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
+_PARTS = {
+    "gain": 3,
+    "bias": 3,
+    "normals": 3,
+    "strands": 3,
+    "gloss": len(_SHARPNESS) + 1,
+    "lit": (LIT_ORDER + 1) ** 2,
+    "around": (LIT_ORDER + 1) ** 2,
+    "trust": 1,
+    "shadow": (SHADOW_ORDER + 1) ** 2,
+}
+OUTPUTS = sum(_PARTS.values())
+
+
+@dataclass(frozen=True)
+class PortraitSettings:
+    """Channels at 1/2, 1/4, ... of the square's side, and residual blocks there; classes of the input."""
+
+    widths: tuple[int, ...] = (40, 72, 120, 176, 208)
+    blocks: tuple[int, ...] = (1, 1, 2, 2, 2)
+    classes: int = 14
+    side: int = 192
+
+
+@dataclass(frozen=True)
+class PortraitInputs:
+    """What the network knows of B people in squares of side S; camera space.
+
+    image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
+    [B, C, S, S]; normals [B, 3, S, S], depth [B, 1, S, S] (0.1 m) and covered [B, 1, S, S] of the proxy;
+    reached [B, K, S, S]: spherical harmonics of the proxy's visibility.
+    """
+
+    image: Tensor
+    classes: Tensor
+    normals: Tensor
+    depth: Tensor
+    covered: Tensor
+    reached: Tensor
+
+    @staticmethod
+    def of(
+        image: Tensor, classes: Tensor, surface: tuple[Tensor, Tensor, Tensor], reached: Tensor
+    ) -> "PortraitInputs":
+        """Expose images [B, 3, S, S]; `surface` holds normals, depth and cover of the proxy."""
+        normals, depth, covered = surface
+        exposed = image / skin_exposure(image, classes)
+        return PortraitInputs(exposed, classes, normals, depth, covered, reached)
+
+    def to(self, device: torch.device) -> "PortraitInputs":
+        """Move the inputs to `device`."""
+        return PortraitInputs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+    def stacked(self) -> Tensor:
+        """All of it [B, C, S, S] as the first layer sees it."""
+        root = (self.image.clamp(0, 4) + 0.005).sqrt() - 0.5
+        layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached)
+        return torch.cat(layers, 1)
+
+
+def reached_by(directions: Tensor, visible: Tensor, side: int) -> Tensor:
+    """Spherical harmonics [K, side, side] of the visibility [L, s, s] of a rig [L, 3] all around."""
+    basis = sh_basis(directions, _REACH) / len(directions)
+    summary = torch.einsum("lk,lij->kij", basis, visible)
+    return F.interpolate(summary[None] * 3, size=(side, side), mode="bilinear", align_corners=False)[0]
+
+
+def skin_exposure(image: Tensor, classes: Tensor) -> Tensor:
+    """Exposure [B, 1, 1, 1] of images [B, 3, S, S]: divided by it the skin's mean is `MEAN_RADIANCE`."""
+    skin = classes[:, SKIN : SKIN + 1]
+    mean = (image.mean(1, keepdim=True) * skin).sum((2, 3), keepdim=True)
+    return (mean / skin.sum((2, 3), keepdim=True).clamp_min(1e-3) / MEAN_RADIANCE).clamp_min(1e-6)
+
+
+class PortraitMaps(NamedTuple):
+    """Maps of B people; every one [B, C, S, S]; albedo is in the units of the exposed image."""
+
+    gain: Tensor
+    bias: Tensor
+    albedo: Tensor
+    normals: Tensor
+    strands: Tensor
+    gloss: Tensor
+    lit: Tensor
+    around: Tensor
+    trust: Tensor
+    shadow: Tensor
+
+    def shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
+
+        `visible` [B, L, S, S] is the proxy's visibility. The image of a light is albedo times shading plus
+        highlights.
+        """
+        basis = sh_basis(lights, SHADOW_ORDER)  # [B, L, K]
+        few = basis[..., : (LIT_ORDER + 1) ** 2]
+        logit = self.trust * (2 * visible - 1) + torch.einsum("blk,bkij->blij", basis, self.shadow)
+        visible = torch.sigmoid(logit)
+        cosine = torch.einsum("blc,bcij->blij", lights, self.normals)
+        lit = torch.einsum("blk,bkij->blij", few, self.lit)
+        around = torch.einsum("blk,bkij->blij", few, self.around)
+        shading = visible * cosine.clamp_min(0) + F.relu(visible * lit + around)
+        half = F.normalize(lights + lights.new_tensor(_VIEW), dim=-1)
+        n_dot_h = torch.einsum("blc,bcij->blij", half, self.normals).clamp(1e-3, 1).log()
+        t_dot_h = torch.einsum("blc,bcij->blij", half, self.strands)
+        glow = torch.exp(-0.5 * _STRAND_SHARPNESS * t_dot_h.square()) * self.gloss[:, -1:]
+        for index, sharpness in enumerate(_SHARPNESS):
+            lobe = torch.exp(sharpness * n_dot_h) * (sharpness / 8)
+            glow = glow + lobe * self.gloss[:, index : index + 1]
+        return shading, visible * glow, visible
+
+    def olats(self, lights: Tensor, visible: Tensor) -> Tensor:
+        """Images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
+        shading, glow, _ = self.shaded(lights, visible)
+        return self.albedo[:, None] * shading[:, :, None] + glow[:, :, None]
+
+
+class PortraitNetwork(nn.Module):
+    """Predict the maps of people from `PortraitInputs`, by a small U-Net."""
+
+    def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
+        super().__init__()
+        self.settings = settings
+        self.side = settings.side
+        widths = settings.widths
+        channels = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2
+        self.stem = Halving(channels, widths[0], settings.blocks[0])
+        self.encode = nn.ModuleList(
+            Halving(a, b, count) for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
+        )
+        pairs = list(itertools.pairwise(widths))
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
+        self.last = Residual(widths[0])
+        self.predict = nn.Conv2d(widths[0], OUTPUTS * 4, 1)
+        nn.init.normal_(self.predict.weight, std=0.01)
+
+    def forward(self, inputs: PortraitInputs) -> PortraitMaps:
+        """Predict maps; sides are multiples of 32."""
+        x = self.stem(inputs.stacked())
+        skips = []
+        for halving in self.encode:
+            skips.append(x)
+            x = halving(x)
+        for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
+            x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
+        raw = F.pixel_shuffle(self.predict(self.last(x)), 2).float()
+        return _maps(dict(zip(_PARTS, torch.split(raw, list(_PARTS.values()), 1), strict=True)), inputs)
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": "default", **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
+        widths, blocks = (tuple(int(x) for x in metadata[name]) for name in ("widths", "blocks"))
+        classes, side = int(metadata["classes"]), int(metadata["side"])
+        if (
+            not 3 <= len(widths) == len(blocks) <= 6
+            or not all(4 <= width <= _MAX_WIDTH and width % 4 == 0 for width in widths)
+            or not all(0 <= count <= 8 for count in blocks)
+            or not 2 <= classes <= 64
+            or side % 2 ** len(widths)
+        ):
+            raise ValueError(f"no Portrait Network has the settings {metadata}")
+        return cls(PortraitSettings(widths, blocks, classes, side))
+
+
+def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
+    gain, bias = torch.exp(raw["gain"].clamp(-4, 4)), 0.1 * F.softplus(raw["bias"] - 3)
+    return PortraitMaps(
+        gain=gain,
+        bias=bias,
+        albedo=inputs.image * gain + bias,
+        normals=F.normalize(inputs.normals + raw["normals"], dim=1),
+        strands=F.normalize(raw["strands"] + raw["strands"].new_tensor([0.0, 1.0, 0.0]).view(3, 1, 1), dim=1),
+        gloss=0.1 * F.softplus(raw["gloss"] - 2),
+        lit=0.3 * raw["lit"],
+        around=torch.cat([0.3 * raw["around"][:, :1] + 0.05, 0.3 * raw["around"][:, 1:]], 1),
+        trust=4 * F.softplus(raw["trust"] + 0.5),
+        shadow=raw["shadow"] * 3,
+    )

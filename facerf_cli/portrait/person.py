@@ -1,0 +1,73 @@
+"""A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.network.portrait import PortraitInputs, reached_by
+from facerf_cli.portrait.proxy import Proxy, ProxyMaps, proxy_maps, proxy_of, square_camera, visibility
+from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.portrait.square import SIDE_PX, portrait_square
+from facerf_cli.raster.camera import PIXEL_CENTRE
+
+VISIBILITY_PX = SIDE_PX // 2  # side at which shadow rays are cast
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy."""
+
+    square: Crop
+    image: Tensor
+    classes: Tensor
+    proxy: Proxy
+    maps: ProxyMaps
+    fit: FaceFit
+    segmentation: Segmentation
+
+    def visibility(self, directions: Tensor) -> Tensor:
+        """Share [L, s, s] of lights [L, 3] that reaches the person, on `VISIBILITY_PX`."""
+        square = Crop(self.square.x0_px, self.square.y0_px, self.square.side_px, VISIBILITY_PX)
+        return visibility(self.proxy, square_camera(self.fit, square), directions)
+
+    def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
+        """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
+        reached = reached_by(rig, visible, SIDE_PX)[None]
+        return PortraitInputs.of(self.image[None], self.classes[None], surface_of(self.maps), reached)
+
+
+def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals [1, 3, S, S], depth [1, 1, S, S] in decimetres from the mean, and cover of a proxy."""
+    z, covered = maps.positions_m[2], maps.covered
+    depth = (z - (z * covered).sum() / covered.sum()) / 0.1
+    return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
+
+
+def look_at_person(model: MorphableModel, photo: np.ndarray, fit: FaceFit) -> Person:
+    """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face."""
+    landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
+    square = portrait_square(landmarks_px)
+    segmentation = segment(to_display(photo), landmarks_px)
+    classes = _classes_in(segmentation, square)
+    proxy = proxy_of(model, fit, classes, square)
+    image = torch.from_numpy(square.apply(photo)).permute(2, 0, 1)
+    maps = proxy_maps(proxy, square_camera(fit, square))
+    return Person(square, image, classes, proxy, maps, fit, segmentation)
+
+
+def _classes_in(segmentation: Segmentation, square: Crop) -> Tensor:
+    """Shares [C, S, S] of the classes in a square; beyond the photo there is background."""
+    height, width = segmentation.matte.shape
+    at = (np.arange(square.size_px) + PIXEL_CENTRE) / square.size_px
+    x, y = np.meshgrid(*square.to_photo(np.stack([at, at], -1) * square.size_px).T)
+    grid = torch.from_numpy(np.stack([2 * x / width - 1, 2 * y / height - 1], -1)).float()[None]
+    found = F.grid_sample(segmentation.classes[None], grid, align_corners=False)[0]
+    found[0] += (1 - found.sum(0)).clamp_min(0)
+    return found

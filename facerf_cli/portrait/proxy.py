@@ -1,0 +1,194 @@
+"""Proxy geometry of a person in a photo: the fitted face on a mean head with ears, neck, hair and bust.
+
+It gives each pixel a normal and a position, and tells which lights reach it. Shadows of nose, brow, chin,
+hair and head come from it; what it gets wrong, the Portrait Network corrects.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.face.view import photo_camera
+from facerf_cli.light.transport import build_scene, occluded, on_disc
+from facerf_cli.network.checkpoint import load_checkpoint
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import inpaint, vertex_normals
+
+ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
+_HAIR_M = 0.07  # most that the scalp is pushed out by
+_ANGLES, _SMOOTH = 48, 2.0  # around the head, in which the hair's outline is measured, and its smoothing
+_OFF_M = 0.003  # of rays, from the surface: hides its facets
+_RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
+_SOFT_PX = 0.7  # standard deviation of a blur of visibility
+_SEED = 7
+
+
+@dataclass(frozen=True, eq=False)
+class _Person:
+    """The mean person, head frame: vertices [N, 3], triangles [F, 3].
+
+    A vertex follows the displacement of the face's vertices `carriers` [N, 4] by `weights` [N, 4] times
+    `follows` [N]; `hair` [N] is the share of the hair's thickness by which it is pushed out.
+    """
+
+    vertices_m: Tensor
+    triangles: Tensor
+    carriers: Tensor
+    weights: Tensor
+    follows: Tensor
+    hair: Tensor
+    face_m: Tensor  # [GRID * GRID, 3] of the mean face
+
+
+@dataclass(frozen=True, eq=False)
+class Proxy:
+    """The mesh of a person in camera space: vertices and unit normals [N, 3], triangles [F, 3]."""
+
+    vertices: Tensor
+    normals: Tensor
+    triangles: Tensor
+
+    @staticmethod
+    def of(vertices: Tensor, triangles: Tensor) -> "Proxy":
+        """Compute the normals."""
+        return Proxy(vertices, vertex_normals(vertices, triangles), triangles)
+
+
+@dataclass(frozen=True, eq=False)
+class ProxyMaps:
+    """The proxy seen in a square of side S, camera space; where it is not covered, filled from around.
+
+    normals [3, S, S] unit; positions_m [3, S, S]; covered [S, S] 0 or 1.
+    """
+
+    normals: Tensor
+    positions_m: Tensor
+    covered: Tensor
+
+
+def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop) -> Proxy:
+    """Shape the proxy of a fitted face; classes [C, S, S] are what is seen in the square around it."""
+    person = _person()
+    face = model.vertices(fit.alpha[None], fit.beta[None])[0]
+    mean = person.face_m
+    scale = ((face - face.mean(0)) * (mean - mean.mean(0))).sum(0) / (mean - mean.mean(0)).square().sum(0)
+    shift = face.mean(0) - scale * mean.mean(0)
+    rest = face - (scale * mean + shift)
+    carried = (person.weights[..., None] * rest[person.carriers]).sum(1) * person.follows[:, None]
+    vertices = (scale * person.vertices_m + shift + carried) @ fit.rotation.mT + fit.translation_m
+    camera = square_camera(fit, square)
+    return Proxy.of(_with_hair(vertices, person.hair, camera, classes), person.triangles)
+
+
+def square_camera(fit: FaceFit, square: Crop) -> Camera:
+    """The camera of a square of the photo that a face was fitted in."""
+    whole = photo_camera(fit.crop, square.size_px, square.size_px)
+    return Camera(
+        whole.focal_px * square.scale,
+        square.size_px,
+        square.size_px,
+        (whole.cx_px - square.x0_px) * square.scale,
+        (whole.cy_px - square.y0_px) * square.scale,
+    )
+
+
+def proxy_maps(proxy: Proxy, camera: Camera) -> ProxyMaps:
+    """Render normals and positions."""
+    fragments = rasterize(proxy.vertices, proxy.triangles, camera)
+    seen = interpolate(torch.cat([proxy.normals, proxy.vertices], 1), proxy.triangles, fragments)
+    covered = fragments.covered.float()
+    if not covered.any():
+        raise InputError("the fitted face lies outside the image; give its landmarks with --landmarks")
+    filled = inpaint(seen.permute(2, 0, 1), covered)
+    return ProxyMaps(F.normalize(filled[:3], dim=0), filled[3:], covered)
+
+
+def visibility(proxy: Proxy, camera: Camera, directions: Tensor) -> Tensor:
+    """Share [L, s, s] of lights from camera-space directions [L, 3] that reaches each pixel of a camera.
+
+    The proxy shades itself; a surface that faces away is not reached.
+    """
+    maps = proxy_maps(proxy, camera)
+    inside = maps.covered.numpy() > 0
+    normals, points = (field.numpy()[:, inside].T for field in (maps.normals, maps.positions_m))
+    origins = (points + _OFF_M * normals).astype(np.float32)
+    scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
+    random = np.random.default_rng(_SEED)
+    numbers = random.random((_RAYS, 2, len(origins), 1)).astype(np.float32)
+    found = np.zeros((len(directions), *inside.shape), np.float32)
+    for light, direction in enumerate(directions.numpy()):
+        blocked = [occluded(scene, origins, on_disc(direction, _RADIUS_DEG, *pair)) for pair in numbers]
+        found[light, inside] = 1 - np.mean(blocked, 0)
+    filled = inpaint(torch.from_numpy(found), maps.covered)
+    return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
+
+
+def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) -> Tensor:
+    """Push the scalp out to the outline of hair and headwear in the image.
+
+    The thickness is measured along directions from the middle of the scalp in the image, and continued over
+    the parts that face the camera or lie behind.
+    """
+    scalp = hair > 0.5
+    centre_m = vertices[scalp].mean(0)
+    places = project(vertices, camera)
+    middle = project(centre_m[None], camera)[0]
+    bald_px = _reach(places[scalp] - middle, torch.ones(int(scalp.sum()), dtype=torch.bool))
+    side = classes.shape[-1]
+    y, x = torch.meshgrid(*(torch.arange(side) + PIXEL_CENTRE,) * 2, indexing="ij")
+    own = classes[class_index("hair")] + classes[class_index("headwear")]
+    pixels = (torch.stack([x, y], -1) * (camera.width_px / side)).view(-1, 2) - middle
+    outline_px = _reach(pixels, (own > 0.5).flatten())
+    per_metre = camera.focal_px / float(-centre_m[2])
+    upper = np.sin(_bin_angles()) < 0.3  # image directions upward and to the sides; y points down
+    thick_m = ((outline_px - bald_px) / per_metre).clip(0, _HAIR_M) * (bald_px > 0) * upper
+    thick_m = gaussian_filter1d(thick_m, _SMOOTH, mode="wrap")
+    offset = (places - middle).numpy()
+    at = _bin_of(offset)
+    near_outline = (np.linalg.norm(offset, axis=1) / np.maximum(bald_px[at], 1e-6)).clip(0, 1) ** 2
+    mean_m = thick_m[upper].mean()
+    push_m = torch.from_numpy(mean_m + near_outline * (thick_m[at] - mean_m)).float() * hair
+    outward = F.normalize(vertices - centre_m, dim=1)
+    return vertices + push_m[:, None] * outward
+
+
+def _bin_angles() -> np.ndarray:
+    """Image angles of the middle of the bins, clockwise from the right."""
+    return (np.arange(_ANGLES) + 0.5) * 2 * np.pi / _ANGLES
+
+
+def _bin_of(offset: np.ndarray) -> np.ndarray:
+    angle = np.arctan2(offset[:, 1], offset[:, 0]) % (2 * np.pi)
+    return (angle * _ANGLES / (2 * np.pi)).astype(int) % _ANGLES
+
+
+def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
+    """Largest distance [A] of the chosen places [N, 2] from the middle, by angle; 0 without any."""
+    offset = offset_px[chosen].numpy()
+    reach = np.zeros(_ANGLES)
+    np.maximum.at(reach, _bin_of(offset), np.linalg.norm(offset, axis=1))
+    return reach
+
+
+@cache
+def _person() -> _Person:
+    tensors, metadata = load_checkpoint(ASSET)
+    if metadata.get("layout_version") != LAYOUT_VERSION:
+        raise InputError(f"{ASSET}: made for another UV layout; make it again")
+    model = load_face_model(BUILTIN)
+    face = model.vertices(torch.zeros(1, len(model.identity)), torch.zeros(1, len(model.expression)))[0]
+    tensors["triangles"], tensors["carriers"] = tensors["triangles"].long(), tensors["carriers"].long()
+    return _Person(**tensors, face_m=face)

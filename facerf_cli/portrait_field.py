@@ -1,0 +1,154 @@
+"""The portrait field: the light transport of all that a photo shows of a person.
+
+Fixed maps of the Portrait Network and the shadows of a proxy give an image of the whole person under any
+single light (`network/portrait.py`). In the face, where the neural reflectance field sees more detail, both
+are averaged. As the field's, the maps are corrected by the photo's quotient, so that its own light gives the
+photo back.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.head import Head
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
+from facerf_cli.field import Field, OwnLight
+from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork, skin_exposure
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.person import Person, look_at_person
+from facerf_cli.portrait.proxy import square_camera
+from facerf_cli.raster.camera import project
+from facerf_cli.raster.texture import bake_attributes
+
+SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
+_SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
+_LIGHTS_AT_ONCE = 16
+_SHARE = 0.5  # of the portrait field in the face
+_SKIN = class_index("skin")
+_LIKENESS_PX = 48
+
+
+@dataclass(frozen=True, eq=False)
+class PortraitLight:
+    """A person under M sums of lights: shading and highlights [M, 3, S, S] in the square.
+
+    Both hold the photo's correction; radiance is albedo times shading, plus highlights.
+    """
+
+    shading: Tensor
+    highlights: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PortraitField:
+    """The light transport of a person; a `Reflectance`, whose textures are those of the face."""
+
+    person: Person
+    maps: PortraitMaps  # of one person; albedo in the units of `image`
+    image: Tensor  # [3, S, S] exposed
+    exposure: float  # radiance of the photo over that of `image`
+    field: Field
+    quotient: Quotient | None = None
+    texels: Tensor | None = None  # [T, T, 2] of the face's texture, in the square, for grid_sample
+
+    @staticmethod
+    @torch.no_grad()
+    def of(
+        model: MorphableModel, photo: np.ndarray, head: Head, field: Field, own: OwnLight | None
+    ) -> "PortraitField":
+        """Look at the person in a scene-linear photo [H, W, 3]; `own` is the photo's estimated light."""
+        person = look_at_person(model, photo, head.fit)
+        rig = rig_directions(_SUMMARY_LIGHTS)
+        inputs = person.inputs(rig, person.visibility(rig))
+        maps = portrait_network()(inputs)
+        exposure = float(skin_exposure(person.image[None], person.classes[None]))
+        texels = _texels_in_square(model, head, person)
+        found = PortraitField(person, maps, inputs.image[0], exposure, field, None, texels)
+        return found if own is None else found._corrected(own)
+
+    def _corrected(self, own: OwnLight) -> "PortraitField":
+        """The field in the units of the photo's light, corrected to give the photo back under it."""
+        lit = self.lit(own.light.directions, own.light.weights[None])
+        explained = (self.maps.albedo * lit.shading + lit.highlights)[0]
+        skin = self.person.classes[_SKIN]
+        exposure = float((self.person.image * skin).sum() / (explained * skin).sum().clamp_min(1e-6))
+        alpha = 1 - self.person.classes[0]
+        quotient = Quotient.of(self.person.image, explained * exposure, alpha)
+        return PortraitField(self.person, self.maps, self.image, exposure, self.field, quotient, self.texels)
+
+    @torch.no_grad()
+    def lit(self, directions: Tensor, weights: Tensor) -> PortraitLight:
+        """The person under M sums, rgb weights [M, L, 3], of lights [L, 3]."""
+        shading, highlights = torch.zeros(2, len(weights), 3, *self.image.shape[1:]).unbind(0)
+        used = weights.abs().sum((0, 2)) > 0
+        for lights, some in zip(
+            torch.split(directions[used], _LIGHTS_AT_ONCE),
+            torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
+            strict=True,
+        ):
+            visible = F.interpolate(
+                self.person.visibility(lights)[None], size=self.image.shape[1:], mode="bilinear"
+            )
+            shade, glow, _ = self.maps.shaded(lights[None], visible)
+            if self.quotient is None:
+                shade, glow = shade[0][:, None], glow[0][:, None]
+            else:
+                images = self.maps.albedo * shade[0][:, None] + glow[0][:, None]
+                factor = self.quotient.factors(images)
+                shade, glow = shade[0][:, None] * factor, glow[0][:, None] * factor
+            shading = shading + torch.einsum("mlc,lcij->mcij", some, shade.expand(-1, 3, -1, -1))
+            highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow.expand(-1, 3, -1, -1))
+        return PortraitLight(shading, highlights)
+
+    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
+        """Textures [M, 3, T, T] of the face; of a turned head the neural field's alone."""
+        textures = self.field.relit(directions, weights, turn)
+        return textures if turn is not None else self.blended(textures, self.lit(directions, weights))
+
+    def blended(self, textures: Tensor, lit: PortraitLight) -> Tensor:
+        """Textures [M, 3, T, T] of the neural field, averaged with the portrait's."""
+        assert self.texels is not None
+        grid = self.texels[None]
+
+        def sampled(maps: Tensor) -> Tensor:
+            return F.grid_sample(
+                maps, grid.expand(len(maps), -1, -1, -1), padding_mode="border", align_corners=False
+            )
+
+        texture = self.field.face.texture[None] / self.input_exposure
+        albedo = texture * sampled(self.maps.gain) + sampled(self.maps.bias)
+        own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * self.exposure
+        return torch.lerp(textures, own, _SHARE)
+
+    @property
+    def input_exposure(self) -> float:
+        """Radiance of the photo over that of the network's input."""
+        return float(skin_exposure(self.person.image[None], self.person.classes[None]))
+
+
+def _texels_in_square(model: MorphableModel, head: Head, person: Person) -> Tensor:
+    """Place [T, T, 2] of each texel of the face in the square, in -1..1."""
+    camera = square_camera(head.fit, person.square)
+    places = project(head.fit.vertices_camera(model), camera) / person.square.size_px * 2 - 1
+    side = head.face.texture.shape[-1]
+    grid = round(len(grid_uv()) ** 0.5)
+    return bake_attributes(places, grid, side).permute(1, 2, 0)
+
+
+@cache
+def portrait_network(path: Path = SHIPPED) -> PortraitNetwork:
+    """Load a Portrait Network, by default the shipped one; raises InputError where the file holds none."""
+    network = load_networks(path, LAYOUT_VERSION)[0].get("portrait")
+    if not isinstance(network, PortraitNetwork):
+        raise InputError(f"{path}: holds no Portrait Network of this version; train one, --stage portrait")
+    return network.eval()

@@ -1,0 +1,217 @@
+"""Bank of portraits that the Portrait Network is trained on: what cameras see of synthetic people.
+
+A portrait is kept without light: the facets of the image, how much of each light reaches them, and what they
+are made of in several looks. Every training sample lights it anew. The squares lie around the head as those
+that the Portrait Network sees of photos (`portrait.proxy`).
+"""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.fit import fit_landmarks
+from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.transport import BakeSettings
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.person import look_at_person, surface_of
+from facerf_cli.portrait.square import SIDE_PX, SIDES
+from facerf_cli.raster.camera import Camera, pose_to_rotation, project
+from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
+from facerf_cli.synth.backgrounds import background_of
+from facerf_cli.synth.portraits import (
+    BakedPortrait,
+    bake_subject,
+    images_under,
+    materials_of,
+    portrait_tensors,
+    view_of,
+)
+from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.texture_samples import draw_light
+from facerf_cli.workers import in_shards
+
+_LOOK_PX = 256  # texture side of looks other than the person's own
+_BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=6)
+# Standard deviations of the camera's yaw, pitch and roll, and their largest values, in degrees.
+_POSE_STD_DEG, _POSE_MAX_DEG = (24.0, 9.0, 5.0), (65.0, 28.0, 18.0)
+_DISTANCE_M = (0.5, 3.0)
+_TRIES, _CROP_PX = 3, 256  # lights in which a face is looked for; side of the crop that it is fitted in
+_SIZE_STD, _SHIFT_STD = 0.06, 0.03  # of the square: logarithm of its side, and its place in sides
+
+
+@dataclass(frozen=True)
+class TransportBankSettings:
+    """Numbers of views, looks and lights of a person."""
+
+    views: int = 4
+    looks: int = 3
+    lights: int = 48
+
+
+def add_transport(
+    folder: Path,
+    face_models: list[str],
+    people: range,
+    jobs: int,
+    seed: int,
+    settings: TransportBankSettings = TransportBankSettings(),
+) -> None:
+    """Bake synthetic people into `folder`; keep finished ones. The face models take turns."""
+    folder.mkdir(parents=True, exist_ok=True)
+    last = settings.views - 1
+    missing = [index for index in people if not _path(folder, index, last).exists()]
+    in_shards(partial(_add_shard, folder, face_models, seed, settings), missing, jobs)
+
+
+def _path(folder: Path, index: int, view: int) -> Path:
+    return folder / f"{index:05}_{view}.safetensors"
+
+
+def _add_shard(
+    folder: Path, face_models: list[str], seed: int, settings: TransportBankSettings, people: list[int]
+) -> None:
+    torch.set_num_threads(1)
+    for index in people:
+        views = transport_of(face_models[index % len(face_models)], index, seed, settings)
+        for view, tensors in enumerate(views):
+            with atomic_path(_path(folder, index, view)) as temporary:
+                save_file(tensors, temporary)
+
+
+@torch.no_grad()
+def transport_of(
+    face_model: str, index: int, seed: int, settings: TransportBankSettings
+) -> list[dict[str, Tensor]]:
+    """Bake one person: for each view the fields of `BakedPortrait`, and its facets' materials in K looks.
+
+    look_albedo [K, N, 3], look_specular and look_roughness [K, N]: float16, see `MaterialPoints`.
+    """
+    random = np.random.default_rng([seed, index, 5])
+    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    subject = draw_subject(subject_model(face_model), index, seed, SIDE_PX)
+    cameras = [_draw_camera(subject, random) for _ in range(settings.views)]
+    turn = pose_to_rotation(*random.uniform(-180, 180, 3).tolist()).double()
+    directions = (rig_directions(settings.lights).double() @ turn).numpy()
+    transport = bake_subject(subject, cameras, directions, _BAKE, index)
+    others = [draw_appearance(_LOOK_PX, generator) for _ in range(settings.looks - 1)]
+    looks = [subject.appearance, *others]
+    views = [view_of(subject, transport, camera) for camera in cameras]
+    return [
+        {**portrait_tensors(view), **_materials([materials_of(view, look) for look in looks])}
+        for view in views
+    ]
+
+
+def _materials(looks: list[MaterialPoints]) -> dict[str, Tensor]:
+    return {
+        f"look_{name}": torch.stack([getattr(look, name) for look in looks]).half()
+        for name in ("albedo", "specular", "roughness")
+    }
+
+
+def _draw_camera(subject: Subject, random: np.random.Generator) -> StageCamera:
+    """Draw a camera whose image is the square around the head, a little off."""
+    limit = np.array(_POSE_MAX_DEG)
+    rotation = pose_to_rotation(*random.normal(0, _POSE_STD_DEG).clip(-limit, limit).tolist())
+    distance_m = math.exp(random.uniform(*np.log(_DISTANCE_M)))
+    towards = torch.tensor([*random.normal(0, 0.05, 2), -distance_m]).float()  # off the axis of the lens
+    landmarks = torch.from_numpy(subject.landmarks_world).float() @ rotation.T.float() + towards
+    seen = project(landmarks, Camera(1.0, 1, 1, 0.0, 0.0))
+    low, high = seen.amin(0), seen.amax(0)
+    side = SIDES * float((high - low).max()) * math.exp(random.normal(0, _SIZE_STD))
+    x, y = (-SIDE_PX * ((low + high) / 2 / side + torch.from_numpy(random.normal(0, _SHIFT_STD, 2)))).tolist()
+    lens = Camera(SIDE_PX / side, SIDE_PX, SIDE_PX, SIDE_PX / 2 + x, SIDE_PX / 2 + y)
+    return StageCamera(lens, rotation, towards)
+
+
+def add_proxies(folder: Path, backgrounds: Tensor, jobs: int, seed: int) -> None:
+    """Add to each portrait of a bank what is seen of it: see `seen_in`; keep finished ones."""
+    missing = [path for path in sorted(folder.glob("[0-9]*.safetensors")) if not seen_path(path).exists()]
+    in_shards(partial(_see_shard, backgrounds, seed), missing, jobs)
+
+
+def seen_path(path: Path) -> Path:
+    """The file beside a portrait's that holds what is seen of it."""
+    return path.with_name(f"seen_{path.name}")
+
+
+def _see_shard(backgrounds: Tensor, seed: int, paths: list[Path]) -> None:
+    torch.set_num_threads(1)
+    for path in paths:
+        with atomic_path(seen_path(path)) as temporary:
+            save_file(
+                seen_in(load_view(path), backgrounds, seed + int(path.stem.replace("_", ""))), temporary
+            )
+
+
+@torch.no_grad()
+def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Tensor]:
+    """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
+
+    classes [C, S, S], covered [1, S, S] and visible [L, s, s] of the view's lights: uint8, of 255; normals
+    [3, S, S], depth [1, S, S]: float16.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    portrait = view.portrait
+    chosen = backgrounds[int(torch.randint(len(backgrounds), (), generator=generator))]
+    for _ in range(_TRIES):
+        weights = draw_light(portrait.directions, generator)
+        background = background_of(chosen, SIDE_PX, generator)
+        image = images_under(portrait, view.looks[0], weights[None])[0]
+        image = image / image.mean().clamp_min(1e-6) * 0.1 + (1 - view.alpha) * background
+        exposed = (image / image.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
+        with suppress(InputError):
+            face = find_faces(exposed, "portrait")[0]
+            crop = from_landmarks(face.landmarks_px, _CROP_PX)
+            fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
+            person = look_at_person(_builtin(), exposed, fit)
+            normals, depth, covered = surface_of(person.maps)
+            return {
+                "classes": (255 * person.classes).round().byte(),
+                "covered": (255 * covered[0]).byte(),
+                "normals": normals[0].half().contiguous(),
+                "depth": depth[0].half(),
+                "visible": (255 * person.visibility(portrait.directions)).round().byte(),
+            }
+    return {}
+
+
+@cache
+def _builtin() -> MorphableModel:
+    return load_face_model(BUILTIN)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredView:
+    """One view of the bank, and the materials of its facets in several looks."""
+
+    portrait: BakedPortrait
+    looks: list[MaterialPoints]
+
+    @property
+    def alpha(self) -> Tensor:
+        """Cover [S, S] of the person."""
+        return 1 - self.portrait.classes[..., 0].float() / 255
+
+
+def load_view(path: Path) -> StoredView:
+    """Read a view."""
+    tensors = load_file(path)
+    albedo, specular, roughness = (
+        tensors.pop(f"look_{name}").float() for name in ("albedo", "specular", "roughness")
+    )
+    relief = torch.zeros(albedo.shape[1], 2)
+    looks = [MaterialPoints(*look, relief) for look in zip(albedo, specular, roughness, strict=True)]
+    return StoredView(BakedPortrait(**tensors), looks)

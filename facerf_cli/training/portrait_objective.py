@@ -1,0 +1,173 @@
+"""Stage `portrait`: the Portrait Network, on synthetic people lit anew at every step.
+
+Errors of single lights, which sums of lights follow from; of the photo under its own light, so that it
+comes back; and of normals and albedo, which make training on synthetic people hold for others (Yeh et al.,
+*Learning to relight portrait images via a virtual light stage and synthetic-to-real adaptation*, 2022).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.synth.portrait_samples import SMALL, PortraitSample, StoredTransport
+from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+
+_VALIDATION_SEED = 20216
+_ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
+_SCALE = (0.4, 2.5)  # of exposure between prediction and truth that is forgiven
+_SHEET_ROWS = 8
+# Regions that are measured, as in the benchmark of whole heads.
+_REGIONS = {
+    "face": ("skin", "brows", "lips", "eyes"),
+    "hair": ("hair",),
+    "ears": ("ears",),
+    "neck": ("neck",),
+    "garment": ("garment",),
+}
+
+
+@dataclass(frozen=True)
+class PortraitObjectiveSettings:
+    """Weights of the terms, targets of a sample, and the held-out people and draws of each."""
+
+    edges: float = 1.0  # of differences of neighbouring roots
+    own: float = 1.0
+    albedo: float = 0.3
+    normals: float = 0.1
+    scale: float = 0.05
+    targets: int = 4
+    held_out_people: int = 16
+    held_out_draws: int = 3
+
+
+class PortraitObjective(Objective):
+    """Errors of the images that the Portrait Network predicts."""
+
+    def __init__(
+        self,
+        portraits: StoredTransport,
+        network: PortraitNetwork | None = None,
+        settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
+    ) -> None:
+        super().__init__()
+        self.networks = nn.ModuleDict({"portrait": network or PortraitNetwork()})
+        self.chooses_by = "error"
+        self.provenance = portraits.provenance
+        self.portraits = portraits
+        self.settings = settings
+        self.people, self.held_out = portraits.people(settings.held_out_people)
+        self._validation: PortraitSample | None = None
+
+    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> PortraitSample:
+        """Draw `count` samples of random people."""
+        targets = self.settings.targets
+        return concatenate([self.portraits.draw(self.people, targets, generator_of(i)) for i in range(count)])
+
+    def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
+        """Compute the weighted terms, each a mean over samples."""
+        maps, settings = self._maps(batch), self.settings
+        found, own = maps.olats(batch.lights, _larger(batch.visible, batch.image)), _own(maps, batch)
+        scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1])
+        alpha = (1 - batch.shares[:, :1])[:, None]
+        off = (_root(found * scale) - _root(batch.targets)) * alpha
+        covered = alpha.mean((1, 2, 3, 4)).clamp_min(1e-3).view(-1, 1, 1, 1, 1)
+        off = off / covered
+        edges = off.diff(dim=-1).abs().mean() + off.diff(dim=-2).abs().mean()
+        small = alpha[:, 0], covered[:, 0]
+        own_off = (_root(own * scale[:, 0]) - _root(_smaller(batch.own))) * _smaller(small[0]) / small[1]
+        albedo_off = (_root(maps.albedo * scale[:, 0]) - _root(batch.albedo)) * small[0] / small[1]
+        turned = 1 - (maps.normals * F.normalize(batch.true_normals, dim=1)).sum(1, keepdim=True)
+        return {
+            "lights": off.abs().mean(),
+            "edges": settings.edges * edges,
+            "own": settings.own * own_off.abs().mean(),
+            "albedo": settings.albedo * albedo_off.abs().mean(),
+            "normals": settings.normals * (turned * small[0] / small[1]).mean(),
+            "scale": settings.scale * scale.log().abs().mean(),
+        }
+
+    def _maps(self, batch: PortraitSample) -> PortraitMaps:
+        with self.mixed_precision():
+            maps: PortraitMaps = self.networks["portrait"](batch.inputs)
+        return maps
+
+    @torch.no_grad()
+    def validate(self) -> Validation:
+        """Measure held-out people: relative error by region under one scale of the head, and its SSIM."""
+        if self._validation is None:
+            self._validation = self._drawn()
+        batch = self._validation.to(next(self.networks.parameters()).device)
+        parts = [_part(batch, index) for index in range(len(batch.image))]
+        found = torch.cat([self._maps(p).olats(p.lights, _larger(p.visible, p.image)) for p in parts])
+        scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1], clamp=False)
+        squared = (found * scale - batch.targets).square().mean(2)
+        truth = batch.targets.square().mean(2)
+        metrics = {}
+        for name, classes in _REGIONS.items():
+            share = batch.shares[:, [class_index(one) for one in classes]].sum(1)[:, None]
+            metrics[name] = float((squared * share).sum() / (truth * share).sum())
+        alpha = (1 - batch.shares[:, :1])[:, None]
+        root = ((_root(found * scale) - _root(batch.targets)) * alpha).abs().mean() / alpha.mean()
+        metrics["error"] = float(root)
+        return Validation(metrics, self._sheet(batch, found * scale))
+
+    def _drawn(self) -> PortraitSample:
+        return concatenate(
+            [
+                self.portraits.draw([person], self.settings.targets, seeded(_VALIDATION_SEED, person, index))
+                for index in range(self.settings.held_out_draws)
+                for person in self.held_out
+            ]
+        )
+
+    def _sheet(self, batch: PortraitSample, found: Tensor) -> np.ndarray:
+        """Held-out photos, each with pairs of predicted and true images."""
+        rows = []
+        for index in range(min(_SHEET_ROWS, len(found))):
+            pairs = torch.stack([found[index], batch.targets[index]], 1).flatten(0, 1)
+            rows.append(torch.cat([batch.image[index], *pairs], -1))
+        return torch.cat(rows, 1).permute(1, 2, 0).cpu().numpy()
+
+
+def _part(batch: PortraitSample, index: int) -> PortraitSample:
+    return PortraitSample(
+        *(getattr(batch, name)[index : index + 1] for name in PortraitSample.__dataclass_fields__)
+    )
+
+
+def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
+    """The photo under its own light [B, 3, S / 4, S / 4], as the network sees it."""
+    small = PortraitMaps(*(_smaller(values) for values in maps))
+    visible = F.interpolate(batch.rig_visible, size=small.gain.shape[-2:], mode="area")
+    shading, glow, _ = small.shaded(batch.rig, visible)
+    lit = torch.einsum("blij,blc->bcij", shading, batch.weights)
+    return small.albedo * lit + torch.einsum("blij,blc->bcij", glow, batch.weights)
+
+
+def _larger(visible: Tensor, image: Tensor) -> Tensor:
+    return F.interpolate(visible, size=image.shape[-2:], mode="bilinear", align_corners=False)
+
+
+def _smaller(values: Tensor) -> Tensor:
+    return F.avg_pool2d(values, SMALL)
+
+
+def _root(radiance: Tensor) -> Tensor:
+    return (radiance.clamp(0, 4) + _ROOT_OFFSET).sqrt()
+
+
+def _best_scale(found: Tensor, targets: Tensor, alpha: Tensor, clamp: bool = True) -> Tensor:
+    """The scale [B, 1, 1, 1, 1] of images [B, T, 3, S, S] that brings them closest to the truth."""
+    with torch.no_grad():
+        one, other, weight = found.clamp(max=2), targets.clamp(max=2), alpha[:, None]
+        scale = (one * other * weight).sum((1, 2, 3, 4)) / (one * one * weight).sum((1, 2, 3, 4)).clamp_min(
+            1e-6
+        )
+        scale = scale.clamp(*_SCALE) if clamp else scale
+    return scale.view(-1, 1, 1, 1, 1)

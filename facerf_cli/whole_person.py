@@ -1,0 +1,79 @@
+"""The whole person of a portrait field, relit at the photo's own resolution.
+
+The field's maps are coarse. Its gain is enlarged with the photo as a guide, so that the photo without its
+light keeps every pore and hair; shading and highlights of a light are smooth and enlarged as they are.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.landmarks import to_display
+from facerf_cli.portrait.matte import local_lines
+from facerf_cli.portrait_field import PortraitField
+from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.raster.texture import inpaint
+
+_REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
+_BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
+_SURE = 0.5  # share of the person from which on a pixel of the maps is its own
+
+
+class WholePerson:
+    """A photo's person [H, W] under sums of lights; outside the square its border goes on."""
+
+    def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
+        self.matte = field.person.segmentation.matte
+        self._field, self._photo = field, photo
+        self._own = (1 - field.person.classes[0] > _SURE).float()
+        self._lines = self._gain_lines()
+        self._bias = self._filled(field.maps.bias[0])
+
+    @property
+    def nbytes(self) -> int:
+        """Size of one light's maps."""
+        return 2 * self._field.image.nbytes
+
+    def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
+        """The pixels [H, W, 3] of the photo under shading and highlights [6, S, S]."""
+        maps = torch.cat([self._filled(lit), self._lines, self._bias])
+        result = np.empty_like(photo)
+        for rows, wide in self._bands(maps):
+            pixels = torch.from_numpy(photo[rows].clip(min=0)).permute(2, 0, 1)
+            guide = torch.from_numpy(to_display(photo[rows])).permute(2, 0, 1).float() / 255
+            shading, highlights, slopes, offset, bias = torch.split(wide, [3, 3, 9, 3, 3])
+            log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
+            log_gain = log_gain.clamp(self._range[0], self._range[1])
+            albedo = pixels / self._field.input_exposure * log_gain.exp() + bias
+            radiance = (albedo * shading + highlights) * self._field.exposure
+            result[rows] = radiance.permute(1, 2, 0).numpy()
+        return result
+
+    def _gain_lines(self) -> Tensor:
+        """Log of the gain as a linear function of the photo's colours: slopes and offsets [12, S, S]."""
+        log_gain = self._filled(self._field.maps.gain[0].log())
+        self._range = float(log_gain.min()), float(log_gain.max())
+        guide = to_display(self._field.person.image.permute(1, 2, 0).numpy()).astype(np.float32) / 255
+        lines = [local_lines(channel.numpy(), guide, _REACH_PX, _SMOOTHNESS) for channel in log_gain]
+        slopes = np.concatenate([slope.transpose(2, 0, 1) for slope, _ in lines])
+        return torch.from_numpy(np.concatenate([slopes, np.stack([offset for _, offset in lines])])).float()
+
+    def _filled(self, maps: Tensor) -> Tensor:
+        """Maps [C, S, S] with the person's values continued over the background."""
+        return inpaint(maps, self._own)
+
+    def _bands(self, maps: Tensor) -> Iterator[tuple[slice, Tensor]]:
+        """Rows of the photo with the maps [C, h, W] over them."""
+        height, width = self._photo.shape[:2]
+        square = self._field.person.square
+        x = 2 * (torch.arange(width) + PIXEL_CENTRE - square.x0_px) / square.side_px - 1
+        y = 2 * (torch.arange(height) + PIXEL_CENTRE - square.y0_px) / square.side_px - 1
+        step = max(1, _BAND_PX // width)
+        for first in range(0, height, step):
+            rows = slice(first, min(height, first + step))
+            grid = torch.stack([x.expand(rows.stop - first, -1), y[rows, None].expand(-1, width)], -1)[None]
+            wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
+            yield rows, wide[0]
