@@ -14,8 +14,8 @@ undershoot of the surround, which is clipped, and for the photo's background, wh
 with negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
@@ -25,6 +25,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
 from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
@@ -48,6 +49,8 @@ _DARKER, _BRIGHTER = 12.0, 1.6  # that change is at most so far below and above 
 _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and below are hair and neck
 
 Background = Literal["photo", "none", "given"]
+FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
+PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,15 +84,14 @@ class Relit:
 
 @dataclass(frozen=True, eq=False)
 class RelitImage:
-    """An image [H, W, 3], scene-linear; alpha [H, W] of a face alone; further layers [H, W, C] by name."""
+    """An image [H, W, 3], scene-linear, not multiplied by alpha [H, W], which images without gaps lack."""
 
     pixels: np.ndarray
     alpha: np.ndarray | None = None
-    layers: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 class AroundFace(Protocol):
-    """What is relit around the face: `Surround`, or the whole person of a portrait field."""
+    """Surroundings of the face that are relit: `Surround`, or the whole person of a portrait field."""
 
     @property
     def nbytes(self) -> int:
@@ -97,6 +99,16 @@ class AroundFace(Protocol):
 
     def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
         """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]."""
+
+
+class PersonAround(AroundFace, Protocol):
+    """A whole person, relit (`whole_person.WholePerson`)."""
+
+    def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
+        """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
+
+    def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
+        """Exposures that show the person well under a light, and in the photo."""
 
 
 class Composition:
@@ -112,7 +124,7 @@ class Composition:
         photo: np.ndarray | None,
         head: Head,
         target: Target = AS_IN_PHOTO,
-        person: AroundFace | None = None,
+        person: PersonAround | None = None,
     ) -> None:
         fit = head.fit if target.fit is None else target.fit
         vertices = fit.vertices_camera(model)
@@ -123,17 +135,14 @@ class Composition:
         self._face, self._target = head.face, target
         self._detail: PhotoDetail | None = None
         self.surround: AroundFace | None = None
+        self._person = person
         self._mask = self.view.full(self.view.mask)
-        self._layers: dict[str, np.ndarray] = {}
         if self._photo is not None:
             matte = target.matte
             self._matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
             self._own = self._photo if matte is None else person_colours(self._photo, self._matte)
             self._detail = PhotoDetail(self._own, head.face, self.view)
             self.surround = person or Surround(vertices, crop, head.face.texture, *size_px)
-            self._layers |= {"face.A": self._mask, "person.A": self._matte}
-        places = {"normal": self.view.normal, "position": self.view.position_m, "uv": self.view.uv}
-        self._layers |= {name: self.view.full(values) for name, values in places.items()}
 
     def image(self, relit: Relit, ev: float = 0.0, behind: np.ndarray | None = None) -> RelitImage:
         """The head in its frame as relit, scene-linear.
@@ -141,23 +150,55 @@ class Composition:
         The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
         if self._photo is None or self._detail is None or self.surround is None or relit.surround is None:
-            return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask, self._layers)
+            return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask)
         person = self.surround.over_photo(self._own, relit.surround)
         mask = self.view.mask.numpy()[..., None]
         person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
         matte = self._matte[..., None]
         if self._target.background == "none":
-            return RelitImage(person * matte, self._matte, self._layers)
+            return RelitImage(person, self._matte)
         if behind is not None:
-            return RelitImage(behind + matte * (person - behind), None, self._layers)
+            return RelitImage(behind + matte * (person - behind))
         shown = np.float32(2.0**-ev)
-        return RelitImage(self._photo * shown + matte * (person - self._own * shown), None, self._layers)
+        return RelitImage(self._photo * shown + matte * (person - self._own * shown))
 
-    def auto_exposure_ev(self, relit: Tensor) -> float:
-        """The exposure that shows the lit face well; before the photo's background, as bright as it was."""
-        chosen_ev = _auto_exposure_ev(relit, self._face.visible)
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+        """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
+
+        `names` are of `PERSON_LAYERS` where a whole person is relit; else, and for what only the face has, of
+        `FACE_LAYERS`. Raises UsageError for others.
+        """
+        found = {} if self._photo is None else {"person.A": self._matte}
+        for name in names:
+            if self._person is not None and relit.surround is not None and name in PERSON_LAYERS:
+                found |= self._person.layer(name, relit.surround)
+            elif name in FACE_LAYERS:
+                found |= self._face_layer(name)
+            else:
+                raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
+        return found
+
+    def _face_layer(self, name: str) -> dict[str, np.ndarray]:
+        if name == "face":
+            return {"face.A": self._mask}
+        view = self.view
+        values = {
+            "normal": view.normal,
+            "position": view.position_m,
+            "depth": -view.position_m[..., 2:],
+            "uv": view.uv,
+        }[name]
+        return {name: view.full(values)}
+
+    def auto_exposure_ev(self, relit: Relit) -> float:
+        """The exposure that shows the lit person well; before the photo's background, as bright as it was."""
+        if self._person is not None and relit.surround is not None:
+            chosen_ev, own_ev = self._person.auto_exposures_ev(relit.surround)
+        else:
+            textures = relit.texture, self._face.texture
+            chosen_ev, own_ev = (_auto_exposure_ev(texture, self._face.visible) for texture in textures)
         keeps = self._photo is not None and self._target.background == "photo"
-        return chosen_ev - (_auto_exposure_ev(self._face.texture, self._face.visible) if keeps else 0.0)
+        return chosen_ev - (own_ev if keeps else 0.0)
 
 
 def _auto_exposure_ev(texture: Tensor, visible: Tensor) -> float:

@@ -300,7 +300,7 @@ def relit_by(
     if isinstance(surround, WholePerson) and isinstance(reflectance, PortraitField):
         lit = reflectance.lit(directions, weights)
         textures = reflectance.blended(reflectance.field.relit(directions, weights), lit)
-        yield from map(Relit, textures, torch.cat([lit.shading, lit.highlights], 1))
+        yield from map(Relit, textures, lit.stacked)
         return
     if isinstance(surround, Surround) and isinstance(reflectance, Field):
         summed = weighted_sums(

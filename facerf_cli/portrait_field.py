@@ -25,7 +25,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork, skin_exposure
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.person import Person, look_at_person
+from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
@@ -40,20 +40,27 @@ _LIKENESS_PX = 48
 
 @dataclass(frozen=True, eq=False)
 class PortraitLight:
-    """A person under M sums of lights: shading and highlights [M, 3, S, S] in the square.
+    """A person under M sums of lights, in the square: each [M, 3, S, S].
 
-    Both hold the photo's correction; radiance is albedo times shading, plus highlights.
+    Radiance is albedo times shading, plus highlights; both hold the photo's correction. `reached` is the
+    share of the light that is not in shadow.
     """
 
     shading: Tensor
     highlights: Tensor
+    reached: Tensor
+
+    @property
+    def stacked(self) -> Tensor:
+        """All maps [M, 9, S, S], as `WholePerson` takes them."""
+        return torch.cat([self.shading, self.highlights, self.reached], 1)
 
 
 @dataclass(frozen=True, eq=False)
 class PortraitField:
     """The light transport of a person; a `Reflectance`, whose textures are those of the face."""
 
-    person: Person
+    person: SeenPerson
     maps: PortraitMaps  # of one person; albedo in the units of `image`
     image: Tensor  # [3, S, S] exposed
     exposure: float  # radiance of the photo over that of `image`
@@ -89,7 +96,7 @@ class PortraitField:
     @torch.no_grad()
     def lit(self, directions: Tensor, weights: Tensor) -> PortraitLight:
         """The person under M sums, rgb weights [M, L, 3], of lights [L, 3]."""
-        shading, highlights = torch.zeros(2, len(weights), 3, *self.image.shape[1:]).unbind(0)
+        shading, highlights, reached = torch.zeros(3, len(weights), 3, *self.image.shape[1:]).unbind(0)
         used = weights.abs().sum((0, 2)) > 0
         for lights, some in zip(
             torch.split(directions[used], _LIGHTS_AT_ONCE),
@@ -99,7 +106,7 @@ class PortraitField:
             visible = F.interpolate(
                 self.person.visibility(lights)[None], size=self.image.shape[1:], mode="bilinear"
             )
-            shade, glow, _ = self.maps.shaded(lights[None], visible)
+            shade, glow, arrives = self.maps.shaded(lights[None], visible)
             if self.quotient is None:
                 shade, glow = shade[0][:, None], glow[0][:, None]
             else:
@@ -108,7 +115,8 @@ class PortraitField:
                 shade, glow = shade[0][:, None] * factor, glow[0][:, None] * factor
             shading = shading + torch.einsum("mlc,lcij->mcij", some, shade.expand(-1, 3, -1, -1))
             highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow.expand(-1, 3, -1, -1))
-        return PortraitLight(shading, highlights)
+            reached = reached + torch.einsum("mlc,lij->mcij", some, arrives[0])
+        return PortraitLight(shading, highlights, reached / weights.sum(1).clamp_min(1e-6)[..., None, None])
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] of the face; of a turned head the neural field's alone."""
@@ -136,7 +144,7 @@ class PortraitField:
         return float(skin_exposure(self.person.image[None], self.person.classes[None]))
 
 
-def _texels_in_square(model: MorphableModel, head: Head, person: Person) -> Tensor:
+def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:
     """Place [T, T, 2] of each texel of the face in the square, in -1..1."""
     camera = square_camera(head.fit, person.square)
     places = project(head.fit.vertices_camera(model), camera) / person.square.size_px * 2 - 1

@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.portrait_field import PortraitField
@@ -19,6 +20,7 @@ from facerf_cli.raster.texture import inpaint
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
+_ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 
@@ -29,28 +31,73 @@ class WholePerson:
         self.matte = field.person.segmentation.matte
         self._field, self._photo = field, photo
         self._own = (1 - field.person.classes[0] > _SURE).float()
-        self._lines = self._gain_lines()
-        self._bias = self._filled(field.maps.bias[0])
+        self._albedo_maps = torch.cat([self._gain_lines(), self._filled(field.maps.bias[0])])
 
     @property
     def nbytes(self) -> int:
         """Size of one light's maps."""
-        return 2 * self._field.image.nbytes
+        return 3 * self._field.image.nbytes
 
     def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
-        """The pixels [H, W, 3] of the photo under shading and highlights [6, S, S]."""
-        maps = torch.cat([self._filled(lit), self._lines, self._bias])
+        """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
         result = np.empty_like(photo)
-        for rows, wide in self._bands(maps):
-            pixels = torch.from_numpy(photo[rows].clip(min=0)).permute(2, 0, 1)
-            guide = torch.from_numpy(to_display(photo[rows])).permute(2, 0, 1).float() / 255
-            shading, highlights, slopes, offset, bias = torch.split(wide, [3, 3, 9, 3, 3])
-            log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
-            log_gain = log_gain.clamp(self._range[0], self._range[1])
-            albedo = pixels / self._field.input_exposure * log_gain.exp() + bias
-            radiance = (albedo * shading + highlights) * self._field.exposure
+        for rows, wide in self._bands(torch.cat([self._albedo_maps, self._filled(lit[:6])])):
+            shading, highlights = torch.split(wide[_ALBEDO_MAPS:], 3)
+            radiance = (self._albedo(photo[rows], wide) * shading + highlights) * self._field.exposure
             result[rows] = radiance.permute(1, 2, 0).numpy()
         return result
+
+    def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
+        """Exposures in EV that show the person well under the light of maps [9, S, S], and in the photo."""
+        field = self._field
+        relit = (field.maps.albedo[0] * lit[:3] + lit[3:6]) * field.exposure
+        own = self._own.numpy()
+        ev = [auto_exposure_ev(x.permute(1, 2, 0).numpy(), own) for x in (relit, field.person.image)]
+        return ev[0], ev[1]
+
+    def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
+        """A layer of an image under the light of maps [9, S, S], by the name or names that it has in a file.
+
+        albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
+        shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
+        shares. All are 0 off the person.
+        """
+        if name == "classes":
+            layers = self._field.person.segmentation.layers()
+            return {key: layers[key] for key in layers if key.startswith("class.")}
+        if name == "albedo":
+            return {name: self._masked(self._albedo_map())}
+        person = self._field.person
+        maps = {
+            "specular": lit[3:6] * self._field.exposure,
+            "shadow": lit[6:9],
+            "normal": self._field.maps.normals[0],
+            "position": person.maps.positions_m,
+            "depth": -person.maps.positions_m[2:],
+        }[name]
+        wide = np.concatenate([part.permute(1, 2, 0).numpy() for _, part in self._bands(self._filled(maps))])
+        if name == "normal":
+            wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
+        return {name: self._masked(wide)}
+
+    def _masked(self, layer: np.ndarray) -> np.ndarray:
+        return layer * (self.matte > 0)[..., None]
+
+    def _albedo_map(self) -> np.ndarray:
+        albedo = np.empty_like(self._photo)
+        for rows, wide in self._bands(self._albedo_maps):
+            part = self._albedo(self._photo[rows], wide) * self._field.exposure
+            albedo[rows] = part.permute(1, 2, 0).numpy()
+        return albedo
+
+    def _albedo(self, photo: np.ndarray, wide: Tensor) -> Tensor:
+        """The photo without its light [3, h, W] in some rows [h, W, 3], from the maps over them."""
+        pixels = torch.from_numpy(photo.clip(min=0)).permute(2, 0, 1)
+        guide = torch.from_numpy(to_display(photo)).permute(2, 0, 1).float() / 255
+        slopes, offset, bias = torch.split(wide[:_ALBEDO_MAPS], [9, 3, 3])
+        log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
+        log_gain = log_gain.clamp(self._range[0], self._range[1])
+        return pixels / self._field.input_exposure * log_gain.exp() + bias
 
     def _gain_lines(self) -> Tensor:
         """Log of the gain as a linear function of the photo's colours: slopes and offsets [12, S, S]."""

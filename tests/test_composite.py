@@ -8,7 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, PhotoDetail, Relit, Surround, Target
+from facerf_cli.composite import (
+    Background,
+    Composition,
+    PhotoDetail,
+    Relit,
+    RelitImage,
+    Surround,
+    Target,
+)
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
@@ -16,7 +24,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
 from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.sphere import RigLight, azel_to_direction, latlong_directions, rig_directions
+from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
 
@@ -24,7 +32,7 @@ HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
 RIG = rig_directions()
 ROTATION, TRANSLATION_M = pose_to_rotation(14, 4, -3), torch.tensor([0.0, 0.01, -1.25])
-FOLLOWING, KEEPING = Target(), Target(keep_background=True)
+FOLLOWING = Target()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +88,10 @@ def view() -> FaceView:
     return view_face(scene().vertices, photo_camera(CROP, HEIGHT_PX, WIDTH_PX), CROP.side_px)
 
 
-def compose(
-    photo: np.ndarray,
-    source: Tensor,
-    relit: Tensor,
-    seen: Tensor,
-    target: Target = FOLLOWING,
-    crop: Crop = CROP,
-) -> np.ndarray:
-    """The photo with the scene's face relit."""
+def composed(
+    photo: np.ndarray, source: Tensor, seen: Tensor, target: Target = FOLLOWING, crop: Crop = CROP
+) -> Composition:
+    """The composition of the scene's face in a photo."""
     model = load_face_model("builtin")
     none = torch.zeros(1)
     fit = FaceFit(
@@ -101,11 +104,21 @@ def compose(
         none,
         0.0,
     )
-    head = Head(photo, fit, FaceTexture(source, seen, source))
-    light = RigLight(torch.zeros(0, 3), torch.zeros(0, 3))
-    composition = Composition(model, photo, head, target)
-    around = None if composition.surround is None else composition.surround.changes(relit[None])[0]
-    return composition.image(light, Relit(relit, around)).pixels
+    return Composition(model, photo, Head(photo, fit, FaceTexture(source, seen, source)), target)
+
+
+def compose(
+    photo: np.ndarray,
+    source: Tensor,
+    relit: Tensor,
+    seen: Tensor,
+    target: Target = FOLLOWING,
+    crop: Crop = CROP,
+) -> np.ndarray:
+    """The photo with the scene's face relit."""
+    composition = composed(photo, source, seen, target, crop)
+    assert isinstance(composition.surround, Surround)
+    return composition.image(Relit(relit, composition.surround.changes(relit[None])[0])).pixels
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -132,7 +145,7 @@ def test_relit_texture_equal_to_the_source_changes_nothing() -> None:
 
 def test_other_light_comes_out_as_if_rendered() -> None:
     photo, source, seen = unwrapped()
-    result = compose(photo, source, scene().lit(OTHER), seen, KEEPING)
+    result = compose(photo, source, scene().lit(OTHER), seen)
     truth = scene().image(OTHER)
     drawn = view().full(view().render(scene().lit(OTHER)))
     assert psnr_db(result, truth, inside_face()) > 28
@@ -149,13 +162,36 @@ def test_brightness_of_the_light_scales_the_image(gain: float) -> None:
     np.testing.assert_allclose(scaled, gain * once, rtol=2e-3, atol=1e-4 * gain)
 
 
-def test_without_surround_only_the_face_changes() -> None:
+def in_half(background: Background, ev: float, behind: np.ndarray | None = None) -> RelitImage:
+    """The image with its right half cut out as the person."""
     photo, source, seen = unwrapped()
-    result = compose(photo, source, scene().lit(OTHER), seen, KEEPING)
-    outside = view().full(view().mask) == 0
-    assert outside.mean() > 0.5
-    np.testing.assert_array_equal(result[outside], photo[outside])
-    assert np.abs(result - photo)[~outside].max() > 0.1
+    matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
+    matte[:, 200:] = 1
+    composition = composed(photo, source, seen, Target(matte=matte, background=background))
+    assert isinstance(composition.surround, Surround)
+    relit = scene().lit(OTHER)
+    return composition.image(Relit(relit, composition.surround.changes(relit[None])[0]), ev, behind)
+
+
+def test_the_photos_background_looks_as_it_was_at_any_exposure() -> None:
+    photo, _, _ = unwrapped()
+    for ev in (0.0, 2.0):
+        image = in_half("photo", ev)
+        np.testing.assert_allclose(image.pixels[:, :200] * 2**ev, photo[:, :200], rtol=1e-6)
+        np.testing.assert_allclose(image.pixels[:, 200:], in_half("photo", 0.0).pixels[:, 200:], atol=1e-5)
+
+
+def test_other_backgrounds() -> None:
+    person = in_half("photo", 0.0).pixels[:, 200:]
+    nothing = in_half("none", 0.0)
+    assert nothing.alpha is not None
+    np.testing.assert_array_equal(nothing.alpha[:, :200], 0)
+    np.testing.assert_allclose(nothing.pixels[:, 200:], person, atol=1e-5)
+    behind = np.full((HEIGHT_PX, WIDTH_PX, 3), 0.3, np.float32)
+    given = in_half("given", 3.0, behind)
+    assert given.alpha is None
+    np.testing.assert_array_equal(given.pixels[:, :200], behind[:, :200])
+    np.testing.assert_allclose(given.pixels[:, 200:], person, atol=1e-5)
 
 
 def test_a_matte_says_what_may_change() -> None:
@@ -179,11 +215,12 @@ def test_no_border_shows_where_the_surroundings_are_skin() -> None:
     relit = grey * cosine.clamp(min=0)
     border = (view().full(view().mask) > 0.01) & (view().full(view().mask) < 0.5)
 
-    def steps(target: Target) -> float:
-        result = compose(flat, grey, relit, seen, target)[..., 1]
-        return float(np.percentile(np.hypot(*np.gradient(result))[border], 99))
+    def steps(result: np.ndarray) -> float:
+        return float(np.percentile(np.hypot(*np.gradient(result[..., 1]))[border], 99))
 
-    assert steps(FOLLOWING) < 0.5 * steps(KEEPING)
+    followed = compose(flat, grey, relit, seen)
+    kept = np.where(view().full(view().mask)[..., None] > 0.25, followed, flat)
+    assert steps(followed) < 0.5 * steps(kept)
 
 
 def test_a_bright_rim_does_not_glow_beside_the_face() -> None:

@@ -1,4 +1,4 @@
-"""The background behind a relit person, as `--background` names it."""
+"""The background behind a relit person, and the layers of its image, as the options name them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +8,17 @@ from facerf_cli.cli.values import numbers
 from facerf_cli.errors import UsageError
 
 Kind = Literal["photo", "envmap", "none", "file", "colour"]
+_LAYERS = (
+    "albedo",
+    "normal",
+    "position",
+    "depth",
+    "shadow",
+    "specular",
+    "classes",
+    "face",
+    "uv",
+)
 _FORMS = "photo, envmap, none, an image file, #RRGGBB or R,G,B"
 
 
@@ -34,6 +45,14 @@ def parse_background(text: str) -> BackgroundChoice:
             raise UsageError(f"--background {text!r}: the colour is negative; give values from 0")
         return BackgroundChoice("colour", colour=(red, green, blue))
     raise UsageError(f"--background {text!r}: no such file; give {_FORMS}")
+
+
+def parse_aov(text: str) -> tuple[str, ...]:
+    """Parse `--aov`, names with commas; the matte may be named, too."""
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if unknown := [name for name in names if name not in (*_LAYERS, "matte")]:
+        raise UsageError(f"--aov {unknown[0]!r}: no such layer; give some of matte, {', '.join(_LAYERS)}")
+    return tuple(name for name in names if name != "matte")
 
 
 def _hex(text: str) -> tuple[float, float, float]:

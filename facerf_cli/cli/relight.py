@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.backgrounds import BackgroundChoice, parse_background
+from facerf_cli.cli.backgrounds import BackgroundChoice, parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
@@ -50,11 +50,12 @@ class Relight:
     composite: Composite
     background: BackgroundChoice
     background_blur: float
+    aov: tuple[str, ...]
     matte: Path | None
     exposure_ev: float | None  # None: auto
     memory_bytes: int
     asked_for_photo: bool  # --composite photo is on the command line
-    reflectance: Kind = "field"
+    reflectance: Kind = "portrait"
     network_alone: bool = False
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -150,10 +151,10 @@ def relight(
     reflectance: Annotated[
         Kind,
         typer.Option(
-            help="Choose the reflectance model: the network's field, or, to compare, diffuse under spherical "
-            "harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
+            help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
+            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
         ),
-    ] = "field",
+    ] = "portrait",
     exposure: Annotated[
         str,
         typer.Option(metavar="EV|auto", help="Exposure of the PNG in EV, or auto: expose the lit face well."),
@@ -182,6 +183,15 @@ def relight(
             help="Blur the map behind the person as a lens does, in percent of the longer side.",
         ),
     ] = 1.0,
+    aov: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,...",
+            help="Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the "
+            "face alone face (its soft mask) and uv. The matte, person.A, is always there.",
+            show_default="none",
+        ),
+    ] = "",
     matte: Annotated[
         Path | None,
         typer.Option(
@@ -214,8 +224,8 @@ def relight(
 ) -> None:
     """Relight photos under environment maps and single lights.
 
-    Each image is written as a scene-linear EXR, with the layers face.A (the soft mask of the face), normal,
-    position (camera space, metres) and uv, and as a PNG at --exposure. One prediction serves all maps and
+    Each image is written as a scene-linear EXR, with the layer person.A (the matte) and those of --aov, and
+    as a PNG at --exposure. One prediction serves all maps and
     rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the end.
 
     An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
@@ -247,6 +257,7 @@ def relight(
         composite=composite or ("photo" if pose is None else "face"),
         background=behind,
         background_blur=background_blur / 100,
+        aov=parse_aov(aov),
         matte=matte,
         exposure_ev=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),

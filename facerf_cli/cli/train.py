@@ -154,7 +154,7 @@ def train(
         str,
         _data(
             metavar="NAME|PATH",
-            help="Draw synthetic heads from this face model; of parsing and portrait, from several with commas.",
+            help="Draw synthetic heads from this face model; of whole people, from several with commas.",
         ),
     ] = "builtin",
     fit_with: Annotated[

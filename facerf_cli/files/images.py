@@ -38,7 +38,12 @@ HALF_MAX = 65504.0  # the largest finite half float
 JPEG_QUALITY = 95
 # Channel letters and number format of special layers. Positions and UVs are single precision, since a half
 # float has steps of half a millimetre at a metre.
-_LAYER_CHANNELS = {"normal": ("XYZ", "half"), "position": ("XYZ", "float"), "uv": ("UV", "float")}
+_LAYER_CHANNELS = {
+    "normal": ("XYZ", "half"),
+    "position": ("XYZ", "float"),
+    "depth": ("Z", "float"),
+    "uv": ("UV", "float"),
+}
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -180,8 +185,8 @@ def write_exr(
     """Write scene-linear Rec.709 [H, W, 3] as half floats; return how many values were out of range.
 
     The colour must not be premultiplied; it is written multiplied by alpha [H, W], as EXR requires. `layers`
-    are [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z and uv.U/V in float, others as R, G, B in
-    half. Values beyond the range of half floats (65504) are clamped with a warning.
+    are [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z, depth.Z and uv.U/V in float, others as R,
+    G, B in half. Values beyond the range of half floats (65504) are clamped with a warning.
     """
     channels = list(_exr_channels(pixels, alpha, layers or {}))
     names, kinds, _ = zip(*channels, strict=True)

@@ -1,4 +1,4 @@
-"""What a camera sees of an environment map: the background of a portrait."""
+"""Backgrounds of portraits: the part of an environment map that a camera sees."""
 
 import math
 

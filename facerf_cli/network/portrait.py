@@ -54,7 +54,7 @@ class PortraitSettings:
 
 @dataclass(frozen=True)
 class PortraitInputs:
-    """What the network knows of B people in squares of side S; camera space.
+    """Inputs of the network for B people in squares of side S; camera space.
 
     image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
     [B, C, S, S]; normals [B, 3, S, S], depth [B, 1, S, S] (0.1 m) and covered [B, 1, S, S] of the proxy;

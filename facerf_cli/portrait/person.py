@@ -21,7 +21,7 @@ VISIBILITY_PX = SIDE_PX // 2  # side at which shadow rays are cast
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class SeenPerson:
     """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy."""
 
     square: Crop
@@ -50,7 +50,7 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
     return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
 
 
-def look_at_person(model: MorphableModel, photo: np.ndarray, fit: FaceFit) -> Person:
+def look_at_person(model: MorphableModel, photo: np.ndarray, fit: FaceFit) -> SeenPerson:
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face."""
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = portrait_square(landmarks_px)
@@ -59,7 +59,7 @@ def look_at_person(model: MorphableModel, photo: np.ndarray, fit: FaceFit) -> Pe
     proxy = proxy_of(model, fit, classes, square)
     image = torch.from_numpy(square.apply(photo)).permute(2, 0, 1)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    return Person(square, image, classes, proxy, maps, fit, segmentation)
+    return SeenPerson(square, image, classes, proxy, maps, fit, segmentation)
 
 
 def _classes_in(segmentation: Segmentation, square: Crop) -> Tensor:

@@ -54,7 +54,7 @@ class PortraitSample:
 
     @property
     def inputs(self) -> PortraitInputs:
-        """What the network sees."""
+        """Inputs of the network."""
         return PortraitInputs(self.image, self.classes, self.normals, self.depth, self.covered, self.reached)
 
     def to(self, device: torch.device) -> "PortraitSample":

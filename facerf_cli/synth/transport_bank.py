@@ -1,7 +1,7 @@
 """Bank of portraits that the Portrait Network is trained on: what cameras see of synthetic people.
 
 A portrait is kept without light: the facets of the image, how much of each light reaches them, and what they
-are made of in several looks. Every training sample lights it anew. The squares lie around the head as those
+are made of in several looks. Every training sample lights it again. The squares lie around the head as those
 that the Portrait Network sees of photos (`portrait.proxy`).
 """
 

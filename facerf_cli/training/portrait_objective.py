@@ -1,4 +1,4 @@
-"""Stage `portrait`: the Portrait Network, on synthetic people lit anew at every step.
+"""Stage `portrait`: the Portrait Network, on synthetic people lit by other lights at every step.
 
 Errors of single lights, which sums of lights follow from; of the photo under its own light, so that it
 comes back; and of normals and albedo, which make training on synthetic people hold for others (Yeh et al.,

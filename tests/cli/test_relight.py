@@ -104,17 +104,46 @@ def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
 
 
 def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
-    assert relight(given, tmp_path, "--light", "40,10") == 0
-    stream = oiio.ImageInput.open(str(tmp_path / "astronaut_light_40_10.exr"))
-    spec = stream.spec()
-    assert (spec.width, spec.height) == (512, 512)
-    for name in ("R", "face.A", "normal.Z", "position.Z", "uv.U"):
-        assert name in spec.channelnames
-    assert spec.get_string_attribute("facerf:checkpoint") == "lambert"
-    pixels = np.asarray(stream.read_image("float"))
+    aov = "matte,face,normal,position,depth,uv,albedo,shadow,specular,classes"
+    assert relight(given, tmp_path, "--light", "40,10", "--aov", aov) == 0
+    path = tmp_path / "astronaut_light_40_10.exr"
+    assert read_image(path).metadata["facerf:checkpoint"] == "lambert"
+    names = (
+        "R",
+        "face.A",
+        "normal.Z",
+        "position.Z",
+        "depth.Z",
+        "uv.U",
+        "person.A",
+        "class.hair",
+        "class.skin",
+    )
+    red, mask, normal_z, z, depth, _, matte, _, skin = layers_of(path, *names)
+    assert red.shape == (512, 512) and 0.01 < (mask > 0.5).mean() < 0.1
+    assert (z[mask > 0.5] < -0.3).all() and (normal_z[mask > 0.9] > -0.2).all()
+    np.testing.assert_allclose(depth, -z, atol=1e-6)
+    assert (matte[mask > 0.5] > 0.9).mean() > 0.99 and (skin[mask > 0.9] > 0.5).mean() > 0.8
+    albedo, shadow, specular = layers_of(path, "albedo.G", "shadow.G", "specular.G")
+    assert ((shadow >= 0) & (shadow <= 1.001)).all() and (albedo[matte == 0] == 0).all()
+    assert (specular >= 0).all() and albedo[mask > 0.5].mean() > 0.02
+    assert relight(given, tmp_path / "few", "--light", "40,10") == 0
+    assert channels_of(tmp_path / "few/astronaut_light_40_10.exr") == ["R", "G", "B", "person.A"]
+    assert relight(given, tmp_path / "bad", "--light", "40,10", "--aov", "beauty") == 2
+
+
+def channels_of(path: Path) -> list[str]:
+    stream = oiio.ImageInput.open(str(path))
+    names = list(stream.spec().channelnames)
     stream.close()
-    mask, depth = (pixels[..., spec.channelnames.index(name)] for name in ("face.A", "position.Z"))
-    assert 0.01 < (mask > 0.5).mean() < 0.1 and (depth[mask > 0.5] < -0.3).all()
+    return names
+
+
+def layers_of(path: Path, *names: str) -> list[np.ndarray]:
+    stream = oiio.ImageInput.open(str(path))
+    pixels, every = np.asarray(stream.read_image("float")), stream.spec().channelnames
+    stream.close()
+    return [pixels[..., every.index(name)] for name in names]
 
 
 def test_positive_azimuth_lights_the_images_right(given: Path, tmp_path: Path) -> None:
@@ -128,14 +157,37 @@ def test_positive_azimuth_lights_the_images_right(given: Path, tmp_path: Path) -
     assert right > 1.5 * left
 
 
-def test_background_is_kept_bit_for_bit(given: Path, tmp_path: Path) -> None:
-    assert relight(given, tmp_path, "--light", "40,10", "--keep-background") == 0
-    relit = read_image(tmp_path / "astronaut_light_40_10.exr").pixels
-    photo = read_image(PHOTO).pixels.astype(np.float16).astype(np.float32)
-    same = (relit == photo).all(-1)
-    assert 0.9 < same.mean() < 0.99  # the face is small
-    shown = read_image(tmp_path / "astronaut_light_40_10.png").pixels
-    np.testing.assert_allclose(shown[same], read_image(PHOTO).pixels[same], atol=2e-3)
+def test_the_photos_background_looks_as_it_did(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "40,10", "--exposure", "1") == 0
+    name = tmp_path / "astronaut_light_40_10.exr"
+    (matte,) = layers_of(name, "person.A")
+    behind = matte == 0
+    assert 0.2 < behind.mean() < 0.7
+    shown = read_image(name.with_suffix(".png")).pixels
+    np.testing.assert_allclose(shown[behind], read_image(PHOTO).pixels[behind], atol=2e-3)
+    np.testing.assert_allclose(2 * read_image(name).pixels[behind], shown[behind].clip(0, 1), atol=4e-3)
+
+
+def test_backgrounds(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A colour and a file as they look, a map as bright as it is, nothing with alpha."""
+    write_exr(tmp_path / "red.exr", np.full((20, 60, 3), (0.5, 0.1, 0.1), np.float32))
+    grey = ["--envmap", str(given / "maps/grey.exr"), "--exposure", "0"]
+    seen = {}
+    for name, text in (("colour", "0.1,0.2,0.3"), ("file", str(tmp_path / "red.exr")), ("envmap", "envmap")):
+        assert relight(given, tmp_path / name, *grey, "--background", text) == 0
+        path = tmp_path / name / "astronaut_grey.exr"
+        (matte,) = layers_of(path, "person.A")
+        seen[name] = read_image(path).pixels[matte == 0]
+    np.testing.assert_allclose(seen["colour"].mean(0), (0.1, 0.2, 0.3), rtol=2e-3)  # half floats
+    np.testing.assert_allclose(seen["file"].mean(0), (0.5, 0.1, 0.1), rtol=2e-3)
+    np.testing.assert_allclose(seen["envmap"], read_image(given / "maps/grey.exr").pixels.mean(), rtol=2e-3)
+    assert relight(given, tmp_path / "none", *grey, "--background", "none") == 0
+    alone = read_image(tmp_path / "none/astronaut_grey.exr")
+    assert alone.alpha is not None and 0.3 < alone.alpha.mean() < 0.8
+    capsys.readouterr()
+    for text in ("nothing.png", "#12345", "1,2", "1,2,-3"):
+        assert relight(given, tmp_path / "x", *grey, "--background", text) == 2
+        assert "--background" in capsys.readouterr().err
 
 
 def test_pose_gives_the_face_alone(given: Path, tmp_path: Path) -> None:

@@ -1,14 +1,13 @@
 """One photo, or one OLAT stack, under every light setup: relit, exposed and written."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.backdrops import Backdrops
@@ -28,7 +27,7 @@ from facerf_cli.cli.items.photos import (
 from facerf_cli.cli.relight import Relight
 from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -52,8 +51,11 @@ class Composer(Protocol):
     def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
         """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
 
-    def auto_exposure_ev(self, relit: Tensor) -> float:
-        """The exposure that shows the face well."""
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+        """Layers of the image by the names that they have in a file."""
+
+    def auto_exposure_ev(self, relit: Relit) -> float:
+        """The exposure that shows the person well."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +99,7 @@ def _relight_face(
         return list(relit_by(composition, head, reflectance, directions, weights[rows], target))
 
     metadata = provenance(item, work.photo, models.checkpoint_name)
-    if work.reflectance != "field":
+    if work.reflectance != "portrait":
         metadata["facerf:reflectance"] = work.reflectance
     if work.network_alone:
         metadata["facerf:network_alone"] = 1
@@ -171,10 +173,15 @@ class _RenderedStack:
     normals: np.ndarray  # [H, W, 3]
 
     def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
-        return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen, {"normal": self.normals})
+        return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen)
 
-    def auto_exposure_ev(self, relit: Tensor) -> float:
-        return auto_exposure_ev(relit.permute(1, 2, 0).numpy(), self.seen)
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+        if other := [name for name in names if name != "normal"]:
+            raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
+        return {"normal": self.normals} if names else {}
+
+    def auto_exposure_ev(self, relit: Relit) -> float:
+        return auto_exposure_ev(relit.texture.permute(1, 2, 0).numpy(), self.seen)
 
 
 def _write_setups(
@@ -196,7 +203,8 @@ def _write_setups(
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
-            _write(path, shown.composer.image(relit, ev, behind), shown.alpha, ev, metadata)
+            image, layers = shown.composer.image(relit, ev, behind), shown.composer.layers(work.aov, relit)
+            _write(path, image, layers, shown.alpha, ev, metadata)
             yield path, ev
 
 
@@ -209,7 +217,7 @@ def _exposures_ev(
     found: dict[str, float] = {}
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
-            chosen_ev = round(composer.auto_exposure_ev(relit.texture), 2)
+            chosen_ev = round(composer.auto_exposure_ev(relit), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
     return found
 
@@ -217,6 +225,7 @@ def _exposures_ev(
 def _write(
     path: Path,
     image: RelitImage,
+    layers: Mapping[str, np.ndarray],
     photo_alpha: np.ndarray | None,
     exposure_ev: float,
     metadata: Mapping[str, Any],
@@ -225,5 +234,5 @@ def _write(
     metadata = {**metadata, "facerf:exposure_ev": exposure_ev}  # of the PNG, in both
     alpha = photo_alpha if image.alpha is None else image.alpha
     write_display(path.with_suffix(".png"), image.pixels, exposure_ev, alpha, metadata)
-    write_exr(path, image.pixels, alpha, image.layers, metadata)
+    write_exr(path, image.pixels, alpha, layers, metadata)
     log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)
