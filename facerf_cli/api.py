@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from facerf_cli import pipeline
-from facerf_cli.baselines import Kind
+from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_landmarks
@@ -151,20 +151,22 @@ def relight(
     light: Light,
     pose: Pose | None = None,
     alone: bool = False,
-    reflectance: Kind = "field",
+    reflectance: RelightKind = "portrait",
     network_alone: bool = False,
+    background: Literal["photo", "none"] = "photo",
 ) -> np.ndarray:
-    """Relight a photo's head: the photo [H, W, 3] with it, or with `alone` the face with alpha [H, W, 4].
+    """Relight a photo's person: the photo [H, W, 3], or with `alone` the face with alpha [H, W, 4].
 
     `pose` turns the head, which shows the face alone. `network_alone` leaves out the correction by the photo.
+    Without a background ("none") the person has alpha [H, W, 4]; colours are not multiplied by it.
     """
-    if network_alone and reflectance != "field":
-        raise UsageError("network_alone: is for the field; leave it out, or use reflectance='field'")
+    if network_alone and reflectance not in ("field", "portrait"):
+        raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     fit = _posed(head.fit, pose)
-    target = Target(fit, "face" if alone or pose is not None else "photo")
+    target = Target(fit, "face" if alone or pose is not None else "photo", background=background)
     photo = np.ascontiguousarray(photo, np.float32)
     with torch.no_grad():
-        of_head = pipeline.reflectance_of(models, head, reflectance, network_alone)
+        of_head = pipeline.reflectance_of(models, head, reflectance, network_alone, photo=photo)
         image = pipeline.relight(models, photo, head, light._rig(), target, of_head)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])
 

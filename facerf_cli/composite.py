@@ -149,18 +149,30 @@ class Composition:
 
         The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
-        if self._photo is None or self._detail is None or self.surround is None or relit.surround is None:
+        if self._photo is None:
             return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask)
-        person = self.surround.over_photo(self._own, relit.surround)
-        mask = self.view.mask.numpy()[..., None]
-        person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
+        person = self._relit_person(relit)
         matte = self._matte[..., None]
         if self._target.background == "none":
             return RelitImage(person, self._matte)
         if behind is not None:
             return RelitImage(behind + matte * (person - behind))
-        shown = np.float32(2.0**-ev)
-        return RelitImage(self._photo * shown + matte * (person - self._own * shown))
+        behind = (self._photo - matte * self._own).clip(min=0) * np.float32(2.0**-ev)
+        return RelitImage(behind + matte * person)
+
+    def _relit_person(self, relit: Relit) -> np.ndarray:
+        """Pixels [H, W, 3] of the person, also where the matte leaves none of them."""
+        assert self.surround is not None and self._detail is not None and relit.surround is not None
+        person = self.surround.over_photo(self._own, relit.surround)
+        mask = self.view.mask.numpy()[..., None]
+        person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
+        return person
+
+    def light_layer(self, relit: Relit) -> np.ndarray:
+        """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""
+        if self._photo is None:
+            return self.view.full(self.view.render(relit.texture)) * self._mask[..., None]
+        return self._relit_person(relit) * self._matte[..., None]
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.

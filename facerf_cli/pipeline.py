@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines import Kind
+from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
@@ -122,7 +122,7 @@ def regress_head(models: Models, cropped: np.ndarray) -> FitStart | None:
 def reflectance_of(
     models: Models,
     head: Head,
-    kind: Kind = "field",
+    kind: RelightKind = "field",
     network_alone: bool = False,
     memory_bytes: int = MEMORY_BYTES,
     photo: np.ndarray | None = None,
@@ -132,11 +132,13 @@ def reflectance_of(
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
     with `network_alone` they are not. The models that the paper compares with have no such correction.
     """
-    if kind not in ("field", "portrait"):
+    if kind != "field" and kind != "portrait":
         return explain(models, head, kind).reflectance
+    if kind == "portrait" and photo is None:
+        raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
     own = None if network_alone else own_light(models, head.face)
     field = Field(models, head.face, own.quotient if own else None, memory_bytes)
-    if kind == "field" or photo is None:
+    if photo is None or kind == "field":
         return field
     return PortraitField.of(models.face, photo, head, field, own)
 

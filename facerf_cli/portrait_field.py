@@ -6,7 +6,7 @@ are averaged. As the field's, the maps are corrected by the photo's quotient, so
 photo back.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,11 +20,11 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
 from facerf_cli.field import Field, OwnLight
-from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork, skin_exposure
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.raster.camera import project
@@ -34,8 +34,9 @@ SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
 _SHARE = 0.5  # of the portrait field in the face
+_PROXY_NORMALS = 1.0  # weight of the proxy's normals on face and neck; that of the network's is 1
 _SKIN = class_index("skin")
-_LIKENESS_PX = 48
+_FACE = [class_index(name) for name in ("skin", "brows", "eyes", "lips", "mouth", "beard", "neck")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class PortraitField:
     image: Tensor  # [3, S, S] exposed
     exposure: float  # radiance of the photo over that of `image`
     field: Field
-    quotient: Quotient | None = None
+    correction: Correction | None = None
     texels: Tensor | None = None  # [T, T, 2] of the face's texture, in the square, for grid_sample
 
     @staticmethod
@@ -77,7 +78,7 @@ class PortraitField:
         person = look_at_person(model, photo, head.fit)
         rig = rig_directions(_SUMMARY_LIGHTS)
         inputs = person.inputs(rig, person.visibility(rig))
-        maps = portrait_network()(inputs)
+        maps = _steadied(portrait_network()(inputs), person)
         exposure = float(skin_exposure(person.image[None], person.classes[None]))
         texels = _texels_in_square(model, head, person)
         found = PortraitField(person, maps, inputs.image[0], exposure, field, None, texels)
@@ -85,13 +86,22 @@ class PortraitField:
 
     def _corrected(self, own: OwnLight) -> "PortraitField":
         """The field in the units of the photo's light, corrected to give the photo back under it."""
-        lit = self.lit(own.light.directions, own.light.weights[None])
-        explained = (self.maps.albedo * lit.shading + lit.highlights)[0]
+        used = own.light.weights.sum(1) > 0
+        directions, weights = own.light.directions[used], own.light.weights[used]
+        shade, glow, _ = self._shaded(directions)
+        olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
+        explained = torch.einsum("lc,lcij->cij", weights, olats)
         exposure = float((self.person.image * skin).sum() / (explained * skin).sum().clamp_min(1e-6))
-        alpha = 1 - self.person.classes[0]
-        quotient = Quotient.of(self.person.image, explained * exposure, alpha)
-        return PortraitField(self.person, self.maps, self.image, exposure, self.field, quotient, self.texels)
+        correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
+        return replace(self, exposure=exposure, correction=correction)
+
+    def _shaded(self, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shading, highlights and the share that arrives [l, S, S] of single lights [l, 3]."""
+        visible = self.person.visibility(lights)[None]
+        wide = F.interpolate(visible, size=self.image.shape[1:], mode="bilinear", align_corners=False)
+        shade, glow, arrives = self.maps.shaded(lights[None], wide)
+        return shade[0], glow[0], arrives[0]
 
     @torch.no_grad()
     def lit(self, directions: Tensor, weights: Tensor) -> PortraitLight:
@@ -103,19 +113,14 @@ class PortraitField:
             torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
             strict=True,
         ):
-            visible = F.interpolate(
-                self.person.visibility(lights)[None], size=self.image.shape[1:], mode="bilinear"
-            )
-            shade, glow, arrives = self.maps.shaded(lights[None], visible)
-            if self.quotient is None:
-                shade, glow = shade[0][:, None], glow[0][:, None]
-            else:
-                images = self.maps.albedo * shade[0][:, None] + glow[0][:, None]
-                factor = self.quotient.factors(images)
-                shade, glow = shade[0][:, None] * factor, glow[0][:, None] * factor
-            shading = shading + torch.einsum("mlc,lcij->mcij", some, shade.expand(-1, 3, -1, -1))
-            highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow.expand(-1, 3, -1, -1))
-            reached = reached + torch.einsum("mlc,lij->mcij", some, arrives[0])
+            shade, glow, arrives = self._shaded(lights)
+            shade, glow = (x[:, None].expand(-1, 3, -1, -1) for x in (shade, glow))
+            if self.correction is not None:
+                factor, added = self.correction.terms(self.maps.albedo * shade + glow)
+                shade, glow = shade * factor, glow * factor + added
+            shading = shading + torch.einsum("mlc,lcij->mcij", some, shade)
+            highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow)
+            reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
         return PortraitLight(shading, highlights, reached / weights.sum(1).clamp_min(1e-6)[..., None, None])
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
@@ -142,6 +147,16 @@ class PortraitField:
     def input_exposure(self) -> float:
         """Radiance of the photo over that of the network's input."""
         return float(skin_exposure(self.person.image[None], self.person.classes[None]))
+
+
+def _steadied(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:
+    """Normals that lie between the network's and, on face and neck, those of the proxy.
+
+    Where the network is unsure of a shape it predicts the mean of several, which is flatter than each.
+    """
+    covered = person.maps.covered * person.classes[_FACE].sum(0)
+    normals = F.normalize(maps.normals + _PROXY_NORMALS * covered * person.maps.normals, dim=1)
+    return maps._replace(normals=normals)
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

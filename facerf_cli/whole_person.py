@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.colour import auto_exposure_ev
@@ -21,11 +22,13 @@ from facerf_cli.raster.texture import inpaint
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
+_FEATHER = 0.12  # border of the square where the change of light takes over, in halves of its side
+_CHANGE_PX, _DARK = 5.0, 1e-3  # of that change: its blur, and what keeps it finite, as a share of the photo
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 
 class WholePerson:
-    """A photo's person [H, W] under sums of lights; outside the square its border goes on."""
+    """A photo's person under sums of lights; outside the square the change of light at its border goes on."""
 
     def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
         self.matte = field.person.segmentation.matte
@@ -41,11 +44,21 @@ class WholePerson:
     def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
         """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
         result = np.empty_like(photo)
-        for rows, wide in self._bands(torch.cat([self._albedo_maps, self._filled(lit[:6])])):
-            shading, highlights = torch.split(wide[_ALBEDO_MAPS:], 3)
+        maps = torch.cat([self._albedo_maps, self._filled(lit[:6]), self._change(lit)])
+        for rows, wide, inside in self._bands(maps):
+            shading, highlights, change = torch.split(wide[_ALBEDO_MAPS:], 3)
             radiance = (self._albedo(photo[rows], wide) * shading + highlights) * self._field.exposure
-            result[rows] = radiance.permute(1, 2, 0).numpy()
+            beyond = torch.from_numpy(photo[rows].clip(min=0)).permute(2, 0, 1) * change
+            result[rows] = torch.lerp(beyond, radiance, inside).permute(1, 2, 0).numpy()
         return result
+
+    def _change(self, lit: Tensor) -> Tensor:
+        """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
+        own = self._field.person.image
+        relit = (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
+        both = self._filled(torch.cat([relit, own])).numpy()
+        smooth = torch.from_numpy(gaussian_filter(both, (0, _CHANGE_PX, _CHANGE_PX), mode="nearest"))
+        return smooth[:3] / (smooth[3:] + _DARK * own.mean())
 
     def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
         """Exposures in EV that show the person well under the light of maps [9, S, S], and in the photo."""
@@ -75,7 +88,8 @@ class WholePerson:
             "position": person.maps.positions_m,
             "depth": -person.maps.positions_m[2:],
         }[name]
-        wide = np.concatenate([part.permute(1, 2, 0).numpy() for _, part in self._bands(self._filled(maps))])
+        parts = [part.permute(1, 2, 0).numpy() for _, part, _ in self._bands(self._filled(maps))]
+        wide = np.concatenate(parts)
         if name == "normal":
             wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
         return {name: self._masked(wide)}
@@ -85,7 +99,7 @@ class WholePerson:
 
     def _albedo_map(self) -> np.ndarray:
         albedo = np.empty_like(self._photo)
-        for rows, wide in self._bands(self._albedo_maps):
+        for rows, wide, _ in self._bands(self._albedo_maps):
             part = self._albedo(self._photo[rows], wide) * self._field.exposure
             albedo[rows] = part.permute(1, 2, 0).numpy()
         return albedo
@@ -112,8 +126,8 @@ class WholePerson:
         """Maps [C, S, S] with the person's values continued over the background."""
         return inpaint(maps, self._own)
 
-    def _bands(self, maps: Tensor) -> Iterator[tuple[slice, Tensor]]:
-        """Rows of the photo with the maps [C, h, W] over them."""
+    def _bands(self, maps: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Rows of the photo, the maps [C, h, W] over them, and the weight [h, W] of the square there."""
         height, width = self._photo.shape[:2]
         square = self._field.person.square
         x = 2 * (torch.arange(width) + PIXEL_CENTRE - square.x0_px) / square.side_px - 1
@@ -123,4 +137,5 @@ class WholePerson:
             rows = slice(first, min(height, first + step))
             grid = torch.stack([x.expand(rows.stop - first, -1), y[rows, None].expand(-1, width)], -1)[None]
             wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
-            yield rows, wide[0]
+            inside = ((1 - grid[0].abs().amax(-1)) / _FEATHER).clamp(0, 1)
+            yield rows, wide[0], inside.float()

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.composite import Target
+from facerf_cli.baselines import Kind
+from facerf_cli.composite import Composition, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import region_mask
@@ -74,15 +75,18 @@ def test_a_face_that_is_hardly_seen_has_no_light_to_read(head: Head) -> None:
         photo_evidence(FaceTexture(face.texture * 0, face.visible, face.normals))
 
 
-def test_two_lights_apart_add_up_to_both_at_once(models: Models, photo: np.ndarray, head: Head) -> None:
-    """The whole image is linear in light, hair and background included."""
-    reflectance = reflectance_of(models, head)
+@pytest.mark.parametrize("kind", ["field", "portrait"])
+def test_two_lights_apart_add_up_to_both_at_once(
+    models: Models, photo: np.ndarray, head: Head, kind: Kind
+) -> None:
+    """The whole person is linear in light."""
+    reflectance = reflectance_of(models, head, kind, photo=photo)
     directions = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
     rgb = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.1, 0.1]])
 
     def image(weights: torch.Tensor) -> np.ndarray:
         light = RigLight(directions, weights)
-        return relight(models, photo, head, light, reflectance=reflectance).pixels
+        return relight(models, photo, head, light, Target(background="none"), reflectance).pixels
 
     first = image(rgb * torch.tensor([[1.0], [0.0]]))
     second = image(rgb * torch.tensor([[0.0], [1.0]]))
@@ -96,12 +100,14 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     light = RigLight(azel_to_direction(0.0, 0.0)[None], torch.ones(1, 3))
     turned = replace(head.fit, rotation=pose_to_rotation(30, 0, 0))
     straight = replace(head.fit, rotation=pose_to_rotation(0, 0, 0))
-    images = [relight(models, None, head, light, Target(fit, "face")) for fit in (straight, turned)]
+    targets = [Target(fit, "face") for fit in (straight, turned)]
+    images = [relight(models, None, head, light, target) for target in targets]
     for image in images:
         assert image.alpha is not None and image.pixels.shape == (256, 256, 3)
         assert (image.pixels[image.alpha == 0] == 0).mean() > 0.5
-    noses = [image.layers["position"][..., 2] for image in images]  # the point nearest to the camera
-    columns = [int(np.where(z == 0, -np.inf, z).max(0).argmax()) for z in noses]
+    # the point nearest to the camera
+    noses = [Composition(models.face, None, head, target).view.position_m[..., 2] for target in targets]
+    columns = [int(torch.where(z == 0, -torch.inf, z).amax(0).argmax()) for z in noses]
     assert columns[1] > columns[0] + 10  # yaw > 0 turns the nose to the image's right
 
 

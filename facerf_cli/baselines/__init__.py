@@ -2,6 +2,7 @@
 
 from typing import Literal
 
-# Values of `--reflectance`: the whole portrait, the paper's neural field of the face, or one of the models
-# that the field is compared with.
-Kind = Literal["portrait", "field", "diffuse-sh", "specular-sh", "prt"]
+# Models of a face: the paper's neural field, or one that it is compared with.
+Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]
+# Models that relight a photo: of the whole portrait, or of its face.
+RelightKind = Literal["portrait", "field", "diffuse-sh", "specular-sh", "prt"]

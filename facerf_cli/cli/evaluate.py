@@ -13,6 +13,7 @@ from facerf_cli.cli.evaluation_options import (
     JointFitOption,
     PhotosOrDatasetArgument,
     SplitOption,
+    measures_portraits,
     no_part_of_preset,
     only_dataset,
     refuse_for_others,
@@ -279,6 +280,7 @@ def yale_b(
     The database is for research and never trained on.
     """
     refuse_without_field(context, options, "network_alone")
+    options = measures_portraits(context, options)
     from facerf_cli.cli.items.evaluate_images import run_yale_b
 
     photo = PhotoOptions(

@@ -8,8 +8,15 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from facerf_cli.baselines import Kind
-from facerf_cli.cli.options import DryRunOption, JobsOption, OutputOption, OverwriteOption, refuse_given
+from facerf_cli.baselines import RelightKind
+from facerf_cli.cli.options import (
+    DryRunOption,
+    JobsOption,
+    OutputOption,
+    OverwriteOption,
+    refuse_given,
+    was_given,
+)
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
 
@@ -28,9 +35,9 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         metavar="KIND",
-        help="Measure field, diffuse-sh, specular-sh or prt; repeatable, and the others are compared with "
-        "the first.",
-        show_default="field",
+        help="Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and the "
+        "others are compared with the first.",
+        show_default="field; of yale-b portrait",
     ),
 ]
 AgainstOption = Annotated[
@@ -122,7 +129,7 @@ class EvaluateOptions:
     """The shared options, as the user gave them; settings only, so that it can go to other processes."""
 
     output: Path
-    reflectance: tuple[Kind, ...] = ("field",)
+    reflectance: tuple[RelightKind, ...] = ("field",)
     against: tuple[Path, ...] = ()
     compare: tuple[Path, ...] = ()
     pictures: bool = False
@@ -196,12 +203,12 @@ def _evaluate_options(
     )
 
 
-def _kinds(given: Sequence[str]) -> tuple[Kind, ...]:
+def _kinds(given: Sequence[str]) -> tuple[RelightKind, ...]:
     found = []
     for name in given:
-        kind = next((kind for kind in get_args(Kind) if kind == name), None)
+        kind = next((kind for kind in get_args(RelightKind) if kind == name), None)
         if kind is None:
-            raise UsageError(f"--reflectance {name}: give {', '.join(get_args(Kind))}")
+            raise UsageError(f"--reflectance {name}: give {', '.join(get_args(RelightKind))}")
         found.append(kind)
     return tuple(found)
 
@@ -225,9 +232,15 @@ def refuse_for_others(context: typer.Context, photos: bool) -> None:
     refuse_given(context, names, f"is for {kind}; leave it out here")
 
 
+def measures_portraits(context: typer.Context, options: EvaluateOptions) -> EvaluateOptions:
+    """The options of a protocol that measures whole portraits unless another model is asked for."""
+    given = was_given(context, "reflectance")
+    return options if given or options.against else replace(options, reflectance=("portrait",))
+
+
 def refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
     """Raise UsageError for an option of the field if that is not among the methods."""
-    if "field" not in options.reflectance and not options.against:
+    if not {"field", "portrait"} & set(options.reflectance) and not options.against:
         refuse_given(context, (name,), "is for the field; give --reflectance field too, or leave it out")
 
 

@@ -16,6 +16,7 @@ MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "paper"]
 DRAWN = "procedural:"
 _MOST_FRAMES = 9999
+_LIGHT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)")  # a name, and the frame numbers that it ends in
 
 
@@ -39,13 +40,17 @@ class PhotoLight:
 
 @dataclass(frozen=True)
 class LightSetup:
-    """The light of one image of every photo: a map, rotated, or lights (azimuth, elevation, r, g, b)."""
+    """The light of one image of every photo: a map, rotated, or lights (azimuth, elevation, r, g, b).
+
+    Lights with `names` are layers of the image, too.
+    """
 
     name: str
     frame: str = ""  # '.0001': frame numbers, which end a file's name
     envmap: Path | DrawnMap | PhotoLight | None = None
     rotate_deg: float = 0.0
     lights: tuple[tuple[float, ...], ...] = ()
+    names: tuple[str, ...] = ()
 
     def output(self, item: Item, tag: str, suffix: str) -> Path:
         """The image's file; the photo's own frame number goes last."""
@@ -89,7 +94,9 @@ def collect_setups(
         for photo in lit
         for turn, number, degrees in rotations
     ]
-    setups += map(_single_lights, lights)
+    setups += [_single_lights(text) for text in lights if "=" not in text]
+    if named := [part for text in lights if "=" in text for part in text.split(";")]:
+        setups.append(_named_lights(named))
     if not setups:
         raise UsageError("no light given; add --envmap, --light, or --light-from with a photo")
     if rotate is not None and not any(setup.envmap for setup in setups):
@@ -152,10 +159,25 @@ def _expand_glob(entry: str) -> list[str]:
     return found or [entry]
 
 
+def _named_lights(parts: Sequence[str]) -> LightSetup:
+    """Parse `NAME=az,el[,r,g,b]` of several lights: one image, with a layer for each."""
+    names, given = [], []
+    for part in parts:
+        name, _, text = part.partition("=")
+        if not _LIGHT_NAME.fullmatch(name.strip()) or name.strip() in names:
+            raise UsageError(f"--light {part!r}: give each light a name of its own, letters and digits")
+        names.append(name.strip())
+        given.append(azel(text, ("AZ,EL", "AZ,EL,R,G,B"), "--light"))
+    return LightSetup(f"light_{'+'.join(names)}", lights=tuple(map(_with_colour, given)), names=tuple(names))
+
+
+def _with_colour(values: Sequence[float]) -> tuple[float, ...]:
+    return tuple(values) if len(values) == 5 else (*values, 1.0, 1.0, 1.0)
+
+
 def _single_lights(text: str) -> LightSetup:
     """Parse `az,el[,r,g,b][;...]`: lights that shine together."""
     parts = [part for part in text.split(";") if part.strip()] or [""]
     given = [azel(part, ("AZ,EL", "AZ,EL,R,G,B"), "--light") for part in parts]
     name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
-    lights = tuple(tuple(values) if len(values) == 5 else (*values, 1.0, 1.0, 1.0) for values in given)
-    return LightSetup(f"light_{name}", lights=lights)
+    return LightSetup(f"light_{name}", lights=tuple(map(_with_colour, given)))

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.baselines import Kind
+from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import BackgroundChoice, parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
@@ -55,7 +55,7 @@ class Relight:
     exposure_ev: float | None  # None: auto
     memory_bytes: int
     asked_for_photo: bool  # --composite photo is on the command line
-    reflectance: Kind = "portrait"
+    reflectance: RelightKind = "portrait"
     network_alone: bool = False
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -107,9 +107,10 @@ def relight(
         list[str] | None,
         typer.Option(
             "--light",
-            metavar="AZ,EL[,R,G,B][;...]",
+            metavar="[NAME=]AZ,EL[,R,G,B][;...]",
             help="Relight under a single light from an azimuth and elevation in degrees (AZ > 0: from the "
-            "image's right), or under several at once, separated by ;. Repeatable.",
+            "image's right), or under several at once, separated by ;. Repeatable. Lights with names "
+            "(key=40,20) shine together in one image, whose EXR has a layer for each.",
             show_default=False,
         ),
     ] = None,
@@ -149,7 +150,7 @@ def relight(
         ),
     ] = None,
     reflectance: Annotated[
-        Kind,
+        RelightKind,
         typer.Option(
             help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
             "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
@@ -247,7 +248,8 @@ def relight(
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file; give one that exists")
-    lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), reflectance))
+    of_light: Kind = "field" if reflectance == "portrait" else reflectance
+    lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))
     work = Relight(
         photo=photo,
         setups=collect_setups(envmap or (), rotate, light or (), output, settings.seed, lit),

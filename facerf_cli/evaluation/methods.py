@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from facerf_cli.baselines import Kind
+from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.composite import Target
+from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models
@@ -28,12 +29,14 @@ class Method:
     """A reflectance model under the name of its figures; its images are those of `facerf relight`."""
 
     name: str
-    kind: Kind
+    kind: RelightKind
     models: Models
     estimator: Estimator = DEFAULT_ESTIMATOR
 
     def explained(self, head: Head, network_alone: bool = True) -> Explained:
         """Reflectance and light; a field with the photo's correction gives the photo back by construction."""
+        if self.kind == "portrait":
+            raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
         return explain(self.models, head, self.kind, network_alone, self.estimator)
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:

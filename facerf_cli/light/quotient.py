@@ -31,11 +31,7 @@ class Quotient:
         return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible)
 
     def corrected(self, olats: Tensor) -> Tensor:
-        """Multiply OLAT textures [l, 3, T, T] by their `factors`."""
-        return olats * self.factors(olats)
-
-    def factors(self, olats: Tensor) -> Tensor:
-        """The quotient [l, 3, T, T] for OLAT textures, to a power that is each light's likeness.
+        """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
 
         Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
         not light directions: a photo under a dome of light hardly corrects a light from the side.
@@ -46,4 +42,4 @@ class Quotient:
         power = likeness.clamp(0, 1)[:, None, None, None] ** _SHARPNESS
         side = olats.shape[-2:]
         ratio = F.interpolate(self.ratio[None].log(), side, mode="bilinear", align_corners=False)
-        return torch.exp(power * ratio)
+        return olats * torch.exp(power * ratio)

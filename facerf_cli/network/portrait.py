@@ -2,9 +2,10 @@
 
     OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l sum_j g_j lobe_j(n, t, l)
 
-A is the photo without its light, gain times photo plus bias, so that detail survives; b_k are spherical
-harmonics of the light's direction; P and U hold light with and without the shadows of the proxy V_l; the
-lobes are highlights about normals n, and about strands t of hair. V'_l corrects the proxy's shadows:
+A is the photo without its light, gain times photo plus bias, so that detail survives. The gain starts from
+the proxy's shading under the light that explains the photo best (`portrait/own_shading.py`). b_k are
+spherical harmonics of the light's direction; P and U hold light with and without the shadows of the proxy
+V_l; the lobes are highlights about normals n, and about strands t of hair. V'_l corrects those shadows:
 logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pass; a light then costs a few
 products a pixel. The sum over lights is linear in their intensities.
 """
@@ -28,18 +29,14 @@ _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
 _MAX_WIDTH = 512  # in a checkpoint that is read
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
-_PARTS = {
-    "gain": 3,
-    "bias": 3,
-    "normals": 3,
-    "strands": 3,
-    "gloss": len(_SHARPNESS) + 1,
+_DIM = 0.15  # added to the proxy's shading before the photo is divided by it
+_FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
+_COARSE = {  # maps at half the side
     "lit": (LIT_ORDER + 1) ** 2,
     "around": (LIT_ORDER + 1) ** 2,
-    "trust": 1,
     "shadow": (SHADOW_ORDER + 1) ** 2,
 }
-OUTPUTS = sum(_PARTS.values())
+_OUTPUTS = 4 * sum(_FINE.values()) + sum(_COARSE.values())
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,8 @@ class PortraitInputs:
 
     image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
     [B, C, S, S]; normals [B, 3, S, S], depth [B, 1, S, S] (0.1 m) and covered [B, 1, S, S] of the proxy;
-    reached [B, K, S, S]: spherical harmonics of the proxy's visibility.
+    reached [B, K, S, S]: spherical harmonics of the proxy's visibility; own [B, 1, S, S]: its shading under
+    the photo's light, 1 on average over the skin.
     """
 
     image: Tensor
@@ -67,15 +65,7 @@ class PortraitInputs:
     depth: Tensor
     covered: Tensor
     reached: Tensor
-
-    @staticmethod
-    def of(
-        image: Tensor, classes: Tensor, surface: tuple[Tensor, Tensor, Tensor], reached: Tensor
-    ) -> "PortraitInputs":
-        """Expose images [B, 3, S, S]; `surface` holds normals, depth and cover of the proxy."""
-        normals, depth, covered = surface
-        exposed = image / skin_exposure(image, classes)
-        return PortraitInputs(exposed, classes, normals, depth, covered, reached)
+    own: Tensor
 
     def to(self, device: torch.device) -> "PortraitInputs":
         """Move the inputs to `device`."""
@@ -84,7 +74,8 @@ class PortraitInputs:
     def stacked(self) -> Tensor:
         """All of it [B, C, S, S] as the first layer sees it."""
         root = (self.image.clamp(0, 4) + 0.005).sqrt() - 0.5
-        layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached)
+        own = (self.own.clamp(0, 4) + 0.02).sqrt() - 1
+        layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached, own)
         return torch.cat(layers, 1)
 
 
@@ -103,7 +94,10 @@ def skin_exposure(image: Tensor, classes: Tensor) -> Tensor:
 
 
 class PortraitMaps(NamedTuple):
-    """Maps of B people; every one [B, C, S, S]; albedo is in the units of the exposed image."""
+    """Maps of B people, [B, C, S, S], the last three of half the side.
+
+    Albedo is in the units of the exposed image.
+    """
 
     gain: Tensor
     bias: Tensor
@@ -111,9 +105,9 @@ class PortraitMaps(NamedTuple):
     normals: Tensor
     strands: Tensor
     gloss: Tensor
+    trust: Tensor
     lit: Tensor
     around: Tensor
-    trust: Tensor
     shadow: Tensor
 
     def shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -124,11 +118,15 @@ class PortraitMaps(NamedTuple):
         """
         basis = sh_basis(lights, SHADOW_ORDER)  # [B, L, K]
         few = basis[..., : (LIT_ORDER + 1) ** 2]
-        logit = self.trust * (2 * visible - 1) + torch.einsum("blk,bkij->blij", basis, self.shadow)
-        visible = torch.sigmoid(logit)
+        size = self.normals.shape[-2:]
+
+        def over(basis: Tensor, maps: Tensor) -> Tensor:
+            coarse = torch.einsum("blk,bkij->blij", basis, maps)
+            return F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+
+        visible = torch.sigmoid(self.trust * (2 * visible - 1) + over(basis, self.shadow))
         cosine = torch.einsum("blc,bcij->blij", lights, self.normals)
-        lit = torch.einsum("blk,bkij->blij", few, self.lit)
-        around = torch.einsum("blk,bkij->blij", few, self.around)
+        lit, around = over(few, self.lit), over(few, self.around)
         shading = visible * cosine.clamp_min(0) + F.relu(visible * lit + around)
         half = F.normalize(lights + lights.new_tensor(_VIEW), dim=-1)
         n_dot_h = torch.einsum("blc,bcij->blij", half, self.normals).clamp(1e-3, 1).log()
@@ -153,7 +151,7 @@ class PortraitNetwork(nn.Module):
         self.settings = settings
         self.side = settings.side
         widths = settings.widths
-        channels = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2
+        channels = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
         self.stem = Halving(channels, widths[0], settings.blocks[0])
         self.encode = nn.ModuleList(
             Halving(a, b, count) for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
@@ -162,7 +160,7 @@ class PortraitNetwork(nn.Module):
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
         self.last = Residual(widths[0])
-        self.predict = nn.Conv2d(widths[0], OUTPUTS * 4, 1)
+        self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
         nn.init.normal_(self.predict.weight, std=0.01)
 
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
@@ -174,8 +172,15 @@ class PortraitNetwork(nn.Module):
             x = halving(x)
         for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
             x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
-        raw = F.pixel_shuffle(self.predict(self.last(x)), 2).float()
-        return _maps(dict(zip(_PARTS, torch.split(raw, list(_PARTS.values()), 1), strict=True)), inputs)
+        fine, coarse = torch.split(
+            self.predict(self.last(x)), [4 * sum(_FINE.values()), sum(_COARSE.values())], 1
+        )
+        shuffled = F.pixel_shuffle(fine, 2).float()
+        parts = [
+            *torch.split(shuffled, list(_FINE.values()), 1),
+            *torch.split(coarse.float(), list(_COARSE.values()), 1),
+        ]
+        return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs)
 
     def as_metadata(self) -> dict[str, Any]:
         """Form and settings, for a checkpoint."""
@@ -198,7 +203,8 @@ class PortraitNetwork(nn.Module):
 
 
 def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
-    gain, bias = torch.exp(raw["gain"].clamp(-4, 4)), 0.1 * F.softplus(raw["bias"] - 3)
+    gain = torch.exp(raw["gain"].clamp(-4, 4)) * (1 + _DIM) / (inputs.own + _DIM)
+    bias = 0.1 * F.softplus(raw["bias"] - 3)
     return PortraitMaps(
         gain=gain,
         bias=bias,

@@ -11,7 +11,8 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.network.portrait import PortraitInputs, reached_by
+from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
+from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.portrait.proxy import Proxy, ProxyMaps, proxy_maps, proxy_of, square_camera, visibility
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.portrait.square import SIDE_PX, portrait_square
@@ -39,8 +40,10 @@ class SeenPerson:
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
-        reached = reached_by(rig, visible, SIDE_PX)[None]
-        return PortraitInputs.of(self.image[None], self.classes[None], surface_of(self.maps), reached)
+        own = own_shading(self.image, self.classes, self.maps.normals, rig, visible)
+        exposed = self.image[None] / skin_exposure(self.image[None], self.classes[None])
+        reached = reached_by(rig, visible, SIDE_PX)
+        return PortraitInputs(exposed, self.classes[None], *surface_of(self.maps), reached[None], own[None])
 
 
 def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:

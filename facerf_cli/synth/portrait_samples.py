@@ -13,6 +13,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.light.sh import mirror_signs
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN, PortraitInputs, reached_by
+from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.synth.backgrounds import background_of
 from facerf_cli.synth.face_crops import blurred
 from facerf_cli.synth.portraits import albedo_of, images_under
@@ -20,7 +21,7 @@ from facerf_cli.synth.random_fields import Uniform
 from facerf_cli.synth.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.transport_bank import load_view, seen_path
 
-_LAMP_SHARE = 0.2  # of photos, lit by one lamp in near darkness
+_LAMP_SHARE = 0.3  # of photos, lit by one lamp in near darkness
 _GREY = 0.2  # share of grey photos
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
@@ -41,6 +42,7 @@ class PortraitSample:
     depth: Tensor
     covered: Tensor
     reached: Tensor
+    own_shading: Tensor
     lights: Tensor
     visible: Tensor
     targets: Tensor
@@ -55,7 +57,8 @@ class PortraitSample:
     @property
     def inputs(self) -> PortraitInputs:
         """Inputs of the network."""
-        return PortraitInputs(self.image, self.classes, self.normals, self.depth, self.covered, self.reached)
+        names = ("image", "classes", "normals", "depth", "covered", "reached", "own_shading")
+        return PortraitInputs(*(getattr(self, name) for name in names))
 
     def to(self, device: torch.device) -> "PortraitSample":
         """Move the sample to `device`."""
@@ -113,6 +116,7 @@ class StoredTransport:
             depth=seen["depth"].float(),
             covered=seen["covered"].float() / 255,
             reached=reached_by(rig, visible, side),
+            own_shading=own_shading(photo, classes, seen["normals"].float(), rig, visible),
             lights=rig[chosen],
             visible=visible[chosen],
             targets=(images[1:] * scale).clamp(max=_BRIGHTEST),
@@ -125,7 +129,7 @@ class StoredTransport:
             shares=view.portrait.classes.permute(2, 0, 1).float() / 255,
         )
         batched = PortraitSample(*(getattr(sample, field.name)[None] for field in fields(sample)))
-        return _mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
+        return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
 
 
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
@@ -160,7 +164,7 @@ def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
     return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
 
 
-def _mirrored(sample: PortraitSample) -> PortraitSample:
+def mirrored(sample: PortraitSample) -> PortraitSample:
     """Mirror a sample: images, and the x of vectors."""
     values = {}
     for field in fields(sample):

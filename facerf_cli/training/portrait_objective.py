@@ -1,8 +1,9 @@
 """Stage `portrait`: the Portrait Network, on synthetic people lit by other lights at every step.
 
-Errors of single lights, which sums of lights follow from; of the photo under its own light, so that it
-comes back; and of normals and albedo, which make training on synthetic people hold for others (Yeh et al.,
-*Learning to relight portrait images via a virtual light stage and synthetic-to-real adaptation*, 2022).
+Errors of single lights, which sums of lights follow from, and of their contrast; of the photo under its
+light, so that it comes back; and of normals and albedo, which make training on synthetic people hold for
+others (Yeh et al., *Learning to relight portrait images via a virtual light stage and synthetic-to-real
+adaptation*, 2022).
 """
 
 from collections.abc import Callable
@@ -39,7 +40,8 @@ class PortraitObjectiveSettings:
     edges: float = 1.0  # of differences of neighbouring roots
     own: float = 1.0
     albedo: float = 0.3
-    normals: float = 0.1
+    normals: float = 0.5
+    contrast: float = 0.5
     scale: float = 0.05
     targets: int = 4
     held_out_people: int = 16
@@ -89,6 +91,7 @@ class PortraitObjective(Objective):
             "own": settings.own * own_off.abs().mean(),
             "albedo": settings.albedo * albedo_off.abs().mean(),
             "normals": settings.normals * (turned * small[0] / small[1]).mean(),
+            "contrast": settings.contrast * _contrast_error(found * scale, batch),
             "scale": settings.scale * scale.log().abs().mean(),
         }
 
@@ -143,11 +146,33 @@ def _part(batch: PortraitSample, index: int) -> PortraitSample:
 
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
     """The photo under its own light [B, 3, S / 4, S / 4], as the network sees it."""
-    small = PortraitMaps(*(_smaller(values) for values in maps))
+    side = batch.image.shape[-1] // SMALL
+    small = PortraitMaps(*(F.interpolate(values, size=(side, side), mode="area") for values in maps))
     visible = F.interpolate(batch.rig_visible, size=small.gain.shape[-2:], mode="area")
     shading, glow, _ = small.shaded(batch.rig, visible)
     lit = torch.einsum("blij,blc->bcij", shading, batch.weights)
     return small.albedo * lit + torch.einsum("blij,blc->bcij", glow, batch.weights)
+
+
+def _contrast_error(found: Tensor, batch: PortraitSample) -> Tensor:
+    """Difference of the standard deviations of the roots, over the person and over its skin.
+
+    Without it images are flatter than true ones: a network that is unsure of a shape blurs its shading.
+    """
+    regions = 1 - batch.shares[:, :1], batch.shares[:, [class_index("skin")]]
+    roots = _root(found).mean(2), _root(batch.targets).mean(2)
+    errors = []
+    for region in regions:
+        own, true = (_deviation(root, region) for root in roots)
+        errors.append((own - true).abs().mean())
+    return (errors[0] + errors[1]) / 2
+
+
+def _deviation(values: Tensor, weight: Tensor) -> Tensor:
+    """Standard deviation [B, T] of values [B, T, S, S] under weights [B, 1, S, S]."""
+    total = weight.sum((2, 3)).clamp_min(1.0)
+    mean = ((values * weight).sum((2, 3)) / total)[..., None, None]
+    return (((values - mean).square() * weight).sum((2, 3)) / total + 1e-6).sqrt()
 
 
 def _larger(visible: Tensor, image: Tensor) -> Tensor:

@@ -132,6 +132,22 @@ def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
     assert relight(given, tmp_path / "bad", "--light", "40,10", "--aov", "beauty") == 2
 
 
+def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -> None:
+    lights = ["--light", "key=40,20", "--light", "rim=160,10,0.2,0.4,0.9", "--light", "5,6"]
+    assert relight(given, tmp_path, *lights, "--background", "0,0,0") == 0
+    assert made(tmp_path) == [
+        f"astronaut_{name}{suffix}" for name in ("light_5_6", "light_key+rim") for suffix in (".exr", ".png")
+    ]
+    path = tmp_path / "astronaut_light_key+rim.exr"
+    names = [f"{layer}{letter}" for letter in "RGB" for layer in ("", "key.", "rim.")]
+    layers = np.stack(layers_of(path, *names)).reshape(3, 3, 512, 512)
+    np.testing.assert_allclose(layers[:, 1] + layers[:, 2], layers[:, 0], rtol=5e-3, atol=2e-3)  # half floats
+    assert layers[:, 1].max() > 0.1 and layers[2, 2].mean() > 1.5 * layers[0, 2].mean()
+    for wrong in (["key=1,2", "key=3,4"], ["=1,2"], ["a b=1,2"], ["key=1"]):
+        line = [word for text in wrong for word in ("--light", text)]
+        assert relight(given, tmp_path / "x", *line) == 2
+
+
 def channels_of(path: Path) -> list[str]:
     stream = oiio.ImageInput.open(str(path))
     names = list(stream.spec().channelnames)
@@ -224,7 +240,8 @@ def test_a_stack_gives_what_its_photo_gives(given: Path, tmp_path: Path) -> None
     )
     stack = next((tmp_path / "olat").glob("*.exr"))
     envmap = ["--envmap", str(given / "maps")]
-    assert relight(given, tmp_path / "a", *envmap, "--composite", "face") == 0
+    field = ["--composite", "face", "--reflectance", "field"]
+    assert relight(given, tmp_path / "a", *envmap, *field) == 0
     assert relight(given, tmp_path / "b", *envmap, photo=stack) == 0
     direct = face_sides(tmp_path / "a/astronaut_right.0007.exr")
     again = face_sides(next((tmp_path / "b").glob("*_right.0007.exr")))

@@ -83,13 +83,17 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
     assert "give a checkpoint of `facerf train`" in capsys.readouterr().err
 
 
-def test_the_field_is_what_it_was(given: Path, tmp_path: Path) -> None:
-    line = ["--light", "20,30", "--composite", "face"]
-    assert relighting.relight(given, tmp_path / "plain", *line) == 0
-    assert relighting.relight(given, tmp_path / "named", *line, "--reflectance", "field") == 0
-    plain, named = (tmp_path / name / "astronaut_light_20_30.exr" for name in ("plain", "named"))
-    assert np.array_equal(read_image(plain).pixels, read_image(named).pixels)
-    assert attribute(named, "facerf:reflectance") == ""
+def test_the_portrait_is_the_default(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "20,30", "--background", "none", "--exposure", "0"]
+    images = {}
+    for name in ("", "portrait", "field"):
+        chosen = ["--reflectance", name] if name else []
+        assert relighting.relight(given, tmp_path / f"_{name}", *line, *chosen) == 0
+        path = tmp_path / f"_{name}/astronaut_light_20_30.exr"
+        images[name] = read_image(path).pixels
+        assert attribute(path, "facerf:reflectance") == ("field" if name == "field" else "")
+    assert np.array_equal(images[""], images["portrait"])
+    assert np.abs(images[""] - images["field"]).max() > 0.05
 
 
 def test_no_such_model(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.baselines import Kind
+from facerf_cli.baselines import RelightKind
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.items.photo_lights import feature_network
@@ -30,7 +30,7 @@ class MethodOptions:
     """Which methods are compared; settings only, so that it can be sent to other processes."""
 
     photo: PhotoOptions
-    reflectance: tuple[Kind, ...]
+    reflectance: tuple[RelightKind, ...]
     against: tuple[Path, ...]
     light: LightOptions
 

@@ -75,7 +75,7 @@ def _software() -> str:
 
 def _checkpoint_of(method: str, settings: Settings) -> str:
     """The checkpoint of a method's images, as far as the method's name shows it."""
-    return (settings.checkpoint or DEFAULT_CHECKPOINT).stem if method == "field" else method
+    return (settings.checkpoint or DEFAULT_CHECKPOINT).stem if method in ("field", "portrait") else method
 
 
 def _place(kind: str, case: str) -> str:

@@ -24,6 +24,7 @@ from facerf_cli.cli.items.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
 from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
@@ -35,6 +36,7 @@ from facerf_cli.face.view import photo_camera
 from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
+from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 
@@ -54,6 +56,9 @@ class Composer(Protocol):
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
         """Layers of the image by the names that they have in a file."""
 
+    def light_layer(self, relit: Relit) -> np.ndarray:
+        """The person under one of several lights, over black."""
+
     def auto_exposure_ev(self, relit: Relit) -> float:
         """The exposure that shows the person well."""
 
@@ -64,6 +69,7 @@ class _Shown:
 
     composer: Composer
     relit: Callable[[slice], list[Relit]]  # by some of the setups
+    apart: Callable[[LightSetup], list[Relit]]  # by each light of a setup
     bytes_each: int
     alpha: np.ndarray | None = None  # of the photo
     backdrops: Backdrops | None = None
@@ -98,6 +104,15 @@ def _relight_face(
     def relit(rows: slice) -> list[Relit]:
         return list(relit_by(composition, head, reflectance, directions, weights[rows], target))
 
+    def apart(setup: LightSetup) -> list[Relit]:
+        towards = torch.stack([azel_to_direction(*light[:2]) for light in setup.lights])
+        colours = torch.tensor([light[2:] for light in setup.lights])
+        return list(
+            relit_by(
+                composition, head, reflectance, towards, torch.diag_embed(colours.T).permute(1, 2, 0), target
+            )
+        )
+
     metadata = provenance(item, work.photo, models.checkpoint_name)
     if work.reflectance != "portrait":
         metadata["facerf:reflectance"] = work.reflectance
@@ -108,7 +123,7 @@ def _relight_face(
     bytes_each = head.face.texture.nbytes + (composition.surround.nbytes if composition.surround else 0)
     camera = photo_camera(head.fit.crop, *image.pixels.shape[:2])
     backdrops = Backdrops(work.background, work.background_blur, camera) if whole else None
-    shown = _Shown(composition, relit, bytes_each, alpha, backdrops)
+    shown = _Shown(composition, relit, apart, bytes_each, alpha, backdrops)
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
 
@@ -143,7 +158,13 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 
     metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
     bytes_each = 12 * stack.header.seen.size
-    shown = _Shown(composer, relit, bytes_each)
+
+    def apart(setup: LightSetup) -> list[Relit]:
+        each = tuple(replace(setup, lights=(light,)) for light in setup.lights)
+        batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
+        return list(map(Relit, weighted_sum(batches, weights_over_stack(each, directions, work.sampling))))
+
+    shown = _Shown(composer, relit, apart, bytes_each)
     return dict(_write_setups(item, "", shown, work, metadata)), facts
 
 
@@ -175,6 +196,9 @@ class _RenderedStack:
     def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
         return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen)
 
+    def light_layer(self, relit: Relit) -> np.ndarray:
+        return np.asarray(relit.texture.permute(1, 2, 0).numpy() * self.seen[..., None])
+
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
         if other := [name for name in names if name != "normal"]:
             raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
@@ -204,6 +228,9 @@ def _write_setups(
             path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
             image, layers = shown.composer.image(relit, ev, behind), shown.composer.layers(work.aov, relit)
+            if setup.names:
+                each = map(shown.composer.light_layer, shown.apart(setup))
+                layers = {**layers, **dict(zip(setup.names, each, strict=True))}
             _write(path, image, layers, shown.alpha, ev, metadata)
             yield path, ev
 

@@ -1,0 +1,84 @@
+"""The correction of a portrait's transport by its photo, so that the photo's own light gives the photo back.
+
+As in `light/quotient.py`, the error of the model is known under the photo's light, and about the same under
+lights that shade the person alike. With the model's image s_l of light l, the photo P and its explanation
+E = sum_l w_l s_l, the corrected image of a light is
+
+    s_l + (p_l / p) (Q - 1) (s_l + f k_l),    Q = (P + f) / (E + f),    k_l = mean s_l / mean E,
+
+where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l in each pixel over the photo's
+lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
+lights is the sum of their corrections.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+_FLOOR = 0.05  # f, as a share of the mean of the photo's person
+_RANGE = (0.2, 5.0)  # of Q
+_SHARPNESS = 8.0  # exponent of the likeness
+_LARGEST = 1.5  # of p_l / p
+_SMALL_PX = 48  # side at which likeness is measured
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """Q - 1 [3, S, S], p [S, S], the floor f, the mean of E, and E [s, s] small and grey, over the person."""
+
+    excess: Tensor
+    mean_likeness: Tensor
+    floor: float
+    mean: float
+    explained: Tensor
+    person: Tensor  # [S, S]
+
+    @staticmethod
+    def of(photo: Tensor, olats: Tensor, weights: Tensor, person: Tensor) -> "Correction":
+        """Correct images [L, 3, S, S] whose sum by weights [L, 3] explains a photo [3, S, S].
+
+        person [S, S] is the share of each pixel that the person has.
+        """
+        explained = torch.einsum("lc,lcij->cij", weights, olats)
+        total = person.sum().clamp_min(1.0)
+        floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
+        ratio = ((photo + floor) / (explained + floor).clamp_min(1e-9)).clamp(*_RANGE)
+        mean = float((explained.mean(0) * person).sum() / total)
+        plain = Correction(
+            (ratio - 1) * person, torch.ones_like(person), floor, mean, _small(explained, person), person
+        )
+        likeness, whole = plain._likeness(olats), plain._with_floor(olats)
+        shares = torch.einsum("lc,lcij->lij", weights, whole)
+        mean_likeness = torch.einsum("l,lij->ij", likeness, shares) / shares.sum(0).clamp_min(1e-9)
+        return Correction(plain.excess, mean_likeness.clamp_min(1e-3), floor, mean, plain.explained, person)
+
+    def terms(self, olats: Tensor) -> tuple[Tensor, Tensor]:
+        """Factors and additions [l, 3, S, S] by which images [l, 3, S, S] of single lights are corrected."""
+        power = self._likeness(olats)[:, None, None, None] / self.mean_likeness
+        change = power.clamp(max=_LARGEST) * self.excess
+        return (1 + change).clamp_min(0), change * self.floor * self._brightness(olats)
+
+    def _with_floor(self, olats: Tensor) -> Tensor:
+        return olats + self.floor * self._brightness(olats)
+
+    def _brightness(self, olats: Tensor) -> Tensor:
+        """k_l [l, 1, 1, 1]."""
+        means = (olats.mean(1) * self.person).sum((1, 2)) / self.person.sum().clamp_min(1.0)
+        return (means / max(self.mean, 1e-9))[:, None, None, None]
+
+    def _likeness(self, olats: Tensor) -> Tensor:
+        """p_l [l]: the cosine between image and explanation, to a power."""
+        small = _small(olats, self.person)
+        lengths = small.flatten(-2).norm(dim=-1) * self.explained.norm()
+        cosine = (small * self.explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
+        return cosine.clamp(0, 1) ** _SHARPNESS
+
+
+def _small(images: Tensor, person: Tensor) -> Tensor:
+    """Grey images [..., s, s] of images [..., 3, S, S], over the person."""
+    grey = (images.mean(-3) * person)[None] if images.dim() == 3 else (images.mean(-3) * person)
+    size = (_SMALL_PX, _SMALL_PX)
+    small = F.interpolate(grey[None], size, mode="area")[0]
+    return small[0] if images.dim() == 3 else small

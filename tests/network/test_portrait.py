@@ -1,0 +1,170 @@
+"""The Portrait Network's images against known answers."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.light.sh import sh_basis
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.network.portrait import (
+    SKIN,
+    PortraitInputs,
+    PortraitMaps,
+    PortraitNetwork,
+    PortraitSettings,
+    reached_by,
+    skin_exposure,
+)
+
+SIDE = 32
+TINY = PortraitSettings((8, 8, 12), (0, 1, 1), side=SIDE)
+
+
+def inputs() -> PortraitInputs:
+    random = torch.Generator().manual_seed(0)
+    classes = torch.zeros(1, 14, SIDE, SIDE)
+    classes[:, SKIN] = 1
+    normals = F.normalize(torch.randn(1, 3, SIDE, SIDE, generator=random), dim=1)
+    one = torch.ones(1, 1, SIDE, SIDE)
+    image = torch.rand(1, 3, SIDE, SIDE, generator=random)
+    return PortraitInputs(image, classes, normals, 0 * one, one, one.expand(-1, 16, -1, -1), 2 * one)
+
+
+def plain_maps() -> PortraitMaps:
+    """A matt surface of albedo 0.5 that faces the camera; the proxy's shadows are taken as they are."""
+    wide, half = (SIDE, SIDE), (SIDE // 2, SIDE // 2)
+    up = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, *wide)
+    zeros = torch.zeros(1, 3, *wide)
+    few, many = torch.zeros(1, 16, *half), torch.zeros(1, 25, *half)
+    return PortraitMaps(
+        gain=zeros + 1,
+        bias=zeros,
+        albedo=zeros + 0.5,
+        normals=up,
+        strands=torch.tensor([0.0, 1, 0]).view(1, 3, 1, 1).expand_as(up),
+        gloss=zeros,
+        trust=zeros[:, :1] + 50,
+        lit=few,
+        around=few,
+        shadow=many,
+    )
+
+
+def one_light(azimuth_deg: float, elevation_deg: float) -> Tensor:
+    return azel_to_direction(azimuth_deg, elevation_deg)[None, None]
+
+
+def lit_everywhere(lights: int = 1) -> Tensor:
+    return torch.ones(1, lights, SIDE, SIDE)
+
+
+def test_a_matt_surface_follows_the_cosine_and_the_proxys_shadow() -> None:
+    visible = lit_everywhere()
+    visible[..., SIDE // 2 :] = 0
+    image = plain_maps().olats(one_light(60, 0), visible)[0, 0]
+    torch.testing.assert_close(image[..., : SIDE // 2], torch.full((3, SIDE, SIDE // 2), 0.25))
+    assert image[..., SIDE // 2 :].max() < 1e-6
+    behind = plain_maps().olats(one_light(120, 0), lit_everywhere())
+    assert behind.abs().max() == 0
+
+
+def test_shadows_are_moved_by_the_corrections_of_their_direction() -> None:
+    """logit V' = a (2 V - 1) + sum_k b_k W_k."""
+    light = one_light(30, 20)
+    constant = torch.zeros(1, 25, SIDE // 2, SIDE // 2)
+    constant[:, 0] = 3.0
+    maps = plain_maps()._replace(trust=torch.full((1, 1, SIDE, SIDE), 2.0), shadow=constant)
+    _, _, visible = maps.shaded(light, 0 * lit_everywhere())
+    y0 = float(sh_basis(light, 0))
+    torch.testing.assert_close(visible, torch.full_like(visible, 1 / (1 + math.exp(2 - 3 * y0))))
+
+
+def test_light_round_corners_needs_no_visibility_and_is_never_negative() -> None:
+    around = torch.zeros(1, 16, SIDE // 2, SIDE // 2)
+    around[:, 3] = 1.0  # degree 1 along x
+    maps = plain_maps()._replace(around=around)
+    right, left = (maps.olats(one_light(azimuth, 0), 0 * lit_everywhere()) for azimuth in (90, -90))
+    expected = 0.5 * float(sh_basis(one_light(90, 0), 1)[..., 3])
+    torch.testing.assert_close(right, torch.full_like(right, expected))
+    assert left.max() == 0
+
+
+def test_highlights_lie_where_the_half_vector_meets_the_normal() -> None:
+    """Lobe j: (sharpness / 8) (n . h) ^ sharpness, in shadow none."""
+    gloss = torch.zeros(1, 3, SIDE, SIDE)
+    gloss[:, 1] = 0.1
+    maps = plain_maps()._replace(gloss=gloss)
+    ahead = maps.olats(one_light(0, 0), lit_everywhere())
+    torch.testing.assert_close(ahead, torch.full_like(ahead, 0.5 + 0.1 * 45 / 8), rtol=1e-3, atol=0)
+    aside = maps.olats(one_light(60, 0), lit_everywhere())
+    wanted = 0.25 + 0.1 * 45 / 8 * math.cos(math.radians(30)) ** 45
+    torch.testing.assert_close(aside, torch.full_like(aside, wanted), rtol=1e-3, atol=0)
+    assert maps.olats(one_light(0, 0), 0 * lit_everywhere()).max() < 1e-6
+
+
+def test_strands_shine_across_themselves() -> None:
+    gloss = torch.zeros(1, 3, SIDE, SIDE)
+    gloss[:, 2] = 0.1
+    maps = plain_maps()._replace(gloss=gloss)  # the strands are upright
+    aside, above = (
+        maps.shaded(one_light(*at), lit_everywhere())[1].mean() for at in ((60.0, 0.0), (0.0, 60.0))
+    )
+    assert aside == pytest.approx(0.1, rel=1e-3) and above < 0.05
+
+
+def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
+    network = PortraitNetwork(TINY)
+    torch.nn.init.zeros_(network.predict.weight)
+    assert network.predict.bias is not None
+    torch.nn.init.zeros_(network.predict.bias)
+    given = inputs()
+    maps = network(given)
+    torch.testing.assert_close(maps.gain, torch.full_like(maps.gain, 1.15 / 2.15))
+    torch.testing.assert_close(maps.albedo, given.image * maps.gain + maps.bias)
+    torch.testing.assert_close(maps.normals, given.normals)
+    assert maps.lit.shape == (1, 16, SIDE // 2, SIDE // 2) and maps.gloss.shape == (1, 3, SIDE, SIDE)
+
+
+def test_every_input_matters() -> None:
+    network, given = PortraitNetwork(TINY), inputs()
+    before = network(given).gain
+    for name in PortraitInputs.__dataclass_fields__:
+        changed = replace(given, **{name: getattr(given, name) * 0.5 + 0.1})
+        assert not torch.allclose(network(changed).gain, before, atol=1e-4), name
+
+
+def test_exposure_is_that_of_the_skin() -> None:
+    given = inputs()
+    given.classes[:, SKIN, :, SIDE // 2 :] = 0
+    given.image[..., SIDE // 2 :] = 100
+    exposed = given.image / skin_exposure(given.image, given.classes)
+    assert float(exposed[..., : SIDE // 2].mean()) == pytest.approx(0.25, rel=1e-4)
+
+
+def test_what_reaches_a_point_is_summed_over_the_rig() -> None:
+    rig = rig_directions(48)
+    summary = reached_by(rig, torch.ones(48, 4, 4), 8)
+    assert summary.shape == (16, 8, 8)
+    assert float(summary[0, 0, 0]) == pytest.approx(3 / math.sqrt(4 * math.pi), rel=1e-4)
+    assert summary[1:].abs().max() < 0.2
+    from_right = (rig[:, 0] > 0).float()[:, None, None].expand(-1, 4, 4)
+    assert reached_by(rig, from_right, 8)[3].min() > 0.3  # degree 1 along x
+
+
+def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
+    network = PortraitNetwork(TINY)
+    path = tmp_path / "portrait.safetensors"
+    save_networks(path, {"portrait": network}, {"layout_version": LAYOUT_VERSION})
+    again = load_networks(path, LAYOUT_VERSION)[0]["portrait"]
+    assert isinstance(again, PortraitNetwork) and again.settings == TINY
+    torch.testing.assert_close(again(inputs()).gain, network(inputs()).gain, atol=5e-3, rtol=5e-3)
+    for wrong in ({"widths": [8]}, {"side": 33}, {"classes": 1}, {"blocks": [0, 1, 99]}):
+        with pytest.raises(ValueError, match="settings"):
+            PortraitNetwork.from_metadata(network.as_metadata() | wrong)

@@ -1,0 +1,94 @@
+"""The proxy follows its fit and its hair, and casts the shadows of a head."""
+
+from functools import cache
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.proxy import Proxy, proxy_maps, proxy_of, square_camera, visibility
+from facerf_cli.raster.camera import pose_to_rotation
+
+SIDE = 96
+CROP = Crop(200.0, 200.0, 200.0, 256)
+SQUARE = Crop(100.0, 100.0, 400.0, SIDE)
+
+
+@cache
+def fit(wider: float = 0.0) -> FaceFit:
+    """A frontal face; `wider` is in standard deviations of the first shape of the identity."""
+    model = load_face_model("builtin")
+    alpha = torch.zeros(len(model.identity))
+    alpha[0] = wider
+    return FaceFit(
+        model.name,
+        CROP,
+        pose_to_rotation(0, 0, 0),
+        torch.tensor([0.0, 0.0, -1.0]),
+        alpha,
+        torch.zeros(len(model.expression)),
+        torch.zeros(68, 2),
+        0.0,
+    )
+
+
+def classes(hair_px: float = 0.0) -> Tensor:
+    """A square without hair, or with hair in a disc of a radius around the head's middle, in its pixels."""
+    at = torch.arange(SIDE) + 0.5
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    label = torch.where((x - 48) ** 2 + (y - 40) ** 2 < hair_px**2, class_index("hair"), 0)
+    return F.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
+
+
+def proxy(wider: float = 0.0, hair_px: float = 0.0) -> Proxy:
+    return proxy_of(load_face_model("builtin"), fit(wider), classes(hair_px), SQUARE)
+
+
+def test_its_maps_are_a_head_that_looks_at_the_camera() -> None:
+    maps = proxy_maps(proxy(), square_camera(fit(), SQUARE))
+    torch.testing.assert_close(maps.normals.norm(dim=0), torch.ones(SIDE, SIDE))
+    assert 0.1 < maps.covered.mean() < 0.9 and maps.covered[48, 48] == 1
+    assert maps.normals[2, 40, 48] > 0.7  # forehead
+    z = maps.positions_m[2]
+    assert z[44:54, 46:51].max() > z[40, 48]  # the nose stands out
+    assert maps.normals[0, 46, 56:62].min() > 0 > maps.normals[0, 46, 34:40].max()
+
+
+def test_it_follows_the_fitted_face() -> None:
+    """Vertices on the face move as the face does, those of the body by its scale alone."""
+    model = load_face_model("builtin")
+    plain, other = proxy(), proxy(2.0)
+    faces = [f.vertices_camera(model) for f in (fit(), fit(2.0))]
+    tip = int(faces[0][:, 2].argmax())
+    near = int((plain.vertices - faces[0][tip]).norm(dim=1).argmin())
+    moved, wanted = other.vertices[near] - plain.vertices[near], faces[1][tip] - faces[0][tip]
+    assert float((moved - wanted).norm()) < 0.002
+
+
+def test_hair_pushes_the_scalp_to_its_outline() -> None:
+    camera = square_camera(fit(), SQUARE)
+    bald, hairy = (proxy_maps(proxy(hair_px=px), camera).covered for px in (0.0, 40.0))
+    top_of = [int(np.flatnonzero(covered[:, 48].numpy()).min()) for covered in (bald, hairy)]
+    assert top_of[1] < top_of[0] - 3 and top_of[1] >= 40 - 40 - 1
+    assert torch.equal(bald[80:, 48], hairy[80:, 48])
+
+
+def test_heads_cast_shadows() -> None:
+    camera = square_camera(fit(), SQUARE)
+    lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
+    maps = proxy_maps(proxy(), camera)
+    visible = visibility(proxy(), camera, lights)
+    assert visible.shape == (3, SIDE, SIDE) and visible.min() >= 0 and visible.max() <= 1
+    face = (maps.covered > 0) & (torch.arange(SIDE)[:, None] > 36) & (torch.arange(SIDE)[:, None] < 60)
+    left = face & (torch.arange(SIDE) < 44) & (torch.arange(SIDE) > 34)
+    right = face & (torch.arange(SIDE) > 52) & (torch.arange(SIDE) < 62)
+    assert visible[0][right].mean() > 0.8 and visible[0][left].mean() < 0.3
+    assert visible[1][face].mean() > 0.9
+    neck = slice(66, 72), slice(44, 52)
+    assert visible[2][neck].mean() < 0.3 < visible[1][neck].mean()

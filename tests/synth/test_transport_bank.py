@@ -1,0 +1,144 @@
+"""People of the portrait bank: baked once, seen as users' photos are, and lit by any light."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from facerf_cli.errors import InputError
+from facerf_cli.light.sh import sh_basis
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.portrait import SKIN
+from facerf_cli.portrait.square import SIDE_PX
+from facerf_cli.synth import transport_bank
+from facerf_cli.synth.portrait_samples import PortraitSample, StoredTransport
+from facerf_cli.synth.portraits import albedo_of, images_under
+from facerf_cli.synth.transport_bank import (
+    StoredView,
+    TransportBankSettings,
+    add_transport,
+    load_view,
+    seen_in,
+    seen_path,
+    transport_of,
+)
+
+SMALL = TransportBankSettings(views=2, looks=2, lights=14)
+
+
+def backgrounds() -> Tensor:
+    random = torch.Generator().manual_seed(0)
+    return (60 + 100 * torch.rand(2, 3, 32, 32, generator=random)).byte()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bank of one person."""
+    path = tmp_path_factory.mktemp("transport")
+    for view, tensors in enumerate(transport_of("builtin", 1, 3, SMALL)):
+        save_file(tensors, path / f"00001_{view}.safetensors")
+    for stored in sorted(path.iterdir()):
+        save_file(seen_in(load_view(stored), backgrounds(), 0), seen_path(stored))
+    return path
+
+
+@pytest.fixture(scope="module")
+def view(folder: Path) -> StoredView:
+    return load_view(folder / "00001_0.safetensors")
+
+
+def drawn(folder: Path, seed: int) -> PortraitSample:
+    stored = StoredTransport(folder, backgrounds(), {"licence": "MIT"})
+    return stored.draw([0], 3, torch.Generator().manual_seed(seed))
+
+
+def test_images_are_linear_in_light(view: StoredView) -> None:
+    """But for the highlights of weak lights, of which only the brightest twelve are kept."""
+    single = torch.eye(14)[:, :, None].expand(-1, -1, 3)
+    weights = torch.zeros(1, 14, 3)
+    weights[0, [2, 7]] = torch.tensor([[1.0, 0.5, 0.2], [0.3, 0.3, 2.0]])
+    images = images_under(view.portrait, view.looks[0], torch.cat([single, weights]))
+    summed = torch.einsum("lc,lcij->cij", weights[0], images[:14])
+    torch.testing.assert_close(images[14], summed, rtol=1e-3, atol=1e-4)
+
+
+def test_looks_differ_and_albedo_is_theirs(view: StoredView) -> None:
+    (first, normals), (second, again) = (albedo_of(view.portrait, look) for look in view.looks)
+    assert (first - second).abs().mean() > 0.01 and torch.equal(normals, again)
+    assert first.min() >= 0 and first.max() < 1
+    assert first[:, view.alpha == 0].max() < 0.05  # alpha is in 256 steps
+
+
+def test_the_square_shows_head_and_shoulders(view: StoredView) -> None:
+    landmarks = view.portrait.landmarks_px[:68]
+    extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
+    assert SIDE_PX / 3.8 < extent < SIDE_PX / 2.4
+    assert 0.15 < view.alpha.mean() < 0.9
+
+
+def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
+    seen = load_file(seen_path(folder / "00001_0.safetensors"))
+    person = 1 - seen["classes"][0].float() / 255
+    both = torch.minimum(person, view.alpha).sum() / torch.maximum(person, view.alpha).sum()
+    assert both > 0.7
+    assert seen["visible"].shape == (14, SIDE_PX // 2, SIDE_PX // 2)
+    _, normals = albedo_of(view.portrait, view.looks[0])
+    skin = seen["classes"][SKIN] > 230
+    alike = (F.normalize(normals, dim=0) * seen["normals"].float()).sum(0)[skin]
+    assert alike.mean() > 0.8
+
+
+def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
+    sample = drawn(folder, 1)
+    assert sample.targets.shape == (1, 3, 3, SIDE_PX, SIDE_PX)
+    for image in (sample.image, sample.albedo):
+        skin = sample.classes[:, SKIN]
+        mean = (image.mean(1) * skin).sum() / skin.sum()
+        assert float(mean) == pytest.approx(MEAN_RADIANCE, rel=1e-3)
+    small = F.avg_pool2d(sample.own, 8), F.avg_pool2d(sample.image, 8)
+    covered = F.avg_pool2d(1 - sample.shares[:, :1], 8)[0, 0] > 0.99
+    dark, light = (x.mean(1)[0][covered] for x in small)
+    assert float(torch.corrcoef(torch.stack([dark, light]))[0, 1]) > 0.8
+
+
+def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
+    """Normals, lights, shadows and their summary are mirrored alike."""
+    from facerf_cli.synth.portrait_samples import mirrored
+
+    sample = drawn(folder, 2)
+    other = mirrored(sample)
+    cosine, flipped = (torch.einsum("btc,bcij->btij", s.lights, s.normals) for s in (sample, other))
+    torch.testing.assert_close(flipped, cosine.flip(-1))
+    assert torch.equal(other.targets, sample.targets.flip(-1))
+    assert torch.equal(other.visible, sample.visible.flip(-1))
+
+    def towards(one: PortraitSample) -> Tensor:
+        """Visibility toward the image's upper right, or in the mirror its upper left."""
+        sign = 1.0 if one is sample else -1.0
+        at = F.normalize(torch.tensor([sign * 0.6, 0.5, 0.6]), dim=0)
+        return torch.einsum("k,bkij->bij", sh_basis(at, 3), one.reached)
+
+    torch.testing.assert_close(towards(other), towards(sample).flip(-1), rtol=1e-4, atol=1e-5)
+    assert torch.equal(mirrored(other).image, sample.image)
+
+
+def test_a_bank_without_portraits(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no portraits"):
+        StoredTransport(tmp_path, backgrounds(), {})
+
+
+def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+
+    def draw(model: str, index: int, seed: int, settings: TransportBankSettings) -> list[dict[str, Tensor]]:
+        made.append(index)
+        return [{"of": torch.tensor([index])}] * settings.views
+
+    monkeypatch.setattr(transport_bank, "transport_of", draw)
+    monkeypatch.setattr(transport_bank, "in_shards", lambda work, items, jobs: work(items))
+    add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
+    add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
+    assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6

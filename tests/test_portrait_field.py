@@ -1,0 +1,121 @@
+"""The portrait field of a photo: its own light gives the photo back, and the whole person is relit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.composite import Target
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.head import Head
+from facerf_cli.field import own_light
+from facerf_cli.files.images import read_image
+from facerf_cli.light.sphere import RigLight, azel_to_direction
+from facerf_cli.models import Models, load_models
+from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait_field import PortraitField, portrait_network
+
+PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
+
+
+@pytest.fixture(scope="module")
+def models() -> Models:
+    return load_models(None, "builtin", torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def photo() -> np.ndarray:
+    return read_image(PHOTO).pixels
+
+
+@pytest.fixture(scope="module")
+def head(models: Models, photo: np.ndarray) -> Head:
+    return fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px, models.sides(128))
+
+
+@pytest.fixture(scope="module")
+def field(models: Models, photo: np.ndarray, head: Head) -> PortraitField:
+    found = reflectance_of(models, head, "portrait", photo=photo)
+    assert isinstance(found, PortraitField)
+    return found
+
+
+def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
+    return RigLight(azel_to_direction(azimuth_deg, elevation_deg)[None], torch.ones(1, 3))
+
+
+def test_under_its_own_light_the_photo_comes_back(
+    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+) -> None:
+    own = own_light(models, head.face).light
+    image = relight(models, photo, head, own, reflectance=field).pixels
+    inside = field.person.segmentation.matte > 0.9
+    error = ((image - photo)[inside] ** 2).mean()
+    assert 10 * np.log10(1 / error) > 35
+    alone = reflectance_of(models, head, "portrait", network_alone=True, photo=photo)
+    assert isinstance(alone, PortraitField) and alone.correction is None
+
+
+def test_a_lamp_lights_the_side_that_it_is_on(
+    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+) -> None:
+    """Hair, neck and garment, too: halves of the person beside the head's middle."""
+    target = Target(background="none")
+    right, left = (
+        relight(models, photo, head, lamp(azimuth), target, field).pixels.mean(-1) for azimuth in (75, -75)
+    )
+    matte = field.person.segmentation.matte > 0.5
+    columns = np.arange(photo.shape[1])
+    middle = field.person.square.x0_px + field.person.square.side_px / 2
+    hair = field.person.segmentation.layer("hair") > 0.5
+    for region in (matte, hair):
+        on_right = region & (columns > middle + 15)
+        on_left = region & (columns < middle - 15)
+        assert right[on_right].mean() > 1.3 * left[on_right].mean()
+        assert left[on_left].mean() > 1.3 * right[on_left].mean()
+
+
+def test_a_lamp_behind_leaves_the_face_dark(
+    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+) -> None:
+    target = Target(background="none")
+    behind, ahead = (
+        relight(models, photo, head, lamp(azimuth, 10), target, field).pixels for azimuth in (180, 0)
+    )
+    skin = field.person.segmentation.layer("skin") > 0.9
+    assert behind[skin].mean() < 0.15 * ahead[skin].mean()
+
+
+def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
+    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+) -> None:
+    light = lamp(40, 30)
+    composition = composition_of(models, photo, head, field)
+    relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
+    names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
+    layers = composition.layers(names, relit)
+    assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
+    for name, layer in layers.items():
+        assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
+        assert name in ("normal", "position") or layer.min() >= -0.01  # the correction may darken a highlight
+    assert composition.image(relit).pixels.min() >= -0.01
+    face_alone = composition_of(models, None, head, field)
+    with pytest.raises(UsageError, match="--aov albedo"):
+        face_alone.layers(("albedo",), relit)
+
+
+def test_a_turned_head_is_the_fields(models: Models, head: Head, field: PortraitField) -> None:
+    light, turn = lamp(20), torch.eye(3)
+    turned = field.relit(light.directions, light.weights[None], turn)
+    torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
+    as_seen = field.relit(light.directions, light.weights[None])
+    assert (as_seen - turned).abs().mean() > 1e-3
+
+
+def test_no_portrait_network(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such checkpoint"):
+        portrait_network(tmp_path / "none.safetensors")
+    with pytest.raises(InputError, match="--stage portrait"):
+        portrait_network(Path(__file__).parents[1] / "facerf_cli/assets/parsing.safetensors")

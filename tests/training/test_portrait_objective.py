@@ -1,0 +1,158 @@
+"""The terms of the stage portrait against known answers."""
+
+from dataclasses import replace
+from typing import Any, cast
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.synth.portrait_samples import PortraitSample, StoredTransport
+from facerf_cli.training.portrait_objective import PortraitObjective, PortraitObjectiveSettings
+
+SIDE, RIG = 16, rig_directions(12)
+SETTINGS = PortraitObjectiveSettings(held_out_people=1, held_out_draws=1, targets=2)
+NORMAL = F.normalize(torch.tensor([0.2, 0.1, 1.0]), dim=0)
+
+
+def whole(value: Tensor | float, channels: int = 3, side: int = SIDE) -> Tensor:
+    values = torch.as_tensor(value, dtype=torch.float32).reshape(-1)
+    return values.expand(channels).view(1, channels, 1, 1).expand(1, channels, side, side).clone()
+
+
+def perfect() -> PortraitMaps:
+    """The maps of a matt wall of albedo 0.4, all of skin."""
+    few, many = whole(0, 16, SIDE // 2), whole(0, 25, SIDE // 2)
+    return PortraitMaps(
+        gain=whole(1),
+        bias=whole(0),
+        albedo=whole(0.4),
+        normals=whole(NORMAL),
+        strands=whole(NORMAL),
+        gloss=whole(0),
+        trust=whole(60, 1),
+        lit=few,
+        around=few,
+        shadow=many,
+    )
+
+
+def truth() -> PortraitSample:
+    lights = F.normalize(torch.tensor([[[0.0, 0, 1], [1, 0, 1]]]), dim=-1)
+    cosines = (lights[0] @ NORMAL).clamp_min(0)
+    weights = torch.linspace(0, 0.3, 12)[None, :, None].expand(-1, -1, 3)
+    own = 0.4 * float(((RIG @ NORMAL).clamp_min(0) * weights[0, :, 0]).sum())
+    shares = torch.zeros(1, 14, SIDE, SIDE)
+    shares[:, class_index("skin"), :, : SIDE // 2] = 1
+    shares[:, 0, :, SIDE // 2 :] = 1  # the right half is background
+    targets = 0.4 * cosines.view(1, 2, 1, 1, 1).expand(1, 2, 3, SIDE, SIDE)
+    return PortraitSample(
+        image=whole(own),
+        classes=shares,
+        normals=whole(NORMAL),
+        depth=whole(0, 1),
+        covered=whole(1, 1),
+        reached=whole(0, 16),
+        own_shading=whole(1, 1),
+        lights=lights,
+        visible=torch.ones(1, 2, SIDE // 2, SIDE // 2),
+        targets=targets,
+        rig=RIG[None],
+        rig_visible=torch.ones(1, 12, SIDE // 2, SIDE // 2),
+        weights=weights,
+        own=whole(own),
+        albedo=whole(0.4),
+        true_normals=whole(NORMAL),
+        shares=shares,
+    )
+
+
+class Answer(nn.Module):
+    """A network that gives one answer."""
+
+    def __init__(self, answer: PortraitMaps) -> None:
+        super().__init__()
+        self.answer = answer
+        self.weight = nn.Parameter(torch.zeros(1))
+
+    def forward(self, inputs: PortraitInputs) -> PortraitMaps:
+        return self.answer
+
+
+class Portraits:
+    """A bank of one fixed sample."""
+
+    provenance: dict[str, Any] = {"licence": "MIT"}  # noqa: RUF012
+
+    def people(self, held_out: int) -> tuple[list[int], list[int]]:
+        return [1], [0]
+
+    def draw(self, people: list[int], targets: int, generator: torch.Generator) -> PortraitSample:
+        return truth()
+
+
+def objective(answer: PortraitMaps) -> PortraitObjective:
+    portraits = cast(StoredTransport, Portraits())
+    return PortraitObjective(portraits, cast(PortraitNetwork, Answer(answer)), SETTINGS)
+
+
+def terms(answer: PortraitMaps, sample: PortraitSample | None = None) -> dict[str, float]:
+    return {name: float(term) for name, term in objective(answer)(sample or truth()).items()}
+
+
+def test_a_perfect_network_pays_nothing() -> None:
+    assert max(terms(perfect()).values()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "dearer"),
+    [
+        ({"albedo": whole(torch.tensor([0.6, 0.4, 0.2]))}, {"lights", "own", "albedo"}),
+        (
+            {"normals": whole(F.normalize(torch.tensor([-0.8, 0.1, 1.0]), dim=0))},
+            {"lights", "own", "normals"},
+        ),
+        ({"around": whole(0.5, 16, SIDE // 2)}, {"lights", "own"}),
+        ({"gloss": whole(0.3)}, {"lights", "own"}),
+    ],
+)
+def test_each_term_sees_its_own_faults(change: dict[str, Tensor], dearer: set[str]) -> None:
+    found = terms(perfect()._replace(**change))
+    assert min(found[name] for name in dearer) > 3e-3
+    assert (found["normals"] > 1e-4) == ("normals" in dearer)  # the others share the forgiven exposure
+
+
+def test_exposure_is_forgiven_but_for_its_own_term() -> None:
+    found = terms(perfect()._replace(albedo=whole(0.8)))
+    assert max(found[name] for name in ("lights", "edges", "own", "albedo")) < 1e-4
+    assert found["scale"] == pytest.approx(SETTINGS.scale * 0.6931, rel=1e-3)
+
+
+def test_the_background_counts_nothing() -> None:
+    wrong = perfect().albedo.clone()
+    wrong[..., SIDE // 2 + 4 :] = 3.0  # beyond the pixels that are averaged with the person's
+    assert max(terms(perfect()._replace(albedo=wrong)).values()) < 1e-4
+
+
+def test_edges_are_those_of_the_error() -> None:
+    stripes = perfect().albedo.clone()
+    stripes[..., ::2] *= 1.5
+    smooth, striped = (terms(perfect()._replace(albedo=a)) for a in (whole(0.5), stripes))
+    assert smooth["edges"] < 1e-4 < 0.01 < striped["edges"]
+
+
+def test_validation_is_by_region() -> None:
+    right = objective(perfect()).validate()
+    assert right.metrics["face"] < 1e-6 and right.metrics["error"] < 1e-4 and right.sheet is not None
+    wrong = objective(perfect()._replace(normals=whole(torch.tensor([0.0, 1.0, 0.0])))).validate()
+    assert wrong.metrics["face"] > 0.05 and wrong.metrics["error"] > 0.01
+
+
+def test_a_sample_moves_as_one() -> None:
+    sample = replace(truth(), image=whole(0.1))
+    moved = sample.to(torch.device("cpu"))
+    assert torch.equal(moved.inputs.image, sample.image) and torch.equal(moved.inputs.own, sample.own_shading)
