@@ -35,8 +35,8 @@ ReflectanceOption = Annotated[
     typer.Option(
         "--reflectance",
         metavar="KIND",
-        help="Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and the "
-        "others are compared with the first.",
+        help="Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and "
+        "the others are compared with the first.",
         show_default="field; of yale-b portrait",
     ),
 ]

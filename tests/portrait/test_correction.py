@@ -1,0 +1,68 @@
+"""The correction of a portrait's lights by its photo."""
+
+import torch
+from torch import Tensor
+
+from facerf_cli.portrait.correction import Correction
+
+SIDE = 64
+
+
+def olats() -> Tensor:
+    """Images [3, 3, S, S] of three lights: two alike from the right, and one from the left."""
+    across = torch.linspace(0, 1, SIDE).expand(SIDE, SIDE)
+    shades = torch.stack([0.1 + across, 0.12 + 0.9 * across, (1 - across) ** 4])
+    return shades[:, None] * torch.tensor([0.8, 0.6, 0.5]).view(1, 3, 1, 1)
+
+
+def photo_under(weights: Tensor) -> Tensor:
+    """The true photo: what the model explains, and a mark that it does not know."""
+    photo = torch.einsum("lc,lcij->cij", weights, olats())
+    photo[:, 20:30, 20:40] *= 0.6
+    return photo
+
+
+WEIGHTS = torch.tensor([[0.7, 0.6, 0.5], [0.3, 0.4, 0.5], [0.0, 0.0, 0.0]])
+PERSON = torch.ones(SIDE, SIDE)
+
+
+def corrected(correction: Correction) -> Tensor:
+    factor, added = correction.terms(olats())
+    return olats() * factor + added
+
+
+def test_the_photos_light_gives_the_photo_back() -> None:
+    photo = photo_under(WEIGHTS)
+    correction = Correction.of(photo, olats(), WEIGHTS, PERSON)
+    found = torch.einsum("lc,lcij->cij", WEIGHTS, corrected(correction))
+    torch.testing.assert_close(found, photo, rtol=2e-3, atol=1e-4)
+    plain = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
+    assert (plain - photo).abs().max() > 0.1
+
+
+def test_lights_that_shade_alike_are_corrected_alike_and_others_hardly() -> None:
+    photo = photo_under(WEIGHTS)
+    marked = (slice(None), slice(22, 28), slice(24, 36))
+    change = (corrected(Correction.of(photo, olats(), WEIGHTS, PERSON)) / olats())[(slice(None), *marked)]
+    first, second, other = change.mean((1, 2, 3))
+    assert 0.55 < first < 0.75 and 0.55 < second < 0.75
+    assert 0.97 < other < 1.03
+
+
+def test_an_explanation_that_is_right_changes_nothing() -> None:
+    photo = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
+    torch.testing.assert_close(corrected(Correction.of(photo, olats(), WEIGHTS, PERSON)), olats())
+
+
+def test_off_the_person_nothing_is_changed() -> None:
+    person = PERSON.clone()
+    person[:, :32] = 0
+    correction = Correction.of(photo_under(WEIGHTS), olats(), WEIGHTS, person)
+    torch.testing.assert_close(corrected(correction)[..., :32], olats()[..., :32])
+
+
+def test_no_light_becomes_negative() -> None:
+    photo = photo_under(WEIGHTS)
+    photo[:, 20:30, 20:40] = 0
+    factor, _ = Correction.of(photo, olats(), WEIGHTS, PERSON).terms(olats())
+    assert factor.min() >= 0
