@@ -111,9 +111,8 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
             for region in REGIONS:
                 error, power = squared[light, kind, region]
                 parts.append(f"{region} {error / max(power, 1e-9):.3f}")
-            print(
-                f"{light:8} {kind:9} relative error: {'  '.join(parts)}   SSIM {np.mean(ssim[light, kind]):.3f}"
-            )
+            errors, similar = "  ".join(parts), np.mean(ssim[light, kind])
+            print(f"{light:8} {kind:9} relative error: {errors}   SSIM {similar:.3f}")
     if sheet and rows:
         write_display(sheet, np.concatenate(rows, 0), 1.0)
 

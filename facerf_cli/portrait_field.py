@@ -2,7 +2,7 @@
 
 Fixed maps of the Portrait Network and the shadows of a proxy give an image of the whole person under any
 single light (`network/portrait.py`). In the face, where the neural reflectance field sees more detail, both
-are averaged. As the field's, the maps are corrected by the photo's quotient, so that its own light gives the
+are mixed. As the field's, the maps are corrected by the photo's quotient, so that its own light gives the
 photo back.
 """
 
@@ -33,8 +33,9 @@ from facerf_cli.raster.texture import bake_attributes
 SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
-_SHARE = 0.5  # of the portrait field in the face
+_SHARE = 0.25  # of the portrait field in the face, where the other one is finer
 _PROXY_NORMALS = 1.0  # weight of the proxy's normals on face and neck; that of the network's is 1
+_HAIRLINE_PX = 4  # of the square, in which the network's normals are kept
 _SKIN = class_index("skin")
 _FACE = [class_index(name) for name in ("skin", "brows", "eyes", "lips", "mouth", "beard", "neck")]
 
@@ -154,8 +155,9 @@ def _steadied(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:
 
     Where the network is unsure of a shape it predicts the mean of several, which is flatter than each.
     """
-    covered = person.maps.covered * person.classes[_FACE].sum(0)
-    normals = F.normalize(maps.normals + _PROXY_NORMALS * covered * person.maps.normals, dim=1)
+    face = person.maps.covered * person.classes[_FACE].sum(0)
+    inside = -F.max_pool2d(-face[None], 2 * _HAIRLINE_PX + 1, stride=1, padding=_HAIRLINE_PX)[0]
+    normals = F.normalize(maps.normals + _PROXY_NORMALS * inside * person.maps.normals, dim=1)
     return maps._replace(normals=normals)
 
 

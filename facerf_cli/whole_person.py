@@ -14,6 +14,7 @@ from torch import Tensor
 
 from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.face.landmarks import to_display
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -24,6 +25,8 @@ _BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _FEATHER = 0.12  # border of the square where the change of light takes over, in halves of its side
 _CHANGE_PX, _DARK = 5.0, 1e-3  # of that change: its blur, and what keeps it finite, as a share of the photo
+_GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixels
+_STRAND_RANGE = (0.3, 3.0)  # of an albedo over that of the maps: strands of hair break up its highlights
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 
@@ -34,6 +37,8 @@ class WholePerson:
         self.matte = field.person.segmentation.matte
         self._field, self._photo = field, photo
         self._own = (1 - field.person.classes[0] > _SURE).float()
+        hair = field.person.classes[[class_index("hair"), class_index("beard")]].sum(0, keepdim=True)
+        self._hair_maps = torch.cat([self._filled(field.maps.albedo[0].mean(0, keepdim=True)), hair])
         self._albedo_maps = torch.cat([self._gain_lines(), self._filled(field.maps.bias[0])])
 
     @property
@@ -44,10 +49,14 @@ class WholePerson:
     def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
         """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
         result = np.empty_like(photo)
-        maps = torch.cat([self._albedo_maps, self._filled(lit[:6]), self._change(lit)])
-        for rows, wide, inside in self._bands(maps):
-            shading, highlights, change = torch.split(wide[_ALBEDO_MAPS:], 3)
-            radiance = (self._albedo(photo[rows], wide) * shading + highlights) * self._field.exposure
+        highlights = _blurred(self._filled(lit[3:6]), _GLOSS_PX)
+        maps = [self._albedo_maps, self._filled(lit[:3]), highlights, self._change(lit), self._hair_maps]
+        for rows, wide, inside in self._bands(torch.cat(maps)):
+            shading, shine, change, hair = torch.split(wide[_ALBEDO_MAPS:], [3, 3, 3, 2])
+            albedo = self._albedo(photo[rows], wide)
+            finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
+            shine = shine * torch.lerp(torch.ones_like(finer), finer, hair[1])
+            radiance = (albedo * shading + shine) * self._field.exposure
             beyond = torch.from_numpy(photo[rows].clip(min=0)).permute(2, 0, 1) * change
             result[rows] = torch.lerp(beyond, radiance, inside).permute(1, 2, 0).numpy()
         return result
@@ -56,8 +65,8 @@ class WholePerson:
         """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
         own = self._field.person.image
         relit = (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
-        both = self._filled(torch.cat([relit, own])).numpy()
-        smooth = torch.from_numpy(gaussian_filter(both, (0, _CHANGE_PX, _CHANGE_PX), mode="nearest"))
+        both = self._filled(torch.cat([relit, own]))
+        smooth = _blurred(both, _CHANGE_PX)
         return smooth[:3] / (smooth[3:] + _DARK * own.mean())
 
     def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
@@ -139,3 +148,7 @@ class WholePerson:
             wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
             inside = ((1 - grid[0].abs().amax(-1)) / _FEATHER).clamp(0, 1)
             yield rows, wide[0], inside.float()
+
+
+def _blurred(maps: Tensor, sigma_px: float) -> Tensor:
+    return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma_px, sigma_px), mode="nearest"))

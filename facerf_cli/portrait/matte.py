@@ -9,6 +9,7 @@ from torch import Tensor
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
 _STRETCH = 0.2  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
+_COLOURS_PX = 1024  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
 _TINY = 1e-5
 
@@ -60,17 +61,33 @@ def person_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
     """The person's own colours [H, W, 3] where a matte [H, W] mixes them with the background's.
 
     Means of sure colours nearby, corrected by the mixture that the photo shows (Forte, *Approximate fast
-    foreground colour estimation*, 2021).
+    foreground colour estimation*, 2021). The means are those of a photo of at most `_COLOURS_PX`.
     """
-    person = background = photo
+    height, width = matte.shape
+    scale = min(1.0, _COLOURS_PX / max(matte.shape))
+    size = max(1, round(height * scale)), max(1, round(width * scale))
+    both = torch.from_numpy(np.dstack([photo, matte]).astype(np.float32)).permute(2, 0, 1)[None]
+    small = F.interpolate(both, size, mode="area")[0].permute(1, 2, 0).numpy()
+    seen, share = small[..., :3], small[..., 3]
+    person = background = seen
     for reach in _COLOUR_REACH:
-        size = max(3, 2 * round(reach * max(matte.shape)) + 1)
-        own = _weighted_mean(person, matte, size)
-        other = _weighted_mean(background, 1 - matte, size)
-        rest = photo - matte[..., None] * own - (1 - matte[..., None]) * other
-        person = (own + matte[..., None] * rest).clip(min=0)
-        background = other
+        span = max(3, 2 * round(reach * max(size)) + 1)
+        own = _weighted_mean(person, share, span)
+        background = _weighted_mean(background, 1 - share, span)
+        person = _unmixed(seen, share, own, background)
+    if scale < 1:
+        own, background = (
+            enlarged(x.transpose(2, 0, 1), matte.shape).transpose(1, 2, 0) for x in (own, background)
+        )
+        person = _unmixed(photo, matte, own, background)
     return np.where(matte[..., None] > 0, person, 0).astype(np.float32)
+
+
+def _unmixed(seen: np.ndarray, matte: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Own colours of mixtures [h, w, 3], from likely ones of the person and of the background."""
+    share = matte[..., None]
+    rest = seen - share * own - (1 - share) * other
+    return np.asarray((own + share * rest).clip(min=0))
 
 
 def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
