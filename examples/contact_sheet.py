@@ -2,8 +2,9 @@
 
     python examples/contact_sheet.py [PHOTO [MAPS [SHEET.jpg]]]
 
-Above: the photo, then the maps in the order of their names. Below: the maps' mirror balls in that order, then
-single lights from the picture's left, from its left above, from its right above, and from straight above.
+Above: the photo, then the maps in the order of their names, with their backgrounds. Below: the maps'
+mirror balls in that order, then single lights from the picture's left, from its left above, from its right
+above, and from straight above.
 """
 
 import sys
@@ -19,7 +20,7 @@ from facerf_cli.portrait.find import find_faces
 
 HERE = Path(__file__).parent
 LIGHTS = ("-75,0", "-35,25", "50,20", "0,60")
-CELL_PX, MARGIN = 360, 0.22  # the margin in sides of the face's crop
+CELL_PX, MARGIN = 360, 0.3  # the margin in sides of the face's crop
 
 
 def sheet(photo: Path, maps: Path) -> np.ndarray:
@@ -30,7 +31,21 @@ def sheet(photo: Path, maps: Path) -> np.ndarray:
     frame = head(original, photo)
     with tempfile.TemporaryDirectory() as folder:
         lights = [part for light in LIGHTS for part in ("--light", light)]
-        if main(["-q", "relight", str(photo), "--envmap", str(maps), "--ball", "-o", folder, *lights]):
+        if main(
+            [
+                "-q",
+                "relight",
+                str(photo),
+                "--envmap",
+                str(maps),
+                "--ball",
+                "--background",
+                "envmap",
+                "-o",
+                folder,
+                *lights,
+            ]
+        ):
             raise SystemExit(1)
         lit = [frame.apply(read_image(Path(folder, f"{photo.stem}_{shot}.png")).pixels) for shot in shots]
         balls = [read_image(Path(folder, "balls", f"{name}.png")).pixels for name in names]
