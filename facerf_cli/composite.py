@@ -140,7 +140,7 @@ class Composition:
         if self._photo is not None:
             matte = target.matte
             self._matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
-            self._own = self._photo if matte is None else person_colours(self._photo, self._matte)
+            self._own = self._photo if matte is None else _own_colours(self._photo, self._matte)
             self._detail = PhotoDetail(self._own, head.face, self.view)
             self.surround = person or Surround(vertices, crop, head.face.texture, *size_px)
 
@@ -157,7 +157,7 @@ class Composition:
             return RelitImage(person, self._matte)
         if behind is not None:
             return RelitImage(behind + matte * (person - behind))
-        behind = (self._photo - matte * self._own).clip(min=0) * np.float32(2.0**-ev)
+        behind = (self._photo - matte * self._own) * np.float32(2.0**-ev)
         return RelitImage(behind + matte * person)
 
     def _relit_person(self, relit: Relit) -> np.ndarray:
@@ -211,6 +211,13 @@ class Composition:
             chosen_ev, own_ev = (_auto_exposure_ev(texture, self._face.visible) for texture in textures)
         keeps = self._photo is not None and self._target.background == "photo"
         return chosen_ev - (own_ev if keeps else 0.0)
+
+
+def _own_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """The person's colours [H, W, 3], of which the photo's mixtures hold no more than they have."""
+    share = matte[..., None]
+    most = np.divide(photo, share, out=np.zeros_like(photo), where=share > 0)
+    return np.minimum(person_colours(photo, matte), most)
 
 
 def _auto_exposure_ev(texture: Tensor, visible: Tensor) -> float:

@@ -24,7 +24,7 @@ _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the squar
 _BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _FEATHER = 0.12  # border of the square where the change of light takes over, in halves of its side
-_CHANGE_PX, _DARK = 5.0, 1e-3  # of that change: its blur, and what keeps it finite, as a share of the photo
+_CHANGE_PX, _DARK = 14.0, 1e-3  # of that change: its blur, and what keeps it finite, as a share of the photo
 _GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixels
 _STRAND_RANGE = (0.3, 3.0)  # of an albedo over that of the maps: strands of hair break up its highlights
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
@@ -91,7 +91,7 @@ class WholePerson:
             return {name: self._masked(self._albedo_map())}
         person = self._field.person
         maps = {
-            "specular": lit[3:6] * self._field.exposure,
+            "specular": lit[3:6].clamp_min(0) * self._field.exposure,
             "shadow": lit[6:9],
             "normal": self._field.maps.normals[0],
             "position": person.maps.positions_m,

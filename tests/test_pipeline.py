@@ -91,7 +91,7 @@ def test_two_lights_apart_add_up_to_both_at_once(
     first = image(rgb * torch.tensor([[1.0], [0.0]]))
     second = image(rgb * torch.tensor([[0.0], [1.0]]))
     both = image(rgb)
-    assert np.abs(both).max() > 0.1 and both.min() >= 0
+    assert np.abs(both).max() > 0.1 and both.min() >= -1e-3  # the correction may darken a highlight
     # 24 bits of mantissa in sums of some ten terms; the bicubic undershoot, clamped at 0, adds the most
     np.testing.assert_allclose(first + second, both, atol=1e-3 * float(both.mean()), rtol=1e-3)
 

@@ -102,7 +102,7 @@ def test_bad_lines(folders: Path, capsys: Said) -> None:
         (["olat", "x", "-o", f"{good}/here", "--compare", good], f"lies in {good}, which is read"),
         (["pairs", good, "--truth", truth, "-o", out, "--lpips", "y"], "--vgg-weights"),
         (["pairs", good, "--truth", truth, "-o", out, "--preset", "paper"], "--preset"),
-        (["olat", "x", "-o", out, "--reflectance", "phong"], "give field, diffuse-sh"),
+        (["olat", "x", "-o", out, "--reflectance", "phong"], "give portrait, field, diffuse-sh"),
     ):
         assert main(["evaluate", *line]) == 2
         said = capsys.readouterr().err

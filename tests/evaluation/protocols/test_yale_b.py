@@ -14,6 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
+from facerf_cli import pipeline
 from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import Others
@@ -143,6 +144,7 @@ def small(tmp_path: Path) -> YaleB:
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
     monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(pipeline, "person_matte", lambda photo, head: np.ones(photo.shape[:2], np.float32))
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
