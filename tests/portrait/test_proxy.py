@@ -22,10 +22,9 @@ SQUARE = Crop(100.0, 100.0, 400.0, SIDE)
 
 @cache
 def fit(wider: float = 0.0) -> FaceFit:
-    """A frontal face; `wider` is in standard deviations of the first shape of the identity."""
+    """A frontal face; `wider` is the size of a random departure from the mean, in standard deviations."""
     model = load_face_model("builtin")
-    alpha = torch.zeros(len(model.identity))
-    alpha[0] = wider
+    alpha = wider * torch.randn(len(model.identity), generator=torch.Generator().manual_seed(1))
     return FaceFit(
         model.name,
         CROP,
@@ -68,7 +67,7 @@ def test_it_follows_the_fitted_face() -> None:
     tip = int(faces[0][:, 2].argmax())
     near = int((plain.vertices - faces[0][tip]).norm(dim=1).argmin())
     moved, wanted = other.vertices[near] - plain.vertices[near], faces[1][tip] - faces[0][tip]
-    assert float((moved - wanted).norm()) < 0.002
+    assert float(wanted.norm()) > 0.002 and float((moved - wanted).norm()) < 0.3 * float(wanted.norm())
 
 
 def test_hair_pushes_the_scalp_to_its_outline() -> None:
