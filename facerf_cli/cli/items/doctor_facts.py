@@ -10,6 +10,7 @@ import OpenImageIO as oiio
 import platformdirs
 import torch
 
+from facerf_cli import portrait_field
 from facerf_cli.cli.doctor import MISSING
 from facerf_cli.cli.options import Settings, torch_device
 from facerf_cli.errors import FacerfError
@@ -19,7 +20,7 @@ from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.face.recognition import RECOGNITION_LICENCE
 from facerf_cli.models import DEFAULT_CHECKPOINT
 from facerf_cli.network.checkpoint import load_checkpoint
-from facerf_cli.portrait.parse import SHIPPED
+from facerf_cli.portrait import parse
 
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:
@@ -29,7 +30,8 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
         "assets": {
             "face model": _face_model(BUILTIN_PATH),
             "checkpoint": _checkpoint(settings.checkpoint or DEFAULT_CHECKPOINT),
-            "parsing": _checkpoint(SHIPPED),
+            "parsing": _of_people(parse.SHIPPED),
+            "portrait": _of_people(portrait_field.SHIPPED),
             "detector": {"licence": DETECTOR_LICENCE},
             "extra dlib": _extra_models(),
         },
@@ -67,6 +69,12 @@ def _checkpoint(path: Path) -> dict[str, Any]:
         return {"name": f"{MISSING}: {error}"}
     provenance = metadata.get("provenance", {})
     return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
+
+
+def _of_people(path: Path) -> dict[str, Any]:
+    """A network that was trained on whole synthetic people; its licence says whose shapes they have."""
+    found = _checkpoint(path)
+    return {name: value for name, value in found.items() if name in ("name", "licence", "size")}
 
 
 def _extra_models() -> dict[str, str]:
