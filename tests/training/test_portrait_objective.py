@@ -145,6 +145,14 @@ def test_edges_are_those_of_the_error() -> None:
     assert smooth["edges"] < 1e-4 < 0.01 < striped["edges"]
 
 
+def test_flat_images_of_what_is_not_flat_lack_contrast() -> None:
+    ramp = torch.linspace(0.2, 1.8, SIDE).view(1, 1, 1, SIDE, 1)
+    sample = truth()
+    uneven = replace(sample, targets=sample.targets * ramp)
+    assert terms(perfect(), uneven)["contrast"] > 0.03
+    assert terms(perfect()._replace(albedo=perfect().albedo * ramp[0]), uneven)["contrast"] < 1e-4
+
+
 def test_validation_is_by_region() -> None:
     right = objective(perfect()).validate()
     assert right.metrics["face"] < 1e-6 and right.metrics["error"] < 1e-4 and right.sheet is not None
