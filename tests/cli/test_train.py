@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,13 @@ from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
 from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.synth.transport_bank import (
+    TransportBankSettings,
+    load_view,
+    seen_in,
+    seen_path,
+    transport_of,
+)
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 
@@ -229,6 +237,26 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> No
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
     assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
+
+
+def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> None:
+    """One person, baked and seen, stands for five."""
+    bank, backgrounds = tmp_path / "bank", torch.full((2, 3, 16, 16), 90).byte()
+    (bank / "transport").mkdir(parents=True)
+    save_file({"backgrounds": backgrounds}, bank / "backgrounds.safetensors")
+    (baked,) = transport_of("builtin", 1, 3, TransportBankSettings(views=1, looks=1, lights=12))
+    for person in range(5):
+        path = bank / "transport" / f"{person:05}_0.safetensors"
+        save_file(baked, path)
+        seen = seen_path(bank / "transport" / "00000_0.safetensors")
+        if not seen.exists():
+            save_file(seen_in(load_view(path), backgrounds, 0), seen)
+        elif person:
+            shutil.copy(seen, seen_path(path))
+    line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--heads", "5"]
+    assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert list(networks) == ["portrait"] and "CC0" in metadata["licence"]
 
 
 def test_too_few_people_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
