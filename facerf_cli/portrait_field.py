@@ -109,6 +109,8 @@ class PortraitField:
         """The person under M sums, rgb weights [M, L, 3], of lights [L, 3]."""
         shading, highlights, reached = torch.zeros(3, len(weights), 3, *self.image.shape[1:]).unbind(0)
         used = weights.abs().sum((0, 2)) > 0
+        if not used.any():
+            return PortraitLight(shading, highlights, reached)
         for lights, some in zip(
             torch.split(directions[used], _LIGHTS_AT_ONCE),
             torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
