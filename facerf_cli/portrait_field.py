@@ -22,7 +22,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
 from facerf_cli.field import Field, OwnLight
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.checkpoint import load_networks
-from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork, skin_exposure
+from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson, look_at_person
@@ -63,12 +63,11 @@ class PortraitField:
     """The light transport of a person; a `Reflectance`, whose textures are those of the face."""
 
     person: SeenPerson
-    maps: PortraitMaps  # of one person; albedo in the units of `image`
-    image: Tensor  # [3, S, S] exposed
-    exposure: float  # radiance of the photo over that of `image`
+    maps: PortraitMaps  # of one person; albedo in the units of the network's input
+    exposure: float  # radiance of the photo over that of the maps in the photo's light
     field: Field
+    texels: Tensor  # [T, T, 2] of the face's texture, in the square, for grid_sample
     correction: Correction | None = None
-    texels: Tensor | None = None  # [T, T, 2] of the face's texture, in the square, for grid_sample
 
     @staticmethod
     @torch.no_grad()
@@ -78,11 +77,8 @@ class PortraitField:
         """Look at the person in a scene-linear photo [H, W, 3]; `own` is the photo's estimated light."""
         person = look_at_person(model, photo, head.fit)
         rig = rig_directions(_SUMMARY_LIGHTS)
-        inputs = person.inputs(rig, person.visibility(rig))
-        maps = _steadied(portrait_network()(inputs), person)
-        exposure = float(skin_exposure(person.image[None], person.classes[None]))
-        texels = _texels_in_square(model, head, person)
-        found = PortraitField(person, maps, inputs.image[0], exposure, field, None, texels)
+        maps = _steadied(portrait_network()(person.inputs(rig, person.visibility(rig))), person)
+        found = PortraitField(person, maps, person.exposure, field, _texels_in_square(model, head, person))
         return found if own is None else found._corrected(own)
 
     def _corrected(self, own: OwnLight) -> "PortraitField":
@@ -100,14 +96,15 @@ class PortraitField:
     def _shaded(self, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shading, highlights and the share that arrives [l, S, S] of single lights [l, 3]."""
         visible = self.person.visibility(lights)[None]
-        wide = F.interpolate(visible, size=self.image.shape[1:], mode="bilinear", align_corners=False)
+        wide = F.interpolate(visible, size=self.person.image.shape[1:], mode="bilinear", align_corners=False)
         shade, glow, arrives = self.maps.shaded(lights[None], wide)
         return shade[0], glow[0], arrives[0]
 
     @torch.no_grad()
     def lit(self, directions: Tensor, weights: Tensor) -> PortraitLight:
         """The person under M sums, rgb weights [M, L, 3], of lights [L, 3]."""
-        shading, highlights, reached = torch.zeros(3, len(weights), 3, *self.image.shape[1:]).unbind(0)
+        size = self.person.image.shape
+        shading, highlights, reached = torch.zeros(3, len(weights), *size).unbind(0)
         used = weights.abs().sum((0, 2)) > 0
         if not used.any():
             return PortraitLight(shading, highlights, reached)
@@ -132,8 +129,7 @@ class PortraitField:
         return textures if turn is not None else self.blended(textures, self.lit(directions, weights))
 
     def blended(self, textures: Tensor, lit: PortraitLight) -> Tensor:
-        """Textures [M, 3, T, T] of the neural field, averaged with the portrait's."""
-        assert self.texels is not None
+        """Textures [M, 3, T, T] of the neural field, mixed with the portrait's."""
         grid = self.texels[None]
 
         def sampled(maps: Tensor) -> Tensor:
@@ -141,15 +137,10 @@ class PortraitField:
                 maps, grid.expand(len(maps), -1, -1, -1), padding_mode="border", align_corners=False
             )
 
-        texture = self.field.face.texture[None] / self.input_exposure
+        texture = self.field.face.texture[None] / self.person.exposure
         albedo = texture * sampled(self.maps.gain) + sampled(self.maps.bias)
         own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * self.exposure
         return torch.lerp(textures, own, _SHARE)
-
-    @property
-    def input_exposure(self) -> float:
-        """Radiance of the photo over that of the network's input."""
-        return float(skin_exposure(self.person.image[None], self.person.classes[None]))
 
 
 def _steadied(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:

@@ -44,7 +44,7 @@ class WholePerson:
     @property
     def nbytes(self) -> int:
         """Size of one light's maps."""
-        return 3 * self._field.image.nbytes
+        return 3 * self._field.person.image.nbytes
 
     def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
         """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
@@ -64,18 +64,19 @@ class WholePerson:
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
         own = self._field.person.image
-        relit = (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
-        both = self._filled(torch.cat([relit, own]))
+        both = self._filled(torch.cat([self._relit(lit), own]))
         smooth = _blurred(both, _CHANGE_PX)
         return smooth[:3] / (smooth[3:] + _DARK * own.mean())
 
     def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
         """Exposures in EV that show the person well under the light of maps [9, S, S], and in the photo."""
-        field = self._field
-        relit = (field.maps.albedo[0] * lit[:3] + lit[3:6]) * field.exposure
-        own = self._own.numpy()
-        ev = [auto_exposure_ev(x.permute(1, 2, 0).numpy(), own) for x in (relit, field.person.image)]
-        return ev[0], ev[1]
+        own, images = self._own.numpy(), (self._relit(lit), self._field.person.image)
+        chosen_ev, own_ev = (auto_exposure_ev(image.permute(1, 2, 0).numpy(), own) for image in images)
+        return chosen_ev, own_ev
+
+    def _relit(self, lit: Tensor) -> Tensor:
+        """The person in the square [3, S, S], as coarse as the maps."""
+        return (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
 
     def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
         """A layer of an image under the light of maps [9, S, S], by the name or names that it has in a file.
@@ -120,7 +121,7 @@ class WholePerson:
         slopes, offset, bias = torch.split(wide[:_ALBEDO_MAPS], [9, 3, 3])
         log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
         log_gain = log_gain.clamp(self._range[0], self._range[1])
-        return pixels / self._field.input_exposure * log_gain.exp() + bias
+        return pixels / self._field.person.exposure * log_gain.exp() + bias
 
     def _gain_lines(self) -> Tensor:
         """Log of the gain as a linear function of the photo's colours: slopes and offsets [12, S, S]."""

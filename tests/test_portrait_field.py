@@ -108,7 +108,7 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
 
 def test_without_light_all_is_black(field: PortraitField) -> None:
     lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
-    assert lit.stacked.shape == (2, 9, *field.image.shape[1:]) and lit.stacked.abs().max() == 0
+    assert lit.stacked.shape == (2, 9, *field.person.image.shape[1:]) and lit.stacked.abs().max() == 0
 
 
 def test_a_turned_head_is_the_fields(models: Models, head: Head, field: PortraitField) -> None:

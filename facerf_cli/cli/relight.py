@@ -226,8 +226,8 @@ def relight(
     """Relight photos under environment maps and single lights.
 
     Each image is written as a scene-linear EXR, with the layer person.A (the matte) and those of --aov, and
-    as a PNG at --exposure. One prediction serves all maps and
-    rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the end.
+    as a PNG at --exposure. One prediction serves all maps and rotations of a photo. Frame numbers at the end
+    of a name (sky.0001.exr) stay at the end.
 
     An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
     the nearest of them.

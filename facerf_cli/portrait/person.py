@@ -1,6 +1,7 @@
 """A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -33,6 +34,11 @@ class SeenPerson:
     fit: FaceFit
     segmentation: Segmentation
 
+    @cached_property
+    def exposure(self) -> float:
+        """Radiance of the photo over that of the network's input."""
+        return float(skin_exposure(self.image[None], self.classes[None]))
+
     def visibility(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights [L, 3] that reaches the person, on `VISIBILITY_PX`."""
         square = Crop(self.square.x0_px, self.square.y0_px, self.square.side_px, VISIBILITY_PX)
@@ -41,7 +47,7 @@ class SeenPerson:
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible)
-        exposed = self.image[None] / skin_exposure(self.image[None], self.classes[None])
+        exposed = self.image[None] / self.exposure
         reached = reached_by(rig, visible, SIDE_PX)
         return PortraitInputs(exposed, self.classes[None], *surface_of(self.maps), reached[None], own[None])
 

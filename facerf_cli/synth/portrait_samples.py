@@ -24,6 +24,7 @@ from facerf_cli.synth.transport_bank import load_view, seen_path
 _LAMP_SHARE = 0.3  # of photos, lit by one lamp in near darkness
 _GREY = 0.2  # share of grey photos
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
+_EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
 
 
@@ -130,9 +131,6 @@ class StoredTransport:
         )
         batched = PortraitSample(*(getattr(sample, field.name)[None] for field in fields(sample)))
         return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
-
-
-_EMPTY_BYTES = 1000  # a file without tensors is smaller
 
 
 def _below(count: int, generator: torch.Generator) -> int:
