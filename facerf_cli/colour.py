@@ -9,6 +9,7 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 import OpenImageIO as oiio
@@ -32,6 +33,9 @@ _BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
 _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
+ExposureRule = Literal["auto", "face"]
+_FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
+_BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 
 
@@ -212,7 +216,39 @@ def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> floa
 
     linear is [H, W, 3]. Only pixels where `mask` [H, W] exceeds one half count. A black image gives 0 EV.
     """
-    values = luminance(linear)
-    values = values.ravel() if mask is None else values[mask > 0.5]
-    high = float(np.percentile(values, AUTO_EXPOSURE_PERCENTILE)) if values.size else 0.0
-    return round(float(np.log2(AUTO_EXPOSURE_TARGET_LINEAR / high)), 2) if high > 1e-9 else 0.0
+    whole = np.ones(linear.shape[:2]) if mask is None else mask
+    high = _brighter_than(linear, whole, AUTO_EXPOSURE_PERCENTILE)
+    return round(float(np.log2(AUTO_EXPOSURE_TARGET_LINEAR / high)), 2) if high > _BLACK else 0.0
+
+
+def anchored_exposure_ev(
+    relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray | None = None
+) -> float:
+    """Return the exposure in EV, to two decimals, that leaves a face as bright in `relit` as in its plate.
+
+    Images [H, W, 3] and masks [H, W], of which what exceeds one half counts. As bright: by the luminance
+    that a tenth of the face exceeds, for a light from the side leaves much of it in shadow. So a dark skin
+    stays as dark beside a light one as it was. No more than lets the brightest hundredth of the person
+    exceed white, or the plate's own, by one EV, as in a light from behind. A black face gives 0 EV.
+    """
+    bright, wanted = (_brighter_than(image, face, _FACE_PERCENTILE) for image in (relit, plate))
+    if min(bright, wanted) <= _BLACK:
+        return 0.0
+    whole = face if person is None else person
+    most, own = (_brighter_than(image, whole, AUTO_EXPOSURE_PERCENTILE) for image in (relit, plate))
+    gain = min(wanted / bright, 2 * max(1.0, own) / max(most, _BLACK))
+    return round(float(np.log2(gain)), 2)
+
+
+def chosen_exposure_ev(
+    rule: ExposureRule, relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray
+) -> float:
+    """The exposure in EV by a rule: `auto`, anchored to the plate, or `face`, which shows the person well."""
+    if rule == "face":
+        return auto_exposure_ev(relit, person)
+    return anchored_exposure_ev(relit, plate, face, person)
+
+
+def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> float:
+    values = luminance(linear)[mask > 0.5]
+    return float(np.percentile(values, percentile)) if values.size else 0.0

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
@@ -107,8 +107,8 @@ class PersonAround(AroundFace, Protocol):
     def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
         """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
 
-    def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
-        """Exposures that show the person well under a light, and in the photo."""
+    def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
+        """The exposure of the person under a light, by a rule."""
 
 
 class Composition:
@@ -202,15 +202,14 @@ class Composition:
         }[name]
         return {name: view.full(values)}
 
-    def auto_exposure_ev(self, relit: Relit) -> float:
-        """The exposure that shows the lit person well; before the photo's background, as bright as it was."""
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure in EV of a relit head, by a rule."""
         if self._person is not None and relit.surround is not None:
-            chosen_ev, own_ev = self._person.auto_exposures_ev(relit.surround)
-        else:
-            textures = relit.texture, self._face.texture
-            chosen_ev, own_ev = (_auto_exposure_ev(texture, self._face.visible) for texture in textures)
-        keeps = self._photo is not None and self._target.background == "photo"
-        return chosen_ev - (own_ev if keeps else 0.0)
+            return self._person.exposure_ev(relit.surround, rule)
+        textures = relit.texture, self._face.texture
+        lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
+        seen = self._face.visible.numpy()
+        return chosen_exposure_ev(rule, lit, plate, seen, seen)
 
 
 def _own_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
@@ -218,10 +217,6 @@ def _own_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
     share = matte[..., None]
     most = np.divide(photo, share, out=np.zeros_like(photo), where=share > 0)
     return np.minimum(person_colours(photo, matte), most)
-
-
-def _auto_exposure_ev(texture: Tensor, visible: Tensor) -> float:
-    return auto_exposure_ev(texture.permute(1, 2, 0).numpy(), visible.numpy())
 
 
 class PhotoDetail:

@@ -52,7 +52,7 @@ VERBS: tuple[Callable[..., Any], ...] = (
 GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
 # Global options, which are moved before the verb wherever they stand.
-FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version"})
+FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version", "-0", "--null"})
 VALUED = frozenset({"--device", "--checkpoint", "--seed"})
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
@@ -88,6 +88,10 @@ def _global_options(
         ),
     ] = Settings.checkpoint,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = Settings.seed,
+    null: Annotated[
+        bool,
+        typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0."),
+    ] = Settings.null_separated,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -96,7 +100,7 @@ def _global_options(
         raise UsageError("-v and -q: contradict each other; leave one out")
     verbosity = int(verbose) - int(quiet)
     configure_logging(verbosity, log_json)
-    context.obj = Settings(verbosity, log_json, device, checkpoint, seed)
+    context.obj = Settings(verbosity, log_json, device, checkpoint, seed, null)
 
 
 for _verb in VERBS:

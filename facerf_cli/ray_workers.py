@@ -48,7 +48,6 @@ def in_ray(
     jobs: int,
     gpus: int,
     broken: Callable[[T, Exception], R],
-    recover: Callable[[T], R | None],
 ) -> Generator[tuple[int, R]]:
     """Each item's number and result as they come; `jobs` tasks at a time, 0 for as many as there are CPUs.
 
@@ -72,8 +71,6 @@ def in_ray(
                 if isinstance(answer, _Answer):
                     answer.log()
                     yield number, answer.result
-                elif (found := recover(items[number])) is not None:
-                    yield number, found
                 elif attempt < _ATTEMPTS:
                     log.warning("a worker was lost; its item is tried again (%s)", answer)
                     waiting.appendleft((number, attempt + 1))

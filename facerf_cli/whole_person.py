@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
@@ -68,11 +68,12 @@ class WholePerson:
         smooth = _blurred(both, _CHANGE_PX)
         return smooth[:3] / (smooth[3:] + _DARK * own.mean())
 
-    def auto_exposures_ev(self, lit: Tensor) -> tuple[float, float]:
-        """Exposures in EV that show the person well under the light of maps [9, S, S], and in the photo."""
-        own, images = self._own.numpy(), (self._relit(lit), self._field.person.image)
-        chosen_ev, own_ev = (auto_exposure_ev(image.permute(1, 2, 0).numpy(), own) for image in images)
-        return chosen_ev, own_ev
+    def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
+        """The exposure in EV, by a rule, of the person under the light of maps [9, S, S]."""
+        images = self._relit(lit), self._field.person.image
+        relit, plate = (image.permute(1, 2, 0).numpy() for image in images)
+        skin = self._field.person.classes[class_index("skin")].numpy()
+        return chosen_exposure_ev(rule, relit, plate, skin, self._own.numpy())
 
     def _relit(self, lit: Tensor) -> Tensor:
         """The person in the square [3, S, S], as coarse as the maps."""

@@ -170,18 +170,16 @@ def spread(
     items: Sequence[T],
     workers: Workers,
     broken: Callable[[T, Exception], R],
-    recover: Callable[[T], R | None] = lambda item: None,
 ) -> Generator[R]:
     """Yield `work(item)` of each item in the items' order, computed by the workers.
 
-    `broken` gives the result of an item whose worker died while it had it. Before an item is tried again,
-    `recover` gives its result if the lost worker had finished it, else None. Workers log through this
-    process; Ctrl-C here ends them. An exception of `work` is raised here.
+    `broken` gives the result of an item whose worker died while it had it. Workers log through this process;
+    Ctrl-C here ends them. An exception of `work` is raised here.
     """
     if workers.ray is not None and items:
         from facerf_cli.ray_workers import in_ray
 
-        yield from in_order(in_ray(work, items, workers.ray, workers.jobs, workers.gpus, broken, recover))
+        yield from in_order(in_ray(work, items, workers.ray, workers.jobs, workers.gpus, broken))
     elif workers.jobs > 1 and len(items) > 1:
         yield from in_order(in_processes(work, items, workers.jobs, broken))
     else:

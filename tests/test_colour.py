@@ -116,3 +116,34 @@ def test_auto_exposure_uses_the_mask_and_leaves_black_alone() -> None:
     mask[:, :3] = 1
     assert ours.auto_exposure_ev(linear, mask) == pytest.approx(np.log2(0.8), abs=0.01)
     assert ours.auto_exposure_ev(linear * 0) == 0 and ours.auto_exposure_ev(linear, mask * 0) == 0
+
+
+def test_the_anchored_exposure_keeps_the_order_and_ratio_of_six_skins() -> None:
+    """Six plates in one light, relit by another: as dark beside each other as they were."""
+    random = np.random.default_rng(5)
+    first, second = random.uniform(0.2, 1, (2, 40, 30, 1))
+    face, ratios = np.zeros((40, 30)), []
+    face[10:30, 5:25] = 1
+    for albedo in (0.02, 0.05, 0.1, 0.2, 0.35, 0.6):
+        plate, relit = albedo * first.repeat(3, -1), 7 * albedo * second.repeat(3, -1)
+        shown = relit * 2 ** ours.anchored_exposure_ev(relit, plate, face)
+        tenth = [np.percentile(image[face > 0], 90) for image in (shown, plate)]
+        ratios.append(tenth[0] / tenth[1])
+    assert ratios == pytest.approx(np.ones(6), rel=0.005)  # exposures have two decimals
+
+
+def test_a_light_from_behind_burns_the_person_by_one_ev_at_most() -> None:
+    plate, relit = np.full((20, 20, 3), 0.3), np.full((20, 20, 3), 0.001)
+    relit[:, :2] = 1.0  # the rim
+    face, person = np.zeros((20, 20)), np.ones((20, 20))
+    face[:, 5:15] = 1
+    assert ours.anchored_exposure_ev(relit, plate, face, person) == 1.0
+    assert ours.anchored_exposure_ev(relit, plate, face) == pytest.approx(np.log2(300), abs=0.01)
+    assert ours.anchored_exposure_ev(relit, 10 * plate, face, person) == pytest.approx(np.log2(6), abs=0.01)
+    assert ours.anchored_exposure_ev(relit * 0, plate, face, person) == 0
+
+
+def test_rules_of_exposure() -> None:
+    plate, relit, mask = np.full((8, 8, 3), 0.1), np.full((8, 8, 3), 0.2), np.ones((8, 8))
+    assert ours.chosen_exposure_ev("auto", relit, plate, mask, mask) == -1.0
+    assert ours.chosen_exposure_ev("face", relit, plate, mask, mask) == 2.0

@@ -1,24 +1,28 @@
 """The contract of every verb that walks folders: what is read, skipped, written and reported.
 
-A verb passes two functions to `run_batch` (files) or `run_items` (other items):
-`outputs_of(item)` names the files of a finished item, and `process(item)` makes them. `process` raises
-`InputError` for a faulty item (the run continues); any other `FacerfError` concerns the whole run and ends
-it.
+A verb passes functions to `run_batch` (files) or `run_items` (other items): `outputs_of(item)` names the
+files of a finished item, `process(item)` makes them, and `recipes_of` says what else shapes them. `process`
+raises `InputError` for a faulty item (the run continues); any other `FacerfError` concerns the whole run and
+ends it.
 """
 
 import json
 import logging
+import shutil
 import sys
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.cli.options import Settings, Shard, workers_of
+from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
+from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line, one_line, unexpected
@@ -33,7 +37,7 @@ class BatchOptions:
     """The options of the contract, as the user gave them."""
 
     output: Path
-    overwrite: bool = False
+    overwrite: Overwrite = "changed"
     dry_run: bool = False
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
 
@@ -53,6 +57,7 @@ class _Result:
     item: Item
     seconds: float
     outcome: Outcome | None = None
+    made: Made | None = None
     error: str = ""
     trace: str = ""
     stops_the_run: FacerfError | None = None
@@ -65,12 +70,13 @@ def run_batch(
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
+    recipes_of: RecipesOf,
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
     prepare: Callable[[], object] | None = None,
 ) -> int:
     """Process the files that `inputs` name: `run_files` over `collect_items`."""
-    items = collect_items(inputs, options.output, suffixes)
-    return run_files(verb, items, process, outputs_of, options, settings, prepare)
+    items = collect_items(inputs, options.output, suffixes, null_separated=settings.null_separated)
+    return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
 
 
 def run_files(
@@ -80,10 +86,11 @@ def run_files(
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
+    recipes_of: RecipesOf,
     prepare: Callable[[], object] | None = None,
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
-    return run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare)
+    return run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
 
 
 def run_items(
@@ -94,50 +101,64 @@ def run_items(
     options: BatchOptions,
     settings: Settings,
     prepare: Callable[[], object] | None = None,
+    recipes_of: RecipesOf | None = None,
 ) -> int:
     """Process the items and return the exit code: 0 all done, 1 some failed.
 
-    With `--shard` only this process's share of them, which has a report of its own. `prepare` is called once,
-    before the first item, and not at all where everything is finished: it loads what `process` needs, so that
-    an error in that is reported once; in a dry run, too. With several workers `process` runs in other
-    processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be used.
+    An item is finished if its outputs exist and, with `recipes_of`, were made from the same input by the
+    same recipe. With `--shard` only this process's share of them, which has a report of its own. `prepare` is
+    called once, before the first item, and not at all where everything is finished: it loads what `process`
+    needs, so that an error in that is reported once; in a dry run, too. With several workers `process` runs
+    in other processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be
+    used.
     """
     items = settings.shard.share(items)
-    finished = [] if options.overwrite else [item for item in items if _is_finished(outputs_of(item))]
-    done = set(finished)
-    todo = [item for item in items if item not in done]
+    index = FolderIndex(options.output, verb, settings.shard, recipes_of) if recipes_of else None
+    reasons = {item: _why_again(item, outputs_of(item), options, index) for item in items}
+    todo = [item for item in items if reasons[item] is not None]
+    finished = [item for item in items if reasons[item] is None]
     if todo and prepare:
         prepare()
     if options.dry_run:
         return _list_what_would_be_done(todo, finished, outputs_of)
+    is_new = not options.output.exists()
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
-    if finished:
-        advice = "--overwrite makes them again, for example with other options"
-        log.info("%d of %d already finished (%s)", len(finished), len(items), advice)
-    recover = _Recover(outputs_of, options.overwrite)
+    if index:
+        index.open()
+    _say_what_is_skipped(reasons, options)
+    if index and index.edited:
+        kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
+        log.warning(kept, len(index.edited))
     failures = 0
     workers = workers_of(settings, options.jobs)
-    with closing(spread(_Work(process), todo, workers, _broken, recover)) as results:
+    with closing(spread(_Work(process, index is not None), todo, workers, _broken)) as results:
         for result in _with_progress(results, len(todo), verb, settings):
             if result.stops_the_run is not None:
                 raise result.stops_the_run
+            if index and result.made:
+                index.add(result.made, outputs_of(result.item))
             with report.open("a", encoding="utf-8") as stream:
                 stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
             failures += _print_result(result)
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
+    elif failures and is_new:
+        shutil.rmtree(options.output)
     return 1 if failures else 0
 
 
 def all_finished(
+    verb: str,
     items: Sequence[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
+    recipes_of: RecipesOf,
 ) -> bool:
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
+    index = FolderIndex(options.output, verb, settings.shard, recipes_of)
     share = settings.shard.share(items)
-    return not options.overwrite and all(_is_finished(outputs_of(item)) for item in share)
+    return all(_why_again(item, outputs_of(item), options, index) is None for item in share)
 
 
 def report_name(shard: Shard) -> str:
@@ -154,14 +175,17 @@ def sums_up(
     """True if a verb may now write what depends on all items.
 
     Without `--shard` always. A shard may when the items of all shards are finished, so the last one does; not
-    with `--overwrite`, since an earlier run's outputs look the same.
+    with `--overwrite always`, since an earlier run's outputs look the same.
     """
     if settings.shard.of == 1:
         return True
-    left = len(items) if options.overwrite else sum(not _is_finished(outputs_of(item)) for item in items)
+    always = options.overwrite == "always"
+    left = len(items) if always else sum(not _exist(outputs_of(item)) for item in items)
     if left:
-        state = "may be unfinished" if options.overwrite else f"({left}) are unfinished"
-        log.info("items %s, so there is no summary; a run without --shard and --overwrite writes it", state)
+        state = "may be unfinished" if always else f"({left}) are unfinished"
+        log.info(
+            "items %s, so there is no summary; a run without --shard and --overwrite always writes it", state
+        )
     return not left
 
 
@@ -172,8 +196,9 @@ class _OfFile:
     process: Callable[[Item], Outcome]
 
     def __call__(self, item: Item) -> Outcome:
-        if not item.input_path.exists():
-            raise InputError(f"{item.input_path}: no such file; check the path")
+        if not item.input_path.is_file():
+            state = "not a regular file" if item.input_path.exists() else "no such file"
+            raise InputError(f"{item.input_path}: {state}; check the path")
         return self.process(item)
 
 
@@ -182,6 +207,7 @@ class _Work:
     """Runs `process` on an item and returns a `_Result`, whatever happens."""
 
     process: Callable[[Item], Outcome]
+    indexed: bool
 
     def __call__(self, item: Item) -> _Result:
         start_s = time.perf_counter()
@@ -190,7 +216,10 @@ class _Work:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
-            return result(outcome=self.process(item))
+            read = read_row(item.input_path) if self.indexed and item.input_path.is_file() else None
+            outcome = self.process(item)
+            made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
+            return result(outcome=outcome, made=made)
         except InputError as error:
             return result(error=str(error), trace=traceback.format_exc())
         except FacerfError as error:
@@ -204,20 +233,30 @@ def _broken(item: Item, error: Exception) -> _Result:
     return _Result(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
 
 
-@dataclass(frozen=True)
-class _Recover:
-    """The result of an item that its lost worker had finished; None if it must be done again."""
+def _why_again(
+    item: Item, outputs: Sequence[Path], options: BatchOptions, index: FolderIndex | None
+) -> str | None:
+    """Say why an item must be made, None if it is finished; empty where it never was."""
+    if options.overwrite == "always":
+        return ""
+    if options.overwrite == "never" or index is None:
+        return None if _exist(outputs) else ""
+    return index.why_again(item.input_path, outputs)
 
-    outputs_of: Callable[[Item], Sequence[Path]]
-    overwrite: bool  # then an earlier run's outputs look like the lost worker's
 
-    def __call__(self, item: Item) -> _Result | None:
-        outputs = self.outputs_of(item)
-        return None if self.overwrite or not _is_finished(outputs) else _Result(item, 0.0, Outcome(outputs))
-
-
-def _is_finished(outputs: Sequence[Path]) -> bool:
+def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.exists() for path in outputs)
+
+
+def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:
+    """Log how many items are finished, and how many are made again for each reason."""
+    counts = Counter(reasons.values())
+    if finished := counts.pop(None, 0):
+        advice = "" if options.overwrite == "never" else " from the same inputs and options"
+        log.info("%d of %d already finished%s", finished, len(reasons), advice)
+    counts.pop("", None)
+    for reason, count in sorted(counts.items(), key=str):
+        log.info("%d made again: %s", count, reason)
 
 
 def _list_what_would_be_done(

@@ -16,6 +16,7 @@ from facerf_cli.cli.options import (
     refuse_given,
     settings_of,
 )
+from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
@@ -124,7 +125,7 @@ def convert_light(
         ),
     ] = False,
     jobs: JobsOption = 1,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
 ) -> None:
     """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
@@ -145,5 +146,7 @@ def convert_light(
     convert = ConvertLight(forms, from_axes, width, order, lights, signed)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
-    code = run_batch("convert-light", inputs, convert, convert.outputs_of, options, settings, _SUFFIXES)
+    code = run_batch(
+        "convert-light", inputs, convert, convert.outputs_of, options, settings, OneRecipe(convert), _SUFFIXES
+    )
     raise typer.Exit(code)

@@ -25,7 +25,7 @@ def envmap(
         int,
         typer.Option(min=16, max=8192, metavar="PX", help="Write maps of this width; the height is half."),
     ] = 512,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
 ) -> None:
     """Write environment maps drawn from a seed: suns, overcast skies, rooms, studios, streets and stages.

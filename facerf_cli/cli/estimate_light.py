@@ -29,6 +29,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
+from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.errors import UsageError
 
 _OUTPUTS = ("_light.exr", "_light.json", "_light.png")
@@ -105,7 +106,7 @@ def estimate_light(
         int, typer.Option(min=0, max=_MOST_ORDER, help="Order of the spherical harmonics in the JSON.")
     ] = 2,
     texture_size: TextureSizeOption = None,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
@@ -149,6 +150,7 @@ def estimate_light(
         work.outputs_of,
         options,
         photo.settings,
+        OneRecipe(work),
         prepare=partial(work.prepare, dry_run),
     )
     raise typer.Exit(code)

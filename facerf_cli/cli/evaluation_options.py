@@ -13,6 +13,7 @@ from facerf_cli.cli.options import (
     DryRunOption,
     JobsOption,
     OutputOption,
+    Overwrite,
     OverwriteOption,
     refuse_given,
     was_given,
@@ -139,7 +140,7 @@ class EvaluateOptions:
     vgg_weights: str | None = None
     preset: Literal["paper"] | None = None
     jobs: int = 1
-    overwrite: bool = False
+    overwrite: Overwrite = "changed"
     dry_run: bool = False
 
     @property
@@ -182,7 +183,7 @@ def _evaluate_options(
     vgg_weights: VggWeightsOption = None,
     preset: PresetOption = None,
     jobs: JobsOption = 1,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
 ) -> EvaluateOptions:
     """Collect the shared options; a command's signature ends with these parameters."""

@@ -25,6 +25,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
+from facerf_cli.cli.recipe import OneRecipe
 
 _OUTPUTS = (
     "_texture.exr",
@@ -61,7 +62,7 @@ def fit_geometry(
     context: typer.Context,
     inputs: InputsArgument,
     output: OutputOption,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
@@ -99,6 +100,7 @@ def fit_geometry(
         work.outputs_of,
         options,
         photo.settings,
+        OneRecipe(work),
         prepare=photo.preparation(dry_run),
     )
     raise typer.Exit(code)

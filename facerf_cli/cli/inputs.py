@@ -1,12 +1,13 @@
 """The inputs of a command line as a sorted list of items, each with its place in the output folder."""
 
 import os
+import re
 import sys
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
+from facerf_cli.cli.naming import NamePattern, fields_of
 from facerf_cli.errors import UsageError
 
 PHOTO_SUFFIXES = frozenset(
@@ -15,57 +16,126 @@ PHOTO_SUFFIXES = frozenset(
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 
 
+_FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
+_NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
+_MOST_FRAMES = 100_000
+
+
 @dataclass(frozen=True, order=True)
 class Item:
-    """One input, and its place in the mirrored output tree."""
+    """One input, and its place in the output folder."""
 
     input_path: Path
-    output_base: Path  # output folder / mirrored path, without suffix: the outputs' common beginning
-    name: str  # the mirrored path as text; the item's identity within the output folder
+    output_base: Path  # output folder / name: the outputs' common beginning
+    name: str  # path in the output folder, without suffix; the item's identity there
+    mirrored: PurePosixPath | None = None  # of a file: path in its input folder, or name alone
 
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
         return Path(f"{self.output_base}{ending}")
 
+    def filled(self, pattern: NamePattern, tag: str = "", **more: str) -> Path:
+        """The path that a pattern gives to the item, in the output folder; `more` fields override its own.
 
-def collect_items(inputs: Sequence[str], output_folder: Path, suffixes: frozenset[str]) -> list[Item]:
+        `tag` goes to the stem's end.
+        """
+        folder = self.output_base.parents[len(PurePosixPath(self.name).parts) - 1]
+        own = fields_of(self.input_path, self.mirrored or PurePosixPath(self.input_path.name))
+        own["stem"] += tag
+        given = {name: value for name, value in more.items() if value}
+        return folder / pattern.filled(own | given)
+
+
+def collect_items(
+    inputs: Sequence[str],
+    output_folder: Path,
+    suffixes: frozenset[str],
+    pattern: NamePattern | None = None,
+    null_separated: bool = False,
+) -> list[Item]:
     """List the files of the inputs, sorted, each once; UsageError if there are none.
 
-    Files are taken as named, folders are walked recursively for `suffixes`, and `-` reads paths from stdin.
-    The output tree mirrors the input from the deepest folder that all inputs share. Hidden files and folders
-    are left out, and so is an output folder inside an input folder.
+    Folders are walked recursively for `suffixes`, and a file keeps the path that it has in its folder; a file
+    that is named alone has its name only. So an item's place depends on no other input, and two that meet in
+    one place are refused. `-` reads paths from stdin. Hidden files and folders are left out, and so is an
+    output folder inside an input folder.
     """
     output_real = output_folder.resolve()
-    found: dict[Path, Path] = {}  # absolute -> as the user would write it
-    roots: set[Path] = set()
-    for path in map(Path, expand_stdin(inputs)):
-        absolute = Path(os.path.abspath(path))
-        if path.is_dir():
-            if path.resolve() == output_real:
-                raise UsageError(f"{path}: the output folder is an input folder; give another one with -o")
-            roots.add(absolute)
-            found.update((Path(os.path.abspath(file)), file) for file in _walk(path, output_real, suffixes))
-        else:
-            roots.add(absolute.parent)
-            found[absolute] = path
+    found: dict[Path, tuple[Path, PurePosixPath]] = {}  # absolute -> as the user would write it, mirrored
+    for path in map(Path, expand_inputs(inputs, null_separated)):
+        if not path.is_dir():
+            found.setdefault(Path(os.path.abspath(path)), (path, PurePosixPath(path.name)))
+            continue
+        if path.resolve() == output_real:
+            raise UsageError(f"{path}: the output folder is an input folder; give another one with -o")
+        for file in _walk(path, output_real, suffixes):
+            absolute, mirrored = Path(os.path.abspath(file)), PurePosixPath(file.relative_to(path))
+            if absolute not in found or len(mirrored.parts) > len(found[absolute][1].parts):
+                found[absolute] = file, mirrored
     if not found:
         kinds = " ".join(sorted(suffixes))
         raise UsageError(f"{' '.join(inputs) or 'standard input'}: no inputs found (looked for {kinds})")
-    common = Path(os.path.commonpath(roots))
-    names = _unique_names([absolute.relative_to(common) for absolute in sorted(found)])
-    return [
-        Item(found[absolute], output_folder / name, name)
-        for absolute, name in zip(sorted(found), names, strict=True)
-    ]
+    items = []
+    for _, (path, mirrored) in sorted(found.items()):
+        own = mirrored.with_suffix("").as_posix()
+        name = pattern.filled(fields_of(path, mirrored)) if pattern else own
+        items.append(Item(path, output_folder / name, name, mirrored))
+    _refuse_meeting(items)
+    return items
 
 
-def expand_stdin(inputs: Sequence[str]) -> Iterator[str]:
-    """Yield the inputs, with the lines of standard input in place of `-`."""
+def _refuse_meeting(items: Sequence[Item]) -> None:
+    """Raise UsageError for two items with one name; case counts only where one folder holds both."""
+    by_name: dict[str, Item] = {}
+    for item in items:
+        other = by_name.setdefault(item.name.casefold(), item)
+        apart = other.name != item.name and other.input_path.parent == item.input_path.parent
+        if other is not item and not apart:
+            raise UsageError(
+                f"{other.input_path} and {item.input_path}: would both be written as {item.name}; rename "
+                "one, name the folder that holds both, or give --name, such as '{dir}/{stem}_{ext}'"
+            )
+
+
+def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:
+    """Yield the inputs, with the names on standard input in place of `-`, and files in place of frames."""
     for entry in inputs:
         if entry == "-":
-            yield from filter(None, (line.rstrip("\r\n") for line in sys.stdin))
+            yield from filter(None, _stdin_names(null_separated))
+        elif os.path.exists(entry):
+            yield entry
+        elif frames := _FRAMES.fullmatch(entry):
+            yield from _range(entry, *frames.groups())
+        elif numbered := _NUMBERED.fullmatch(entry):
+            yield from _numbered(entry, *numbered.groups())
         else:
             yield entry
+
+
+def _stdin_names(null_separated: bool) -> list[str]:
+    if null_separated:
+        return sys.stdin.read().split("\0")
+    return [line.rstrip("\r\n") for line in sys.stdin]
+
+
+def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:
+    """The frames of `plate.1001-1050.exr`."""
+    if not int(first) <= int(last) < int(first) + _MOST_FRAMES:
+        raise UsageError(f"{entry}: not a range of frames; give FIRST-LAST, at most {_MOST_FRAMES}")
+    return [f"{before}{number:0{len(first)}}{after}" for number in range(int(first), int(last) + 1)]
+
+
+def _numbered(entry: str, before: str, after: str) -> list[str]:
+    """The files of `plate.%04d.exr`, by number."""
+    folder, begin = os.path.split(before)
+    form = re.compile(re.escape(begin) + r"(\d+)" + re.escape(after))
+    matches = (
+        form.fullmatch(name) for name in (os.listdir(folder or ".") if os.path.isdir(folder or ".") else ())
+    )
+    found = sorted((int(match[1]), os.path.join(folder, match[0])) for match in matches if match)
+    if not found:
+        raise UsageError(f"{entry}: no such files; check the pattern")
+    return [path for _, path in found]
 
 
 def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator[Path]:
@@ -77,21 +147,3 @@ def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator
             sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files
             if name[0] != "." and Path(name).suffix.lower() in suffixes and not sheet:
                 yield Path(here) / name
-
-
-def _unique_names(relatives: Sequence[Path]) -> list[str]:
-    """Mirrored paths without suffix, or with it where two would share a name, ignoring case."""
-    full = [path.as_posix() for path in relatives]
-    names = [path.with_suffix("").as_posix() for path in relatives]
-    while clashing := _repeated(name.casefold() for name in names):
-        longer = [
-            whole if name.casefold() in clashing else name for whole, name in zip(full, names, strict=True)
-        ]
-        if longer == names:
-            break  # only case tells them apart; the file system that holds the inputs can hold the outputs
-        names = longer
-    return names
-
-
-def _repeated(keys: Iterable[str]) -> set[str]:
-    return {key for key, count in Counter(keys).items() if count > 1}

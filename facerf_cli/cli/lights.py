@@ -9,6 +9,7 @@ from typing import Literal
 
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions
+from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.values import azel, numbers
 from facerf_cli.errors import UsageError
 
@@ -17,7 +18,6 @@ Sampling = Literal["cell", "paper"]
 DRAWN = "procedural:"
 _MOST_FRAMES = 9999
 _LIGHT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-_FRAME = re.compile(r"(.+?)((?:\.\d+)*)")  # a name, and the frame numbers that it ends in
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,13 @@ class LightSetup:
     lights: tuple[tuple[float, ...], ...] = ()
     names: tuple[str, ...] = ()
 
-    def output(self, item: Item, tag: str, suffix: str) -> Path:
-        """The image's file; the photo's own frame number goes last."""
+    def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
+        """The image's file, by a pattern of --name or the default: the photo's own frame number goes last."""
         stem, frame = split_frame(item.output_base.name)
-        return item.output_base.with_name(f"{stem}{tag}_{self.name}{self.frame}{frame}{suffix}")
-
-
-def split_frame(name: str) -> tuple[str, str]:
-    """Split 'sky.0001' into 'sky' and '.0001'."""
-    match = _FRAME.fullmatch(name)
-    assert match is not None
-    return match[1], match[2]
+        if pattern is None:
+            return item.output_base.with_name(f"{stem}{tag}_{self.name}{self.frame}{frame}{suffix}")
+        path = item.filled(pattern, tag, light=self.name, frame=self.frame.rpartition(".")[2])
+        return path.with_name(f"{path.name}{suffix}")
 
 
 def collect_setups(

@@ -2,12 +2,13 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
 
@@ -47,13 +48,14 @@ class Shard:
 class Settings:
     """The global options and the choice of workers; `ctx.obj` in every verb."""
 
-    verbosity: int = 0  # -1 errors only, 0 notes and warnings, 1 everything and tracebacks
-    log_json: bool = False
-    device: DeviceName = "auto"
+    verbosity: int = field(default=0, metadata=NOT_IN_RECIPE)  # -1 errors only, 0 notes, 1 everything
+    log_json: bool = field(default=False, metadata=NOT_IN_RECIPE)
+    device: DeviceName = field(default="auto", metadata=NOT_IN_RECIPE)
     checkpoint: Path | None = None  # None: the one in assets/
     seed: int = 0
-    shard: Shard = Shard()
-    ray: str | None = None  # None: this machine, without Ray
+    null_separated: bool = field(default=False, metadata=NOT_IN_RECIPE)  # names on standard input
+    shard: Shard = field(default=Shard(), metadata=NOT_IN_RECIPE)
+    ray: str | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: this machine, without Ray
 
 
 def settings_of(context: typer.Context) -> Settings:
@@ -103,7 +105,8 @@ InputsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="PHOTO...",
-        help="Images, folders (walked recursively), or - to read a list of paths from standard input.",
+        help="Images, folders (walked recursively), frames (plate.1001-1050.exr, plate.%04d.exr), or - to "
+        "read a list of paths from standard input.",
         show_default=False,
     ),
 ]
@@ -113,8 +116,13 @@ OutputOption = Annotated[
         "--output", "-o", metavar="DIR", help="Write the results to this folder.", show_default=False
     ),
 ]
+Overwrite = Literal["never", "changed", "always"]
 OverwriteOption = Annotated[
-    bool, typer.Option("--overwrite", help="Make results again that exist already (default: skip them).")
+    Overwrite,
+    typer.Option(
+        help="Make again results that exist: never; those that were made from other inputs, options or "
+        "networks (changed); or always."
+    ),
 ]
 DryRunOption = Annotated[
     bool, typer.Option("--dry-run", help="List what would be read and written; write nothing.")

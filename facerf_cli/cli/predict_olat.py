@@ -1,6 +1,6 @@
 """`facerf predict-olat`: a photo's face under every light of a rig, as an OLAT stack."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -28,6 +28,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
+from facerf_cli.cli.recipe import NOT_IN_RECIPE, OneRecipe
 from facerf_cli.cli.values import parse_lights, parse_pose
 
 Precision = Literal["float32", "bf16"]
@@ -42,7 +43,7 @@ class PredictOlat:
     pose: str | None
     image: bool
     network_alone: bool
-    memory_bytes: int
+    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     precision: Precision
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -84,7 +85,7 @@ def predict_olat(
     texture_size: TextureSizeOption = None,
     memory: MemoryOption = 2.0,
     precision: Annotated[Precision, typer.Option(help="Compute the network in this precision.")] = "float32",
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
@@ -110,6 +111,13 @@ def predict_olat(
     work = PredictOlat(photo, lights, pose, image, network_alone, int(memory * 2**30), precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
-        "predict-olat", inputs, work, work.outputs_of, options, settings, prepare=photo.preparation(dry_run)
+        "predict-olat",
+        inputs,
+        work,
+        work.outputs_of,
+        options,
+        settings,
+        OneRecipe(work),
+        prepare=photo.preparation(dry_run),
     )
     raise typer.Exit(code)

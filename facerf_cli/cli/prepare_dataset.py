@@ -10,6 +10,7 @@ from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     JobsOption,
+    Overwrite,
     OverwriteOption,
     refuse_given,
     settings_of,
@@ -35,7 +36,7 @@ class PrepareOptions:
     split: str
     crop_px: int
     face_model: str
-    overwrite: bool
+    overwrite: Overwrite
     dry_run: bool
     jobs: int
 
@@ -134,7 +135,7 @@ def prepare_dataset(
         int, typer.Option(metavar="PX", help="Side of the crops in pixels; a multiple of 8.")
     ] = 256,
     face_model: FaceModelOption = "builtin",
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
 ) -> None:

@@ -1,6 +1,7 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +13,7 @@ from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
+from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -32,10 +34,12 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
+from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
 Composite = Literal["photo", "face"]
+_SUFFIXES = (".exr", ".png")
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class Relight:
     """Relights one item under every light setup; settings only."""
 
     photo: PhotoOptions
-    setups: tuple[LightSetup, ...]
+    setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)  # each is in that of its own images
     rig: str
     sampling: Sampling
     pose: str | None
@@ -52,16 +56,34 @@ class Relight:
     background_blur: float
     aov: tuple[str, ...]
     matte: Path | None
-    exposure_ev: float | None  # None: auto
-    memory_bytes: int
-    asked_for_photo: bool  # --composite photo is on the command line
+    exposure: Exposure
+    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
+    asked_for_photo: bool = field(metadata=NOT_IN_RECIPE)  # --composite photo is on the command line
     reflectance: RelightKind = "portrait"
     network_alone: bool = False
+    name: NamePattern | None = field(default=None, metadata=NOT_IN_RECIPE)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """An EXR and a PNG for each setup."""
         tag = self.photo.first_tag
-        return [setup.output(item, tag, suffix) for setup in self.setups for suffix in (".exr", ".png")]
+        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in _SUFFIXES]
+
+    def refuse_meeting(self, items: Sequence[Item]) -> None:
+        """Raise UsageError where two images would have one path, as a --name may make them."""
+        seen: set[Path] = set()
+        for item in items:
+            for path in self.outputs_of(item):
+                if path in seen:
+                    raise UsageError(
+                        f"{item.input_path}: {path} would be the name of two images; give --name more fields"
+                    )
+                seen.add(path)
+
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        """The recipe of every output, which holds the light of its own setup alone."""
+        shared = recipe_of(self, digest_of)
+        lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
+        return [recipe for recipe in lit for _ in _SUFFIXES]
 
     def readable(self, dry_run: bool) -> "Relight":
         """Load the models, and keep the setups whose maps can be read.
@@ -83,7 +105,7 @@ class Relight:
         from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self)
-        outputs = [path.with_suffix(suffix) for path in written for suffix in (".exr", ".png")]
+        outputs = [path.with_suffix(suffix) for path in written for suffix in _SUFFIXES]
         exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
         return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
 
@@ -158,7 +180,11 @@ def relight(
     ] = "portrait",
     exposure: Annotated[
         str,
-        typer.Option(metavar="EV|auto", help="Exposure of the PNG in EV, or auto: expose the lit face well."),
+        typer.Option(
+            metavar="auto|face|EV",
+            help="Expose the PNG so that the face is as bright as in the photo (auto) or well lit (face); or "
+            "by a number of EV.",
+        ),
     ] = "auto",
     composite: Annotated[
         Composite | None,
@@ -212,8 +238,16 @@ def relight(
     ] = "cell",
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
+    name: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATTERN",
+            help="Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.",
+            show_default="{dir}/{stem}_{light}",
+        ),
+    ] = None,
     memory: MemoryOption = 2.0,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
@@ -233,6 +267,7 @@ def relight(
     the nearest of them.
     """
     settings = settings_of(context)
+    pattern = NamePattern.parse(name, "--name") if name else None
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
@@ -261,17 +296,19 @@ def relight(
         background_blur=background_blur / 100,
         aov=parse_aov(aov),
         matte=matte,
-        exposure_ev=parse_exposure(exposure),
+        exposure=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
         reflectance=reflectance,
         network_alone=network_alone,
+        name=pattern,
     )
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    items = collect_items(inputs, output, PHOTO_SUFFIXES)
-    finished = all_finished(items, work.outputs_of, options, settings)
+    items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
+    work.refuse_meeting(items)
+    finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
     usable = work if finished else work.readable(dry_run)
-    code = run_files("relight", items, usable, usable.outputs_of, options, settings)
+    code = run_files("relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of)
     if ball and not dry_run and settings.shard.number == 1:
         _write_balls(usable, options)
     raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))
@@ -285,10 +322,12 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
 
     maps = [setup for setup in work.setups if setup.envmap is not None]
     missing = [
-        setup for setup in maps if options.overwrite or not path_of(setup).with_suffix(".png").exists()
+        setup
+        for setup in maps
+        if options.overwrite == "always" or not path_of(setup).with_suffix(".png").exists()
     ]
     if missing:
         from facerf_cli.cli.items.light_weights import readable, write_balls
 
         drawn = readable(missing)
-        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure_ev)
+        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure)

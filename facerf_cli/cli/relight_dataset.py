@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import DryRunOption, OverwriteOption, Settings, settings_of
+from facerf_cli.cli.options import DryRunOption, Overwrite, OverwriteOption, Settings, settings_of
 from facerf_cli.errors import UsageError
 
 
@@ -20,7 +20,7 @@ class RelightDataset:
     per_subject: int
     lazy: bool
     memory_bytes: int
-    overwrite: bool
+    overwrite: Overwrite
     dry_run: bool
     jobs: int
     settings: Settings
@@ -54,7 +54,7 @@ def relight_dataset(
     memory: Annotated[
         float, typer.Option(metavar="GB", min=0.1, help="Limit the memory of each job, roughly.")
     ] = 2.0,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=1, help="Relight this many subjects at a time.")

@@ -17,6 +17,7 @@ from facerf_cli.cli.options import (
     settings_of,
 )
 from facerf_cli.cli.photo_options import FaceOption, LandmarksFromOption, LandmarksOption, PhotoOptions
+from facerf_cli.cli.recipe import OneRecipe
 
 _OUTPUTS = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
 
@@ -43,7 +44,7 @@ def segment(
     context: typer.Context,
     inputs: InputsArgument,
     output: OutputOption,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
     face: FaceOption = "largest",
@@ -68,5 +69,5 @@ def segment(
     photo.check()
     work = Segment(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch("segment", inputs, work, work.outputs_of, options, photo.settings)
+    code = run_batch("segment", inputs, work, work.outputs_of, options, photo.settings, OneRecipe(work))
     raise typer.Exit(code)

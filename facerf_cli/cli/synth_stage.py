@@ -61,7 +61,7 @@ def synth_stage(
     jobs: Annotated[
         int, typer.Option("--jobs", "-j", min=1, help="Photograph this many people at a time.")
     ] = 1,
-    overwrite: OverwriteOption = False,
+    overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
 ) -> None:
     """Photograph synthetic people in a light stage: one light at a time, eight cameras, one exposure.

@@ -3,6 +3,7 @@
 import math
 import os.path
 from pathlib import Path
+from typing import Literal
 
 from facerf_cli.errors import UsageError
 
@@ -10,6 +11,7 @@ MOST_LIGHTS = 4096
 _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 
+Exposure = float | Literal["auto", "face"]  # EV, or the rule that chooses it
 PoseDeg = tuple[float, float, float]
 
 
@@ -43,9 +45,13 @@ def parse_pose(text: str | None) -> PoseDeg | None:
     return yaw_deg, pitch_deg, roll_deg
 
 
-def parse_exposure(text: str) -> float | None:
-    """Parse `--exposure`: EV, or None for `auto`."""
-    return None if text == "auto" else numbers(text, ("EV or auto",), "--exposure")[0]
+def parse_exposure(text: str) -> Exposure:
+    """Parse `--exposure`: EV, or the rule that chooses it."""
+    if text == "auto":
+        return "auto"
+    if text == "face":
+        return "face"
+    return numbers(text, ("auto, face or EV",), "--exposure")[0]
 
 
 def parse_lights(text: str) -> int | list[tuple[float, float]]:

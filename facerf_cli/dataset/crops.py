@@ -77,7 +77,8 @@ class PairReader:
         target = read_olats(path, slice(pair.target_light, pair.target_light + 1))[0].float()
         if source.shape != target.shape or source.shape[-1] != source_stack.side_px:
             raise InputError(
-                f"{path}: the source has another size than the stack; run relight-dataset with --overwrite"
+                f"{path}: the source has another size than the stack; "
+                "run relight-dataset with --overwrite always"
             )
         exposed = source * (MEAN_RADIANCE / source_stack.colour_on_face(source).mean())
         moved, moved_target = moves

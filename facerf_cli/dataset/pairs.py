@@ -111,7 +111,8 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
                 raise ValueError("not sorted, or repeated")
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             raise InputError(
-                f"{path}: line {number} is not a pair of this dataset; run relight-dataset with --overwrite"
+                f"{path}: line {number} is not a pair of this dataset; "
+                "run relight-dataset with --overwrite always"
             ) from None
         pairs.append(pair)
     return pairs

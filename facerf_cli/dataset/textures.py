@@ -194,5 +194,5 @@ def _read_source(dataset: Dataset, pair: Pair, fit: FaceFit) -> Tensor:
     path = image_path(dataset, *pair.key)
     pixels = read_image(path).pixels
     if pixels.shape[:2] != (fit.crop.size_px, fit.crop.size_px):
-        raise InputError(f"{path}: another size than its stack; run relight-dataset with --overwrite")
+        raise InputError(f"{path}: another size than its stack; run relight-dataset with --overwrite always")
     return torch.from_numpy(pixels).permute(2, 0, 1)

@@ -100,7 +100,7 @@ def _require_agreement(dataset: Dataset, old: list[Pair], new: list[Pair]) -> No
     if any(known[pair.key] != pair for pair in both) or not explained.issuperset(_images(dataset)):
         raise UsageError(
             f"{dataset.folder / RELIT}: holds images of another seed, other envmaps, another dataset or a "
-            "larger --per-subject; give those options again, or --overwrite"
+            "larger --per-subject; give those options again, or --overwrite always"
         )
 
 
@@ -177,7 +177,7 @@ def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
         if computed != pairs:
             raise InputError(
                 f"{pairs_path(dataset)}: the envmaps have changed since the pairs were made; run "
-                "relight-dataset with --overwrite"
+                "relight-dataset with --overwrite always"
             )
         _write_weights(dataset, weights, pairs_path(dataset).read_bytes())
     try:
@@ -233,7 +233,7 @@ def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
     if result.exposure_ev != pair.exposure_ev:
         raise InputError(
             f"{pair.envmap}: the envmap has changed since the pair was made; run relight-dataset with "
-            "--overwrite"
+            "--overwrite always"
         )
     return torch.from_numpy(result.weights[0, : len(lights)])
 

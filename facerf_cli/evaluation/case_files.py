@@ -66,7 +66,7 @@ def read_figures(path: Path) -> ItemFigures:
         return ItemFigures(content["key"], rows, strips, tuple(map(str, content["pictures"])))
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{path}: no figures of an evaluation ({error}); remove it, or give --overwrite"
+            f"{path}: no figures of an evaluation ({error}); remove it, or give --overwrite always"
         ) from None
 
 

@@ -1,6 +1,5 @@
 """The contract of every verb that walks folders (docs/design.md), with a verb that only copies bytes."""
 
-import io
 import json
 import os
 import signal
@@ -11,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings
+from facerf_cli.cli.recipe import Recipe
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import configure_logging
@@ -39,10 +39,11 @@ def copy(item: Item) -> Outcome:
     return Outcome([path], {"bytes": len(data), "ratio": float("nan")})
 
 
-def run(inputs: list[Path | str], output: Path, **options: object) -> int:
+def run(inputs: list[Path | str], output: Path, recipe: Recipe | None = None, **options: object) -> int:
     configure_logging()
     texts = [str(entry) for entry in inputs]
-    return run_batch("copy", texts, copy, outputs_of, BatchOptions(output, **options), Settings())  # type: ignore[arg-type]
+    chosen = BatchOptions(output, **options)  # type: ignore[arg-type]
+    return run_batch("copy", texts, copy, outputs_of, chosen, Settings(), lambda digest_of: [recipe or {}])
 
 
 def rows(output: Path) -> dict[str, dict]:
@@ -52,64 +53,19 @@ def rows(output: Path) -> dict[str, dict]:
 @pytest.fixture
 def photos(tmp_path: Path) -> Path:
     folder = tmp_path / "photos"
-    for name in ("b.jpg", "a.png", "x/a.jpg", "x/a.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
+    for name in ("b.jpg", "a.png", "x/a.jpg", "x/c.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(name.encode())
     return folder
 
 
-def test_folder_is_mirrored_and_no_two_items_share_an_output(photos: Path, tmp_path: Path) -> None:
-    items = collect_items([str(photos)], tmp_path / "out", PHOTO_SUFFIXES)
-    assert [item.name for item in items] == ["Z", "a", "b", "x/a.jpg", "x/a.png"]
-    assert len({item.output("_copy.bin") for item in items}) == len(items)
-
-
-def test_same_stem_in_different_folders_and_a_file_given_twice(photos: Path, tmp_path: Path) -> None:
-    inputs = [str(photos / "a.png"), str(photos / "x" / "a.png"), str(photos / "a.png"), str(photos / "x")]
-    names = [item.name for item in collect_items(inputs, tmp_path / "out", PHOTO_SUFFIXES)]
-    assert names == ["a", "x/a.jpg", "x/a.png"]
-
-
 def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
     photo = tmp_path / os.fsdecode(b"a\xff.png")
     photo.write_bytes(b"bad")
-    assert run([photo], tmp_path / "out") == 1
+    (tmp_path / "b.png").write_bytes(b"good")
+    assert run([photo, tmp_path / "b.png"], tmp_path / "out") == 1
     assert rows(tmp_path / "out")["a\udcff"]["status"] == "failed"
-
-
-def test_a_single_file_has_no_folders_in_its_output(photos: Path, tmp_path: Path) -> None:
-    (item,) = collect_items([str(photos / "x" / "a.png")], tmp_path / "out", PHOTO_SUFFIXES)
-    assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"
-
-
-def test_names_that_look_like_a_clash_resolved_elsewhere(tmp_path: Path) -> None:
-    for name in ("a.jpg", "a.png", "a.jpg.png", "A.tif"):
-        (tmp_path / name).touch()
-    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
-    assert len({name.casefold() for name in names}) == 4
-
-
-def test_outputs_inside_the_input_folder_are_not_inputs(photos: Path) -> None:
-    (photos / "out").mkdir()
-    (photos / "out" / "b_relit.png").touch()
-    names = [item.name for item in collect_items([str(photos)], photos / "out", PHOTO_SUFFIXES)]
-    assert not [name for name in names if name.startswith("out")]
-    with pytest.raises(UsageError, match="output folder"):
-        collect_items([str(photos)], photos, PHOTO_SUFFIXES)
-
-
-def test_the_contact_sheet_beside_a_stack_is_no_input(tmp_path: Path) -> None:
-    for name in ("a_olat.exr", "a_olat.png", "b_olat.png"):
-        (tmp_path / name).touch()
-    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
-    assert names == ["a_olat", "b_olat"]
-
-
-def test_a_list_on_stdin(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
-    names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
-    assert names == ["b", "x/a.jpg", "x/a.png"]
 
 
 def test_nothing_to_work_on(tmp_path: Path) -> None:
@@ -129,18 +85,18 @@ def test_a_bad_item_does_not_harm_the_others(
     streams = capsys.readouterr()
     assert [Path(line).name for line in streams.out.splitlines()] == [
         "a_copy.bin",
-        "a.jpg_copy.bin",
-        "a.png_copy.bin",
+        "a_copy.bin",
+        "c_copy.bin",
     ]
     assert f"facerf: error: {photos / 'b.jpg'}: is bad; try another\n" in streams.err
     assert "gone.jpg: no such file" in streams.err and "unexpected RuntimeError: a bug" in streams.err
     assert "Traceback" not in streams.err
     report = rows(out)
     assert {name: row["status"] for name, row in report.items()} == {
-        "Z": "failed", "a": "done", "b": "failed", "gone": "failed", "x/a.jpg": "done", "x/a.png": "done",
+        "Z": "failed", "a": "done", "b": "failed", "gone": "failed", "x/a": "done", "x/c": "done",
     }  # fmt: skip
     assert report["a"]["bytes"] == 5 and report["a"]["ratio"] is None and report["a"]["error"] is None
-    assert (out / report["x/a.png"]["outputs"][0]).read_bytes() == b"x/a.png"
+    assert (out / report["x/c"]["outputs"][0]).read_bytes() == b"x/c.png"
 
 
 def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: Path) -> None:
@@ -148,16 +104,17 @@ def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: P
     (photos / "b.jpg").write_bytes(b"bad")
     assert run([photos], out) == 1
     before = rows(out)
-    (out / "a_copy.bin").write_bytes(b"mine")
     (photos / "b.jpg").write_bytes(b"good")
     assert run([photos], out) == 0
-    assert (out / "a_copy.bin").read_bytes() == b"mine"
-    assert rows(out)["x/a.png"] == before["x/a.png"] and rows(out)["b"]["status"] == "done"
+    assert rows(out)["x/c"] == before["x/c"] and rows(out)["b"]["status"] == "done"
     assert len((out / "report.jsonl").read_text().splitlines()) == 5  # the older row of b is gone
     (out / "report.jsonl").unlink()
     assert run([photos], out) == 0
     assert [row["status"] for row in rows(out).values()] == ["skipped"] * 5
-    assert run([photos], out, overwrite=True) == 0
+    (out / "a_copy.bin").write_bytes(b"mine!")
+    assert run([photos], out) == 0
+    assert (out / "a_copy.bin").read_bytes() == b"mine!"
+    assert run([photos], out, overwrite="always") == 0
     assert (out / "a_copy.bin").read_bytes() == b"a.png"
 
 
@@ -210,6 +167,7 @@ import sys, time
 from pathlib import Path
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.options import Settings
+from facerf_cli.cli.recipe import Recipe
 from facerf_cli.files.atomic import atomic_path
 
 def outputs_of(item):
@@ -225,7 +183,7 @@ def slow(item):
 
 if __name__ == "__main__":
     options = BatchOptions(Path(sys.argv[2]), jobs=int(sys.argv[3]))
-    run_batch("slow", [sys.argv[1]], slow, outputs_of, options, Settings())
+    run_batch("slow", [sys.argv[1]], slow, outputs_of, options, Settings(), lambda digest_of: [{}])
 """
 
 
@@ -240,4 +198,4 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path, jobs: int)
     process.wait()
     assert process.returncode != 0
     left = sorted(path.name for path in out.rglob("*") if path.is_file())
-    assert left == ["report.jsonl", "started"]
+    assert left == [".facerf-index.jsonl", "report.jsonl", "started"]

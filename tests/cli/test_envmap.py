@@ -23,7 +23,7 @@ def test_writes_seeded_maps_and_skips_finished_ones(
     before = written[0].stat().st_mtime_ns
     assert main(line) == 0
     assert capsys.readouterr().out == "" and written[0].stat().st_mtime_ns == before
-    assert main([*line, "--overwrite"]) == 0
+    assert main([*line, "--overwrite", "always"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 

@@ -70,11 +70,11 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(tmp_path: Path, capsys: Said
 def test_items_evaluated_otherwise_are_refused(tmp_path: Path) -> None:
     assert evaluate(tmp_path) == 0
     for changed in ({"space": "display"}, {"toy": Toy(cases=3)}, {"keep_eyes": True}):
-        with pytest.raises(UsageError, match="--overwrite, or another folder"):
+        with pytest.raises(UsageError, match="--overwrite always, or another folder"):
             evaluate(tmp_path, **changed)  # type: ignore[arg-type]
     assert evaluate(tmp_path, jobs=1, dry_run=True) == 0
     assert (tmp_path / "summary.json").exists()
-    assert evaluate(tmp_path, Toy(cases=3), overwrite=True) == 0
+    assert evaluate(tmp_path, Toy(cases=3), overwrite="always") == 0
     assert json.loads((tmp_path / "summary.json").read_text())["pictures"] == 9
 
 
@@ -126,7 +126,7 @@ def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, 
     (theirs / "carl/00.exr").unlink()
     write_exr(theirs / "carl/03.exr", np.zeros((WIDTH, HEIGHT, 3), np.float32))
     capsys.readouterr()
-    assert evaluate(tmp_path / "out", overwrite=True, **options) == 1
+    assert evaluate(tmp_path / "out", overwrite="always", **options) == 1
     said = capsys.readouterr().err
     assert all(part in said for part in ("case anna/01", "case carl/00", "carl/03.exr: 36 x 48 pixels"))
     assert not any((tmp_path / "out" / name).exists() for name in OUTPUTS)

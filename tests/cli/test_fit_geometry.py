@@ -107,7 +107,7 @@ def test_two_faces_each_get_their_files(landmarks: Path, tmp_path: Path) -> None
     line = ["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o2"), "--face"]
     assert main([*line, "1"]) == 0
     assert load_fit(tmp_path / "o2" / "two_fit.npz").crop.x0_px == right
-    assert main([*line, "2", "--overwrite"]) == 1
+    assert main([*line, "2", "--overwrite", "always"]) == 1
 
 
 def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:

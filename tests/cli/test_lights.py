@@ -10,7 +10,7 @@ import torch
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
-from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations, split_frame
+from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
@@ -123,8 +123,6 @@ def test_no_light_and_the_same_light_twice() -> None:
 
 
 def test_frame_numbers_stay_at_the_end() -> None:
-    assert split_frame("sky.0012") == ("sky", ".0012")
-    assert split_frame("v2.final") == ("v2.final", "")
     still = Item(Path("a.jpg"), Path("out/a"), "a")
     moving = Item(Path("setup.0007.jpg"), Path("out/b/setup.0007"), "b/setup.0007")
     turned = LightSetup("sky", ".0001")

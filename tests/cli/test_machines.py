@@ -123,4 +123,4 @@ def test_the_last_shard_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture) -
         outputs_of(item)[0].touch()
     assert "there is no summary" in capsys.readouterr().err
     assert sums_up(items, outputs_of, options, shard)
-    assert not sums_up(items, outputs_of, BatchOptions(tmp_path, overwrite=True), shard)
+    assert not sums_up(items, outputs_of, BatchOptions(tmp_path, overwrite="always"), shard)

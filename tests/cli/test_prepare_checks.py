@@ -66,7 +66,7 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     page = (tmp_path / "index.html").read_text()
     assert all(words in page for words in (ORDER.words, CLIPPED.words, "C1/L004"))
     plant()
-    assert prepare(capture, tmp_path, "--overwrite") == 0  # nothing of the old findings is left
+    assert prepare(capture, tmp_path, "--overwrite", "always") == 0  # nothing of the old findings is left
     assert (tmp_path / "findings.jsonl").read_text() == "" and ORDER.words not in capsys.readouterr().err
     assert read_dataset(tmp_path).fewer_lights == {}
 

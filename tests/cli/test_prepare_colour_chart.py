@@ -103,7 +103,7 @@ def test_an_older_charts_image_does_not_outlive_its_dataset(
     wrong: Path, corrected: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(corrected, tmp_path / "again")
-    assert prepare(wrong, tmp_path / "again", *SPLIT, "--overwrite") == 0
+    assert prepare(wrong, tmp_path / "again", *SPLIT, "--overwrite", "always") == 0
     assert "colour_charts" not in normalisation(tmp_path / "again")
     assert (corrected / "colour_chart.png").is_file() and not (tmp_path / "again/colour_chart.png").exists()
 

@@ -378,6 +378,7 @@ def test_records_of_another_run_stay_out_of_the_dataset(
                 "--crop",
                 "64",
                 "--overwrite",
+                "always",
                 "--checks",
                 "off",
             ]

@@ -69,7 +69,7 @@ def test_jobs_lazy_and_the_order_of_runs_make_no_difference(
     before = (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns
     assert main(line(other)) == 0
     assert (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns == before
-    assert main(line(other, "--overwrite", "--memory", "0.1")) == 0
+    assert main(line(other, "--overwrite", "always", "--memory", "0.1")) == 0
     assert tree(other) == whole and (other / "relit" / "0000" / "00000.exr").stat().st_mtime_ns != before
 
 

@@ -51,7 +51,7 @@ def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:
     assert main([*shards, "--shard", "2/2"]) == 0 and main([*shards, "--shard", "1/2"]) == 0
     assert tree(tmp_path / "shards/relit") == tree(tmp_path / "whole/relit")
     before = tree(tmp_path / "shards")
-    assert main([*shards, "--shard", "1/2", "--overwrite"]) == 2, "it would take the other's away"
+    assert main([*shards, "--shard", "1/2", "--overwrite", "always"]) == 2, "it would take the other's away"
     assert tree(tmp_path / "shards") == before
 
 

@@ -66,7 +66,9 @@ def run(
     """Copy PHOTOS to OUTPUT; notes go to the folder above."""
     settings = Settings(shard=shard or Shard(), ray=ray)
     batch = BatchOptions(output, **options)  # type: ignore[arg-type]
-    return run_batch("copy", [str(photos)], Copy(output.parent), outputs_of, batch, settings)
+    return run_batch(
+        "copy", [str(photos)], Copy(output.parent), outputs_of, batch, settings, lambda digest_of: [{}]
+    )
 
 
 if __name__ == "__main__":

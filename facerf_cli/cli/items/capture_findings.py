@@ -125,7 +125,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
     try:
         rows = [json.loads(line) for line in lines]
     except ValueError:
-        raise InputError(f"{path}: damaged; remove it, and give --overwrite to check again") from None
+        raise InputError(f"{path}: damaged; remove it, and give --overwrite always to check again") from None
     return [row for row in rows if isinstance(row, dict)]
 
 

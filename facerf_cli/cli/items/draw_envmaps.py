@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 
 from facerf_cli import __version__
+from facerf_cli.cli.options import Overwrite
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_exr
 from facerf_cli.logs import LOGGER_NAME
@@ -13,7 +14,13 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 def write_envmaps(
-    output: Path, count: int, kind: list[str] | None, width_px: int, seed: int, overwrite: bool, dry_run: bool
+    output: Path,
+    count: int,
+    kind: list[str] | None,
+    width_px: int,
+    seed: int,
+    overwrite: Overwrite,
+    dry_run: bool,
 ) -> None:
     """Draw and write maps of some kinds (None: the usual mix), and print their paths; skip existing ones."""
     kinds = tuple(dict.fromkeys(kind)) if kind else MIX
@@ -22,8 +29,8 @@ def write_envmaps(
     for index in range(count):
         name = kind_of(index, seed, kinds)
         path = output / f"{index:05d}_{name}.exr"
-        if path.exists() and not overwrite:
-            log.info("%s: already exists (--overwrite makes it again)", path)
+        if path.exists() and overwrite != "always":
+            log.info("%s: already exists (--overwrite always makes it again)", path)
         elif dry_run:
             print(path)
         else:

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_stdin
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
 from facerf_cli.cli.items.evaluation import (
     MethodOptions,
     load_methods,
@@ -123,7 +123,7 @@ class _Couple:
 
 def _photo_couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     """An item for each couple: two files each as they are named, and two each of a folder in its order."""
-    inputs = list(expand_stdin(inputs))
+    inputs = list(expand_inputs(inputs))
     files = [name for name in inputs if not os.path.isdir(name)]
     if len(files) % 2:
         raise UsageError(

@@ -111,7 +111,7 @@ def require_enough(found: int, needed: int, what: str, dataset: Path, per_subjec
     raise UsageError(
         f"{dataset}: the split has {found} {what}, --preset paper measures {needed}; run facerf "
         f"relight-dataset {dataset} --envmaps procedural:160 --per-subject {math.ceil(1.1 * per_subject)} "
-        "--overwrite, or prepare more people"
+        "--overwrite always, or prepare more people"
     )
 
 

@@ -158,14 +158,14 @@ def _remove_summary(folder: Path) -> None:
 
 def _check_earlier(items: Sequence[Item], work: "_Measure") -> None:
     """Raise UsageError where finished items were evaluated in another way: one table has one way."""
-    if work.options.overwrite:
+    if work.options.overwrite == "always":
         return
     found = {item: path for item in items if (path := work.path_of(item)).exists()}
     other = [path for item, path in found.items() if read_figures(path).key != work.key_of(item)]
     if other:
         raise UsageError(
             f"{work.options.output}: {len(other)} items ({other[0].stem}, ...) were evaluated with other "
-            "options, another checkpoint or another version; give --overwrite, or another folder"
+            "options, another checkpoint or another version; give --overwrite always, or another folder"
         )
 
 
@@ -196,7 +196,7 @@ class _Measure:
     def outputs_of(self, item: Item) -> list[Path]:
         """The files of a finished item: its figures, and the images that they name."""
         path = self.path_of(item)
-        kept = () if self.options.overwrite or not path.exists() else read_figures(path).files
+        kept = () if self.options.overwrite == "always" or not path.exists() else read_figures(path).files
         return [path, *(self.options.output / file for file in kept)]
 
     def __call__(self, item: Item) -> Outcome:

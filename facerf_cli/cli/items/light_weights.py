@@ -95,7 +95,7 @@ def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: S
     return weights
 
 
-def write_balls(setups: Sequence[LightSetup], paths: Sequence[Path], exposure_ev: float | None) -> None:
+def write_balls(setups: Sequence[LightSetup], paths: Sequence[Path], exposure: float | str) -> None:
     """Write, as EXR and PNG, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
     for setup, path in zip(setups, paths, strict=True):
         assert setup.envmap is not None
@@ -104,7 +104,7 @@ def write_balls(setups: Sequence[LightSetup], paths: Sequence[Path], exposure_ev
         pixels = torch.cat(both, 1).numpy()
         metadata = _metadata_of(setup.envmap)
         write_exr(path, pixels, metadata=metadata)
-        shown_ev: float | Literal["auto"] = "auto" if exposure_ev is None else exposure_ev
+        shown_ev: float | Literal["auto"] = exposure if isinstance(exposure, float) else "auto"
         write_display(path.with_suffix(".png"), pixels, shown_ev, metadata=metadata)
 
 

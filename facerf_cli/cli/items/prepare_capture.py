@@ -94,10 +94,10 @@ def prepare_capture(options: PrepareOptions, output: Path, settings: Settings) -
         return check_all(CheckOnly(source.opened), items, output, options.jobs, options.strict, settings)
     model_sha256 = _model_digest(options.face_model)
     key = preparation_key(capture, model_sha256, options.crop_px)
-    _check_earlier(capture, output, key, options.overwrite)
+    _check_earlier(capture, output, key, options.overwrite == "always")
     work = Prepare(source, options.checks, options.strict, options.face_model, options.crop_px, output, key)
     batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)
-    if options.overwrite and not options.dry_run:
+    if options.overwrite == "always" and not options.dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
     elif not options.dry_run:
         _forget_completed(capture, output)
@@ -190,7 +190,7 @@ def _check_earlier(capture: Capture, output: Path, key: str, overwrite: bool) ->
     if other:
         raise UsageError(
             f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model, "
-            "calibration or colour chart; give --overwrite, or another folder"
+            "calibration or colour chart; give --overwrite always, or another folder"
         )
 
 

@@ -33,11 +33,11 @@ def relight_subjects(options: RelightDataset) -> int:
             f"{options.dataset}: no subject is in a split; run prepare-dataset with another --split"
         )
     if not options.dry_run:
-        write_pairs(dataset, pairs, options.overwrite, _Spread(options.jobs, options.settings))
+        write_pairs(dataset, pairs, options.overwrite == "always", _Spread(options.jobs, options.settings))
     if options.lazy:
         print(pairs_path(dataset))
         return 0
-    work = _Relight(dataset, options.per_subject, options.memory_bytes, options.overwrite)
+    work = _Relight(dataset, options.per_subject, options.memory_bytes, options.overwrite == "always")
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     items = [Item(options.dataset / "olat" / name, output / name, name) for name in subjects]
     batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)

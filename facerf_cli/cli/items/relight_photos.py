@@ -26,7 +26,7 @@ from facerf_cli.cli.items.photos import (
 )
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
-from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.colour import ExposureRule, auto_exposure_ev
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
@@ -59,8 +59,8 @@ class Composer(Protocol):
     def light_layer(self, relit: Relit) -> np.ndarray:
         """The person under one of several lights, over black."""
 
-    def auto_exposure_ev(self, relit: Relit) -> float:
-        """The exposure that shows the person well."""
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure in EV of the person, by a rule."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +204,7 @@ class _RenderedStack:
             raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
         return {"normal": self.normals} if names else {}
 
-    def auto_exposure_ev(self, relit: Relit) -> float:
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         return auto_exposure_ev(relit.texture.permute(1, 2, 0).numpy(), self.seen)
 
 
@@ -225,7 +225,7 @@ def _write_setups(
     exposures_ev = _exposures_ev(parts, relit_by_part, shown.composer, work)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
-            path, ev = setup.output(item, tag, ".exr"), exposures_ev[setup.name]
+            path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
             image, layers = shown.composer.image(relit, ev, behind), shown.composer.layers(work.aov, relit)
             if setup.names:
@@ -239,12 +239,12 @@ def _exposures_ev(
     parts: Iterable[slice], relit_by_part: Callable[[slice], list[Relit]], composer: Composer, work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
-    if work.exposure_ev is not None:
-        return dict.fromkeys((setup.name for setup in work.setups), work.exposure_ev)
+    if isinstance(work.exposure, float):
+        return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     found: dict[str, float] = {}
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
-            chosen_ev = round(composer.auto_exposure_ev(relit), 2)
+            chosen_ev = round(composer.exposure_ev(relit, work.exposure), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
     return found
 

@@ -87,7 +87,7 @@ def test_a_dry_run_writes_nothing(bare: Path, capsys: Said) -> None:
         "--align",
         "--layout stage",
         "--colour-chart chart.exr",
-        "--overwrite",
+        "--overwrite always",
         "--crop 7",
         "--shard 1/2",
         "-j 2",

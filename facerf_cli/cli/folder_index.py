@@ -1,0 +1,160 @@
+"""The index of an output folder: what each output was made from, so that only stale ones are made again.
+
+`.facerf-index.jsonl` holds three kinds of rows: files that were read (size, time, inode and SHA-256, so that
+an unchanged file is not read again), recipes, and outputs (their recipe, input and SHA-256). The last
+row of a name counts. With `--shard` each process writes an index of its own and reads all.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from facerf_cli.cli.options import Shard
+from facerf_cli.cli.recipe import Recipe, RecipesOf, differences
+from facerf_cli.errors import InputError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.downloads import file_sha256
+from facerf_cli.logs import json_line
+
+_INDEXES = ".facerf-index*.jsonl"
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Made:
+    """Rows of an item that was made: its input as it was read, and its outputs."""
+
+    read: Row
+    outputs: tuple[Row, ...]
+
+
+def read_row(path: Path) -> Row:
+    """A row of a file to be read: its state and its digest. Raises InputError if it cannot be read."""
+    try:
+        state = os.stat(path)
+        digest = file_sha256(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
+    return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
+
+
+class FolderIndex:
+    """What the outputs of a folder were made from."""
+
+    def __init__(self, folder: Path, verb: str, shard: Shard, recipes_of: RecipesOf) -> None:
+        self._folder, self._verb = folder, verb
+        self._files: dict[str, Row] = {}
+        self._recipes: dict[str, Recipe] = {}
+        self._outputs: dict[str, Row] = {}
+        self._new: list[Row] = []  # files read since the rows were last written
+        self.edited: list[Path] = []  # finished outputs that are not as they were written
+        name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
+        self._path = folder / f".facerf-index{name}.jsonl"
+        for path in sorted(folder.glob(_INDEXES)):
+            self._read(path)
+        recipes = recipes_of(self.digest_of)
+        self._wanted = [(_key(recipe), recipe) for recipe in recipes]
+
+    def digest_of(self, path: Path) -> str:
+        """SHA-256 of a file; an unchanged one that the index knows is not read. Raises InputError."""
+        known = self._files.get(os.path.abspath(path))
+        try:
+            same = known is not None and _state(os.stat(path)).items() <= known.items()
+        except OSError:
+            same = False
+        if known is None or not same:
+            known = read_row(path)
+            self._note(known)
+        return str(known["sha256"])
+
+    def why_again(self, input_path: Path, outputs: Sequence[Path]) -> str | None:
+        """Say why an item must be made, None if it is finished; empty where none of its outputs exist."""
+        present = [path.exists() for path in outputs]
+        if not all(present):
+            return "an output is missing" if any(present) else ""
+        for number, path in enumerate(outputs):
+            row = self._outputs.get(self._name(path))
+            if row is None or row.get("verb") != self._verb:
+                return "there is no record of what they were made from"
+            key, recipe = self._wanted[number if len(self._wanted) > 1 else 0]
+            if row.get("recipe") != key:
+                old = self._recipes.get(str(row.get("recipe")), {})
+                return differences(old, recipe) if old else "other options"
+            if self._digest_or_none(input_path) != row.get("input"):
+                return "the input changed"
+            if path.stat().st_size == 0:
+                return "an output is empty"
+        self.edited += [path for path in outputs if self._is_edited(path)]
+        return None
+
+    def _is_edited(self, path: Path) -> bool:
+        return self._digest_or_none(path) != self._outputs[self._name(path)].get("sha256")
+
+    def open(self) -> None:
+        """Write the rows, those that are known and those of this run's recipes."""
+        self._recipes.update(self._wanted)
+        self._new.clear()
+        rows: list[Mapping[str, Any]] = list(self._files.values())
+        rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
+        rows += self._outputs.values()
+        with atomic_path(self._path) as temporary:
+            temporary.write_text("".join(json_line(row) + "\n" for row in rows), encoding="utf-8")
+
+    def add(self, made: Made, outputs: Sequence[Path]) -> None:
+        """Add the rows of an item that was made; `outputs` are those that have a recipe, in their order."""
+        rows: list[Row] = []
+        self._note(made.read)
+        keys = {self._name(path): self._key_of(number) for number, path in enumerate(outputs)}
+        for row in made.outputs:
+            self._note(row)
+            name = self._name(Path(row["file"]))
+            made_from = {"input": made.read["sha256"], "recipe": keys.get(name)}
+            rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], **made_from})
+        rows += self._new
+        self._new.clear()
+        with self._path.open("a", encoding="utf-8") as stream:
+            stream.write("".join(json_line(row) + "\n" for row in rows))
+
+    def _key_of(self, number: int) -> str:
+        return self._wanted[number if len(self._wanted) > 1 else 0][0]
+
+    def _digest_or_none(self, path: Path) -> str | None:
+        try:
+            return self.digest_of(path)
+        except InputError:
+            return None  # its item says so
+
+    def _note(self, row: Row) -> None:
+        self._files[str(row["file"])] = row
+        self._new.append(row)
+
+    def _name(self, path: Path) -> str:
+        return Path(os.path.relpath(path, self._folder)).as_posix()
+
+    def _read(self, path: Path) -> None:
+        for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
+            try:
+                row = json.loads(line)
+            except ValueError:  # a run that was killed may leave half a line
+                continue
+            if not isinstance(row, dict):
+                continue
+            if isinstance(row.get("of"), dict):
+                self._recipes[str(row.get("recipe"))] = row["of"]
+            elif "output" in row:
+                self._outputs[str(row["output"])] = row
+            elif "sha256" in row:
+                self._files[str(row.get("file"))] = row
+
+
+def _state(state: os.stat_result) -> dict[str, int]:
+    return {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "inode": state.st_ino}
+
+
+def _key(recipe: Recipe) -> str:
+    text = json.dumps(recipe, sort_keys=True)
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]

@@ -1,0 +1,159 @@
+"""Finished outputs: skipped where input, recipe and networks are those they were made with."""
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli import folder_index
+from facerf_cli.cli.options import Settings, Shard
+from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
+from facerf_cli.files.downloads import file_sha256
+from tests.cli.test_batch import rows, run
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "photos" / f"{name}.png").write_bytes(name.encode())
+    return tmp_path / "photos"
+
+
+def made(capsys: pytest.CaptureFixture) -> list[str]:
+    return [Path(line).name[0] for line in capsys.readouterr().out.splitlines()]
+
+
+def test_another_photo_of_the_same_name_is_processed(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run([photos], tmp_path / "out")
+    (photos / "a.png").write_bytes(b"z")  # as long as before
+    os.utime(photos / "b.png", ns=(1, 1))  # touched, and the same
+    capsys.readouterr()
+    assert run([photos], tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
+    assert "1 made again: the input changed" in said.err
+    assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
+
+
+def test_the_same_photo_from_elsewhere_is_finished(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run([photos], tmp_path / "out")
+    photos.rename(tmp_path / "moved")
+    capsys.readouterr()
+    run([tmp_path / "moved"], tmp_path / "out")
+    assert made(capsys) == []
+
+
+def test_other_options_make_all_again_and_say_which(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run([photos], tmp_path / "out", recipe={"lights": 150})
+    run([photos], tmp_path / "out", recipe={"lights": 300})
+    assert "2 made again: lights is 300, was 150" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
+def test_overwrite(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, overwrite: str, expected: str
+) -> None:
+    run([photos], tmp_path / "out")
+    (photos / "a.png").write_bytes(b"new")
+    capsys.readouterr()
+    run([photos], tmp_path / "out", overwrite=overwrite)
+    assert "".join(made(capsys)) == expected
+
+
+def test_outputs_of_unknown_origin_and_empty_ones_are_made_again(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    run([photos], out)
+    (out / "a_copy.bin").write_bytes(b"")
+    run([photos], out)
+    assert "1 made again: an output is empty" in capsys.readouterr().err
+    (out / ".facerf-index.jsonl").unlink()
+    run([photos], out)
+    assert "2 made again: there is no record" in capsys.readouterr().err
+
+
+def test_an_output_that_the_user_changed_is_kept_and_said(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "out"
+    run([photos], out)
+    (out / "a_copy.bin").write_bytes(b"retouched")
+    assert run([photos], out) == 0
+    assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
+    assert (out / "a_copy.bin").read_bytes() == b"retouched"
+
+
+def test_unchanged_files_are_not_read_again(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run([photos], tmp_path / "out")
+    read: list[Path] = []
+    monkeypatch.setattr(folder_index, "file_sha256", lambda path: read.append(path) or file_sha256(path))
+    run([photos], tmp_path / "out")
+    assert read == []
+
+
+def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run([photos], tmp_path / "out")
+    index = tmp_path / "out" / ".facerf-index.jsonl"
+    index.write_text('5\n{"output": 3}\n{"of": {}}\n{"sha256"' + "\n" + index.read_text() + '{"outp')
+    capsys.readouterr()
+    assert run([photos], tmp_path / "out") == 0
+    assert made(capsys) == []
+
+
+def test_shards_know_what_the_others_made(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    from facerf_cli.cli.batch import BatchOptions, run_batch
+    from tests.cli.test_batch import copy, outputs_of
+
+    for number in (1, 2):
+        settings, options = Settings(shard=Shard(number, 2)), BatchOptions(tmp_path / "out")
+        run_batch("copy", [str(photos)], copy, outputs_of, options, settings, lambda digest_of: [{}])
+    assert made(capsys) == ["a", "b"]
+    run([photos], tmp_path / "out")
+    assert made(capsys) == []
+    assert {row["status"] for row in rows(tmp_path / "out").values()} == {"done"}
+
+
+def test_a_single_photo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"bad")
+    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
+    assert (tmp_path / "out" / "report.jsonl").exists()  # a folder that was there stays
+
+
+@dataclass(frozen=True)
+class Inner:
+    matte: Path
+    jobs: int = field(default=1, metadata=NOT_IN_RECIPE)
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner
+    lights: str
+    checkpoint: Path | None = None
+
+
+def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "one").write_bytes(b"1")
+    (tmp_path / "two").write_bytes(b"1")
+    one = recipe_of(Outer(Inner(tmp_path / "one"), "150"), file_sha256)
+    assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
+    (tmp_path / "two").write_bytes(b"2")
+    other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
+    assert differences(one, other) == "lights is another, was 150; matte changed"
+    assert len(one["checkpoint"]) > 32  # the networks that facerf ships

@@ -1,0 +1,151 @@
+"""The items of a command line: which files, under which names."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
+from facerf_cli.cli.naming import NamePattern, split_frame
+from facerf_cli.errors import UsageError
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    folder = tmp_path / "photos"
+    for name in ("b.jpg", "a.png", "x/a.jpg", "x/c.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(name.encode())
+    return folder
+
+
+def names(tmp_path: Path, *inputs: Path, pattern: str | None = None) -> list[str]:
+    chosen = NamePattern.parse(pattern, "--name") if pattern else None
+    items = collect_items([str(path) for path in inputs], tmp_path / "out", PHOTO_SUFFIXES, chosen)
+    return [item.name for item in items]
+
+
+def test_a_folder_is_mirrored(photos: Path, tmp_path: Path) -> None:
+    assert names(tmp_path, photos) == ["Z", "a", "b", "x/a", "x/c"]
+
+
+def test_a_file_that_is_named_alone_has_its_name_only(photos: Path, tmp_path: Path) -> None:
+    (item,) = collect_items([str(photos / "x" / "a.jpg")], tmp_path / "out", PHOTO_SUFFIXES)
+    assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"
+
+
+def test_the_place_of_an_input_depends_on_no_other(photos: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere" / "deep" / "e.png"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.touch()
+    assert names(tmp_path, photos / "x", elsewhere) == [
+        *names(tmp_path, elsewhere),
+        *names(tmp_path, photos / "x"),
+    ]
+
+
+def test_a_file_that_is_given_twice_is_one_item(photos: Path, tmp_path: Path) -> None:
+    assert names(tmp_path, photos / "x" / "a.jpg", photos / "x", photos) == ["Z", "a", "b", "x/a", "x/c"]
+
+
+def test_two_inputs_that_meet_are_refused(photos: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"a.png and .*x/a.jpg: would both be written as a; .* --name"):
+        names(tmp_path, photos / "a.png", photos / "x" / "a.jpg")
+    (photos / "b.png").touch()
+    with pytest.raises(UsageError, match=r"b.jpg and .*b.png"):
+        names(tmp_path, photos)
+    assert names(tmp_path, photos, pattern="{dir}/{stem}_{ext}_{light}")[1:3] == ["a_png", "b_jpg"]
+    assert names(tmp_path, photos / "a.png", photos / "x" / "a.jpg", pattern="{parent}/{stem}") == [
+        "photos/a",
+        "x/a",
+    ]
+
+
+def test_only_case_may_tell_apart_files_of_one_folder(tmp_path: Path) -> None:
+    for name in ("f/a.jpg", "f/A.tif", "g/A.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert names(tmp_path, tmp_path / "f") == ["A", "a"]
+    with pytest.raises(UsageError, match="would both be written"):
+        names(tmp_path, tmp_path / "f" / "a.jpg", tmp_path / "g" / "A.jpg")
+
+
+def test_outputs_inside_the_input_folder_are_not_inputs(photos: Path) -> None:
+    (photos / "out").mkdir()
+    (photos / "out" / "b_relit.png").touch()
+    names = [item.name for item in collect_items([str(photos)], photos / "out", PHOTO_SUFFIXES)]
+    assert not [name for name in names if name.startswith("out")]
+    with pytest.raises(UsageError, match="output folder"):
+        collect_items([str(photos)], photos, PHOTO_SUFFIXES)
+
+
+def test_the_contact_sheet_beside_a_stack_is_no_input(tmp_path: Path) -> None:
+    for name in ("a_olat.exr", "a_olat.png", "b_olat.png"):
+        (tmp_path / name).touch()
+    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["a_olat", "b_olat"]
+
+
+def test_a_list_on_stdin(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
+    names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
+    assert names == ["b", "a", "c"]
+
+
+def test_names_that_end_in_nul(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (photos / "two\nlines.png").touch()
+    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\0{photos}/two\nlines.png\0"))
+    items = collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES, null_separated=True)
+    assert [item.name for item in items] == ["b", "two\nlines"]
+
+
+def test_frames(tmp_path: Path) -> None:
+    for number in (2, 10, 999, 1000):
+        (tmp_path / f"plate.{number:04d}.exr").touch()
+    found = list(expand_inputs([str(tmp_path / "plate.%04d.exr")]))
+    assert [Path(path).name for path in found] == [
+        "plate.0002.exr", "plate.0010.exr", "plate.0999.exr", "plate.1000.exr"
+    ]  # fmt: skip
+    assert list(expand_inputs(["plate.0998-1001.exr"])) == [
+        "plate.0998.exr", "plate.0999.exr", "plate.1000.exr", "plate.1001.exr"
+    ]  # fmt: skip
+    for wrong in ("plate.5-4.exr", "plate.1-900000.exr", str(tmp_path / "other.%04d.exr")):
+        with pytest.raises(UsageError, match=r"give FIRST-LAST|no such files"):
+            list(expand_inputs([wrong]))
+    (tmp_path / "2020-2021.jpg").touch()
+    assert list(expand_inputs([str(tmp_path / "2020-2021.jpg")])) == [str(tmp_path / "2020-2021.jpg")]
+
+
+def test_patterns_of_names(tmp_path: Path) -> None:
+    def path(text: str, **fields: str) -> str:
+        item = Item(
+            Path("d/in/me.0007.PNG"), tmp_path / "in" / "me.0007", "in/me.0007", Path("in/me.0007.PNG")
+        )
+        return item.filled(NamePattern.parse(text, "--name"), **fields).relative_to(tmp_path).as_posix()
+
+    assert path("{dir}/{stem}_{light}.{frame:04}", light="sky") == "in/me_sky.0007"
+    assert path("{dir}/{stem}_{light}.{frame:04}", light="sky", frame="0012") == "in/me_sky.0012"
+    assert path("{light}/{stem}.{ext}", light="sky", tag="_face0") == "sky/me_face0.png"
+    assert path("{stem}_{light}-x") == "me-x"
+    wrong = (
+        "{x}",
+        "{stem.__class__}",
+        "{stem!r}",
+        "{stem:>9}",
+        "{",
+        "../{stem}",
+        "/{stem}",
+        "{frame:99}",
+        "",
+    )
+    for text in wrong:
+        with pytest.raises(UsageError, match="--name"):
+            NamePattern.parse(text, "--name")
+
+
+def test_frame_numbers_at_the_end_of_a_name() -> None:
+    assert split_frame("sky.0012") == ("sky", ".0012")
+    assert split_frame("v2.final") == ("v2.final", "")
+    assert split_frame("a\nb.01") == ("a\nb", ".01")
