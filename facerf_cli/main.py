@@ -18,6 +18,8 @@ import typer
 
 from facerf_cli import __version__
 from facerf_cli.cli import evaluate, face_model
+from facerf_cli.cli.check import check
+from facerf_cli.cli.config import config, read_config
 from facerf_cli.cli.convert_light import convert_light
 from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
@@ -46,14 +48,16 @@ VERBS: tuple[Callable[..., Any], ...] = (
     relight_dataset,
     train,
     envmap,
+    check,
     doctor,
+    config,
 )
 # Verbs with subcommands.
 GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
 
 # Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version", "-0", "--null"})
-VALUED = frozenset({"--device", "--checkpoint", "--seed"})
+VALUED = frozenset({"--device", "--checkpoint", "--seed", "--config"})
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
@@ -70,6 +74,12 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"facerf {__version__}")
         raise typer.Exit()
+
+
+def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
+    if path is not None:
+        context.default_map = read_config(path, context.command)
+    return path
 
 
 @app.callback()
@@ -92,6 +102,17 @@ def _global_options(
         bool,
         typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0."),
     ] = Settings.null_separated,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            envvar="FACERF_CONFIG",
+            callback=_take_defaults,
+            is_eager=True,
+            metavar="FILE",
+            help="Take defaults of options from this TOML file (see `facerf config`).",
+            show_default=False,
+        ),
+    ] = None,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,

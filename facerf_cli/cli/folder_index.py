@@ -8,9 +8,9 @@ row of a name counts. With `--shard` each process writes an index of its own and
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from facerf_cli.cli.options import Shard
@@ -42,26 +42,61 @@ def read_row(path: Path) -> Row:
     return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
 
 
+class _Rows:
+    """The rows of the indexes of a folder: files by path, recipes by key, outputs by path in the folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files: dict[str, Row] = {}
+        self.recipes: dict[str, Recipe] = {}
+        self.outputs: dict[str, Row] = {}
+        for path in sorted(folder.glob(_INDEXES)):
+            for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
+                self._take(line)
+
+    def _take(self, line: str) -> None:
+        try:
+            row = json.loads(line)
+        except ValueError:  # a run that was killed may leave half a line
+            return
+        if not isinstance(row, dict):
+            return
+        if isinstance(row.get("of"), dict):
+            self.recipes[str(row.get("recipe"))] = row["of"]
+        elif "output" in row:
+            name = PurePosixPath(str(row["output"]))
+            if not name.is_absolute() and ".." not in name.parts:
+                self.outputs[name.as_posix()] = row
+        elif "sha256" in row:
+            self.files[str(row.get("file"))] = row
+
+
+def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Read all outputs in a folder's index; yield each, and `whole`, `missing`, `empty` or `changed`."""
+    for name, row in sorted(_Rows(folder).outputs.items()):
+        path = folder / name
+        if not path.is_file():
+            yield path, "missing"
+        elif not path.stat().st_size:
+            yield path, "empty"
+        else:
+            yield path, "whole" if read_row(path)["sha256"] == row.get("sha256") else "changed"
+
+
 class FolderIndex:
     """What the outputs of a folder were made from."""
 
     def __init__(self, folder: Path, verb: str, shard: Shard, recipes_of: RecipesOf) -> None:
         self._folder, self._verb = folder, verb
-        self._files: dict[str, Row] = {}
-        self._recipes: dict[str, Recipe] = {}
-        self._outputs: dict[str, Row] = {}
+        self._rows = _Rows(folder)
         self._new: list[Row] = []  # files read since the rows were last written
         self.edited: list[Path] = []  # finished outputs that are not as they were written
         name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
         self._path = folder / f".facerf-index{name}.jsonl"
-        for path in sorted(folder.glob(_INDEXES)):
-            self._read(path)
-        recipes = recipes_of(self.digest_of)
-        self._wanted = [(_key(recipe), recipe) for recipe in recipes]
+        self._wanted = [(_key(recipe), recipe) for recipe in recipes_of(self.digest_of)]
 
     def digest_of(self, path: Path) -> str:
         """SHA-256 of a file; an unchanged one that the index knows is not read. Raises InputError."""
-        known = self._files.get(os.path.abspath(path))
+        known = self._rows.files.get(os.path.abspath(path))
         try:
             same = known is not None and _state(os.stat(path)).items() <= known.items()
         except OSError:
@@ -77,12 +112,12 @@ class FolderIndex:
         if not all(present):
             return "an output is missing" if any(present) else ""
         for number, path in enumerate(outputs):
-            row = self._outputs.get(self._name(path))
+            row = self._rows.outputs.get(self._name(path))
             if row is None or row.get("verb") != self._verb:
                 return "there is no record of what they were made from"
             key, recipe = self._wanted[number if len(self._wanted) > 1 else 0]
             if row.get("recipe") != key:
-                old = self._recipes.get(str(row.get("recipe")), {})
+                old = self._rows.recipes.get(str(row.get("recipe")), {})
                 return differences(old, recipe) if old else "other options"
             if self._digest_or_none(input_path) != row.get("input"):
                 return "the input changed"
@@ -92,15 +127,15 @@ class FolderIndex:
         return None
 
     def _is_edited(self, path: Path) -> bool:
-        return self._digest_or_none(path) != self._outputs[self._name(path)].get("sha256")
+        return self._digest_or_none(path) != self._rows.outputs[self._name(path)].get("sha256")
 
     def open(self) -> None:
         """Write the rows, those that are known and those of this run's recipes."""
-        self._recipes.update(self._wanted)
+        self._rows.recipes.update(self._wanted)
         self._new.clear()
-        rows: list[Mapping[str, Any]] = list(self._files.values())
-        rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
-        rows += self._outputs.values()
+        rows: list[Mapping[str, Any]] = list(self._rows.files.values())
+        rows += [{"recipe": key, "of": recipe} for key, recipe in self._rows.recipes.items()]
+        rows += self._rows.outputs.values()
         with atomic_path(self._path) as temporary:
             temporary.write_text("".join(json_line(row) + "\n" for row in rows), encoding="utf-8")
 
@@ -129,26 +164,11 @@ class FolderIndex:
             return None  # its item says so
 
     def _note(self, row: Row) -> None:
-        self._files[str(row["file"])] = row
+        self._rows.files[str(row["file"])] = row
         self._new.append(row)
 
     def _name(self, path: Path) -> str:
         return Path(os.path.relpath(path, self._folder)).as_posix()
-
-    def _read(self, path: Path) -> None:
-        for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-            try:
-                row = json.loads(line)
-            except ValueError:  # a run that was killed may leave half a line
-                continue
-            if not isinstance(row, dict):
-                continue
-            if isinstance(row.get("of"), dict):
-                self._recipes[str(row.get("recipe"))] = row["of"]
-            elif "output" in row:
-                self._outputs[str(row["output"])] = row
-            elif "sha256" in row:
-                self._files[str(row.get("file"))] = row
 
 
 def _state(state: os.stat_result) -> dict[str, int]:

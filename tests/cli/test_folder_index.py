@@ -10,6 +10,7 @@ from facerf_cli.cli import folder_index
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
 from facerf_cli.files.downloads import file_sha256
+from facerf_cli.main import main
 from tests.cli.test_batch import rows, run
 
 
@@ -90,6 +91,20 @@ def test_an_output_that_the_user_changed_is_kept_and_said(
     assert run([photos], out) == 0
     assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
+
+
+def test_check_reads_all_outputs_again(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "out"
+    run([photos], out)
+    capsys.readouterr()
+    assert main(["check", str(out)]) == 0
+    assert "2 whole" in capsys.readouterr().err
+    (out / "a_copy.bin").write_bytes(b"A")  # as long as before
+    (out / "b_copy.bin").unlink()
+    assert main(["check", str(out)]) == 1
+    said = capsys.readouterr()
+    assert said.out.split("\n")[:2] == [f"{out / 'a_copy.bin'}: changed", f"{out / 'b_copy.bin'}: missing"]
+    assert main(["check", str(photos)]) == 2 and "no index" in capsys.readouterr().err
 
 
 def test_unchanged_files_are_not_read_again(
