@@ -93,7 +93,7 @@ def estimate_light(
     matte: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
+            metavar="FILE|DIR|PATTERN",
             help="Use only what a grey image, or its alpha, of the photo's size shows (for example to leave "
             "out hair and glasses). The photo's own alpha is used in the same way.",
             show_default=False,

@@ -40,10 +40,14 @@ class Item:
         `tag` goes to the stem's end.
         """
         folder = self.output_base.parents[len(PurePosixPath(self.name).parts) - 1]
+        return folder / self.pattern_text(pattern, tag, **more)
+
+    def pattern_text(self, pattern: NamePattern, tag: str = "", **more: str) -> str:
+        """A pattern filled with the item's fields; see `filled`."""
         own = fields_of(self.input_path, self.mirrored or PurePosixPath(self.input_path.name))
         own["stem"] += tag
         given = {name: value for name, value in more.items() if value}
-        return folder / pattern.filled(own | given)
+        return pattern.filled(own | given)
 
 
 def collect_items(

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.photo_options import PhotoOptions, check_companion
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
@@ -55,11 +55,10 @@ class LightOptions:
             raise UsageError(
                 f"--lights {self.rig}: too many lights to estimate; give {MOST_ESTIMATED} at most"
             )
-        if self.matte is not None and not self.matte.is_file():
-            raise UsageError(f"--matte {self.matte}: no such file; give one that exists")
+        check_companion(self.matte, "--matte")
 
 
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
     """Options for photos of which only the light is used: those of the inputs that describe one file go."""
-    folder = photo.landmarks if photo.landmarks is not None and photo.landmarks.is_dir() else None
+    folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
     return replace(photo, colourspace=None, face="largest", landmarks=folder)

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from facerf_cli.cli.naming import OF_PHOTOS, NamePattern
 from facerf_cli.cli.options import Settings
 from facerf_cli.errors import UsageError
 
@@ -24,8 +25,9 @@ LandmarksOption = Annotated[
     Path | None,
     typer.Option(
         "--landmarks",
-        metavar="FILE|DIR",
-        help="Read 68 landmarks (.pts or .json) from a file, or from a folder with a file for each photo.",
+        metavar="FILE|DIR|PATTERN",
+        help="Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a pattern "
+        "(points/{stem}.pts).",
         show_default="detect them",
     ),
 ]
@@ -82,8 +84,7 @@ class PhotoOptions:
             )
         if self.landmarks is not None and self.geometry == "network":
             raise UsageError("--landmarks: --geometry network uses none; leave one out")
-        if self.landmarks is not None and not self.landmarks.exists():
-            raise UsageError(f"--landmarks {self.landmarks}: no such file or folder; give one that exists")
+        check_companion(self.landmarks, "--landmarks")
 
     def preparation(self, dry_run: bool) -> Callable[[], None]:
         """A function that loads what every photo needs; in a dry run without the networks."""
@@ -103,3 +104,11 @@ class PhotoOptions:
         written last and mark the photo as finished.
         """
         return "_face0" if self.face == "all" else ""
+
+
+def check_companion(given: Path | None, option: str) -> None:
+    """Raise UsageError for a file or folder that does not exist; a pattern is filled in for each photo."""
+    if given is not None and not given.exists():
+        if "{" not in str(given):
+            raise UsageError(f"{option} {given}: no such file or folder; give one that exists")
+        NamePattern.parse(given.as_posix().lstrip("/"), option, OF_PHOTOS)

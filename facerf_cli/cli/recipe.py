@@ -77,9 +77,16 @@ def _plain(value: Any, digest_of: DigestOf) -> Any:
     if isinstance(value, (str, Path)) and os.path.isfile(value):
         return _content([Path(value)], digest_of)
     if isinstance(value, Path):
-        files = (path for path in value.rglob("*") if path.is_file()) if value.is_dir() else ()
-        return _content(sorted(files), digest_of)
+        return _of_folder(value, digest_of)
     return value
+
+
+def _of_folder(path: Path, digest_of: DigestOf) -> str:
+    """The content of a folder; for a pattern (mattes/{stem}.png) of the folder that it begins with."""
+    fixed, brace, rest = str(path).partition("{")
+    folder = Path(f"{fixed}_").parent if brace else path
+    files = (file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else ()
+    return f"{brace}{rest}{_content(sorted(files), digest_of)}"
 
 
 def _content(files: Iterable[Path], digest_of: DigestOf) -> str:

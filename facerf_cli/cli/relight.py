@@ -33,6 +33,7 @@ from facerf_cli.cli.photo_options import (
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
+    check_companion,
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
@@ -222,8 +223,9 @@ def relight(
     matte: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE",
-            help="Change only what a grey image, or its alpha, of the photo's size shows.",
+            metavar="FILE|DIR|PATTERN",
+            help="Change only what a grey image, or its alpha, of the photo's size shows; of each photo its "
+            "own from a folder, or by a pattern (mattes/{stem}.png).",
             show_default=False,
         ),
     ] = None,
@@ -281,8 +283,7 @@ def relight(
     behind = parse_background(background)
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
-    if matte is not None and not matte.is_file():
-        raise UsageError(f"--matte {matte}: no such file; give one that exists")
+    check_companion(matte, "--matte")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))
     work = Relight(

@@ -172,3 +172,14 @@ def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path:
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
     assert differences(one, other) == "lights is another, was 150; matte changed"
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
+
+
+def test_the_files_of_a_folder_and_of_a_pattern_are_in_the_recipe(tmp_path: Path) -> None:
+    (tmp_path / "mattes").mkdir()
+    (tmp_path / "mattes" / "a.png").write_bytes(b"1")
+    given = [tmp_path / "mattes", tmp_path / "mattes" / "{stem}.png"]
+    before = [recipe_of(Inner(path), file_sha256)["matte"] for path in given]
+    (tmp_path / "mattes" / "a.png").write_bytes(b"2")
+    assert all(
+        recipe_of(Inner(path), file_sha256)["matte"] != old for path, old in zip(given, before, strict=True)
+    )

@@ -56,11 +56,11 @@ def light_of_photo(path: Path, options: LightOptions) -> RigLight:
     item = Item(path, Path(path.stem), path.stem)
     image = read_photo(item, options.photo)
     face = fit_faces(item, image, options.photo)[0]
-    return _estimate(path, image, face.head, options)[0].light
+    return _estimate(item, image, face.head, options)[0].light
 
 
 def _estimate(
-    path: Path, image: LinearImage, head: Head, options: LightOptions
+    item: Item, image: LinearImage, head: Head, options: LightOptions
 ) -> tuple[LightEstimate, dict[str, Any]]:
     """The light of one fitted face, and facts for the report."""
     models = load_models_once(options.photo)
@@ -68,30 +68,30 @@ def _estimate(
     try:
         estimate = estimate_light(
             models,
-            _unmasked(image, head, options),
+            _unmasked(item, image, head, options),
             options.reflectance,
             directions_of(options.rig),
             Estimator(options.non_negative, features),
             options.keep_eyes,
         )
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{item.input_path}: {error}") from None
     residual = estimate.evidence.residual(estimate.explained)
     if residual > _UNEXPLAINED:
         log.warning(
             "%s: no light explains this face well (%.0f %% of it is left over); look at _light.png: perhaps "
             "the fit is off, or it is not a face",
-            path,
+            item.input_path,
             100 * residual,
         )
     return estimate, _facts(estimate, residual, options, name)
 
 
-def _unmasked(image: LinearImage, head: Head, options: LightOptions) -> Head:
+def _unmasked(item: Item, image: LinearImage, head: Head, options: LightOptions) -> Head:
     """The head without what the photo's alpha or --matte leaves out."""
     masks = [] if image.alpha is None else [image.alpha]
     if options.matte is not None:
-        masks.append(read_matte(options.matte, image.pixels.shape[:2]))
+        masks.append(read_matte(item, options.matte, image.pixels.shape[:2]))
     for mask in masks:
         in_crop = head.fit.crop.apply(mask[..., None])[..., 0]
         head = head.without(load_models_once(options.photo).face, in_crop)
@@ -134,7 +134,7 @@ def feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
 def _write(
     item: Item, image: LinearImage, face: FittedFace, options: LightOptions, width_px: int, sh_order: int
 ) -> dict[str, Any]:
-    estimate, facts = _estimate(item.input_path, image, face.head, options)
+    estimate, facts = _estimate(item, image, face.head, options)
     models = load_models_once(options.photo)
     said = {f"facerf:light_{name}": _as_metadata(value) for name, value in facts.items()}
     metadata = provenance(item, options.photo, models.checkpoint_name) | said

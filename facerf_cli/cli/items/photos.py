@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.cli.items.companions import companion
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
@@ -163,17 +164,7 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
 
 def _given(item: Item, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
-    return face_at(read_landmarks(_landmark_file(item, landmarks) if landmarks.is_dir() else landmarks))
-
-
-def _landmark_file(item: Item, folder: Path) -> Path:
-    """The photo's landmarks in a folder that mirrors the photos', or that holds them all in one place."""
-    for name in (item.name, item.input_path.stem):
-        for suffix in _LANDMARK_SUFFIXES:
-            path = folder / f"{name}{suffix}"
-            if path.is_file():
-                return path
-    raise InputError(f"{item.input_path}: no {item.name}.pts or .json in {folder}; add it there")
+    return face_at(read_landmarks(companion(item, landmarks, _LANDMARK_SUFFIXES, "--landmarks")))
 
 
 def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
@@ -192,8 +183,9 @@ def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOption
     return head
 
 
-def read_matte(path: Path, size_px: tuple[int, ...]) -> np.ndarray:
-    """A matte [H, W] in 0..1 of a photo of that size: the file's alpha, or the mean of its values."""
+def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
+    """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
+    path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
     image = read_image(path, "linear")
     matte = image.pixels.mean(-1) if image.alpha is None else image.alpha
     if matte.shape != tuple(size_px):

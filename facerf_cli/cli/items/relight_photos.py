@@ -94,7 +94,7 @@ def _relight_face(
     item: Item, image: LinearImage, face: FittedFace, work: Relight
 ) -> Iterator[tuple[Path, float]]:
     models, head = load_models_once(work.photo), face.head
-    target = _target(head.fit, image, work)
+    target = _target(item, head.fit, image, work)
     reflectance = reflectance_of(
         models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels
     )
@@ -127,13 +127,13 @@ def _relight_face(
     yield from _write_setups(item, face.tag, shown, work, metadata)
 
 
-def _target(fit: FaceFit, image: LinearImage, work: Relight) -> Target:
+def _target(item: Item, fit: FaceFit, image: LinearImage, work: Relight) -> Target:
     """The head in the pose of `--pose`, composed as the options choose."""
     rotation = rotation_of(work.pose)
     posed = None if rotation is None else replace(fit, rotation=rotation)
     if work.composite != "photo":
         return Target(posed, work.composite)
-    matte = None if work.matte is None else read_matte(work.matte, image.pixels.shape[:2])
+    matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
     kind = work.background.kind
     return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
 
