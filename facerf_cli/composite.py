@@ -81,6 +81,14 @@ class Relit:
     texture: Tensor
     surround: Tensor | None = None
 
+    def plus(self, rgb: Tensor, texture: Tensor, surround: Tensor | None) -> "Relit":
+        """This and another light of rgb 1, made so bright [3]."""
+        rgb = rgb[:, None, None]
+        around = self.surround
+        if around is not None and surround is not None:
+            around = around + rgb * surround
+        return Relit(self.texture + rgb * texture, around)
+
 
 @dataclass(frozen=True, eq=False)
 class RelitImage:
@@ -127,7 +135,7 @@ class Composition:
         person: PersonAround | None = None,
     ) -> None:
         fit = head.fit if target.fit is None else target.fit
-        vertices = fit.vertices_camera(model)
+        self.vertices_m = vertices = fit.vertices_camera(model)  # [V, 3], camera space
         size_px = (fit.crop.size_px, fit.crop.size_px) if photo is None else (photo.shape[0], photo.shape[1])
         crop = Crop(0.0, 0.0, float(fit.crop.size_px), fit.crop.size_px) if photo is None else fit.crop
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)

@@ -8,7 +8,7 @@ The verbs on photos, the protocols of `evaluate` and most benchmarks call these 
 scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,9 @@ from facerf_cli.field import (
 )
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.light.studio_points import NearLights
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
+from facerf_cli.near_textures import near_texture
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
@@ -290,8 +292,9 @@ def relit_by(
     directions: Tensor,
     weights: Tensor,
     target: Target = AS_IN_PHOTO,
+    near: NearLights | None = None,
 ) -> Iterator[Relit]:
-    """Relight a head under M sums, rgb weights [M, L, 3], of lights [L, 3], for a composition.
+    """Relight a head under M sums, rgb weights [M, L, 3], of lights [L, 3] and near ones, for a composition.
 
     One prediction of the lights serves all sums. Of the field, which is linear in light, the surround is
     summed over its lights, too; the models that the paper compares with are not linear where they are
@@ -299,17 +302,27 @@ def relit_by(
     """
     surround = composition.surround
     turn = None if target.fit is None else head.fit.turn_to(target.fit.rotation)
+    lamps = near.around(composition.vertices_m.mean(0)) if near else []
     if isinstance(surround, WholePerson) and isinstance(reflectance, PortraitField):
-        lit = reflectance.lit(directions, weights)
-        textures = reflectance.blended(reflectance.field.relit(directions, weights), lit)
-        yield from map(Relit, textures, lit.stacked)
+        lit = reflectance.lit(directions, weights, lamps)
+        textures = reflectance.field.relit(directions, weights)
+        for points, some in lamps:
+            texture = near_texture(reflectance.field, points, composition.vertices_m, textures.shape[-1])
+            textures = textures + some[..., None, None] * texture
+        yield from map(Relit, reflectance.blended(textures, lit), lit.stacked)
         return
-    if isinstance(surround, Surround) and isinstance(reflectance, Field):
-        summed = weighted_sums(
-            reflectance.olats(directions, turn), weights, lambda olats: olats, surround.changes
-        )
-        yield from map(Relit, *summed)
-        return
-    for texture in reflectance.relit(directions, weights, turn):
-        change = surround.changes(texture[None])[0] if isinstance(surround, Surround) else None
-        yield Relit(texture, change)
+    changes = surround.changes if isinstance(surround, Surround) else None
+    pairs: Iterable[tuple[Tensor, Tensor | None]]
+    if changes and isinstance(reflectance, Field):
+        olats = reflectance.olats(directions, turn)
+        pairs = zip(*weighted_sums(olats, weights, lambda olats: olats, changes), strict=True)
+    else:
+        textures = reflectance.relit(directions, weights, turn)
+        pairs = ((x, changes(x[None])[0] if changes else None) for x in textures)
+    side = head.face.texture.shape[-1]
+    extra = [near_texture(reflectance, points, composition.vertices_m, side, turn) for points, _ in lamps]
+    for number, pair in enumerate(pairs):
+        relit = Relit(*pair)
+        for texture, (_, some) in zip(extra, lamps, strict=True):
+            relit = relit.plus(some[number], texture, changes(texture[None])[0] if changes else None)
+        yield relit

@@ -6,9 +6,12 @@ are mixed. As the field's, the maps are corrected by the photo's quotient, so th
 photo back.
 """
 
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +24,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
 from facerf_cli.field import Field, OwnLight
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -58,6 +62,16 @@ class PortraitLight:
         return torch.cat([self.shading, self.highlights, self.reached], 1)
 
 
+class _Some(NamedTuple):
+    """Some lights: maps [l, S, S] and weights [M, l, 3]; `sent` is what would arrive without shadows."""
+
+    shading: Tensor
+    highlights: Tensor
+    arrives: Tensor
+    sent: Tensor
+    weights: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class PortraitField:
     """The light transport of a person; a `Reflectance`, whose textures are those of the face."""
@@ -85,7 +99,7 @@ class PortraitField:
         """The field in the units of the photo's light, corrected to give the photo back under it."""
         used = own.light.weights.sum(1) > 0
         directions, weights = own.light.directions[used], own.light.weights[used]
-        shade, glow, _ = self._shaded(directions)
+        shade, glow, _ = self._shaded(directions, self.person.visibility(directions))
         olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
@@ -93,27 +107,51 @@ class PortraitField:
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
         return replace(self, exposure=exposure, correction=correction)
 
-    def _shaded(self, lights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Shading, highlights and the share that arrives [l, S, S] of single lights [l, 3]."""
-        visible = self.person.visibility(lights)[None]
-        wide = F.interpolate(visible, size=self.person.image.shape[1:], mode="bilinear", align_corners=False)
+    def _shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Shading, highlights and the share that arrives [l, S, S] of single lights, given their visibility.
+
+        Lights [l, 3], or [l, S, S, 3] by pixel, are of rgb 1.
+        """
+        size = self.person.image.shape[1:]
+        wide = F.interpolate(visible[None], size=size, mode="bilinear", align_corners=False)
         shade, glow, arrives = self.maps.shaded(lights[None], wide)
         return shade[0], glow[0], arrives[0]
 
-    @torch.no_grad()
-    def lit(self, directions: Tensor, weights: Tensor) -> PortraitLight:
-        """The person under M sums, rgb weights [M, L, 3], of lights [L, 3]."""
-        size = self.person.image.shape
-        shading, highlights, reached = torch.zeros(3, len(weights), *size).unbind(0)
+    def _far(self, directions: Tensor, weights: Tensor) -> Iterator[_Some]:
+        """Batches of far lights [L, 3] with rgb weights [M, L, 3]; those of weight 0 are left out."""
         used = weights.abs().sum((0, 2)) > 0
-        if not used.any():
-            return PortraitLight(shading, highlights, reached)
-        for lights, some in zip(
-            torch.split(directions[used], _LIGHTS_AT_ONCE),
-            torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
-            strict=True,
-        ):
-            shade, glow, arrives = self._shaded(lights)
+        if used.any():
+            for lights, some in zip(
+                torch.split(directions[used], _LIGHTS_AT_ONCE),
+                torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
+                strict=True,
+            ):
+                maps = self._shaded(lights, self.person.visibility(lights))
+                yield _Some(*maps, torch.ones(len(lights), 1, 1), some)
+
+    def _near(self, points: PointLights, weights: Tensor) -> Iterator[_Some]:
+        """Batches of the points of a near light with rgb weights [M, 3]."""
+        toward, irradiance = points.arriving(self.person.maps.positions_m)
+        for first in range(0, len(toward), _LIGHTS_AT_ONCE):
+            batch = slice(first, first + _LIGHTS_AT_ONCE)
+            sent = irradiance[batch]
+            visible = self.person.visibility_of_points(points.places_m[batch])
+            shade, glow, arrives = self._shaded(toward[batch], visible)
+            some = weights[:, None].expand(-1, len(sent), -1)
+            yield _Some(sent * shade, sent * glow, sent * arrives, sent, some)
+
+    @torch.no_grad()
+    def lit(
+        self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
+    ) -> PortraitLight:
+        """The person under M sums, rgb weights [M, L, 3], of lights [L, 3].
+
+        `near` are further lights, each with its rgb weights [M, 3].
+        """
+        size = self.person.image.shape
+        shading, highlights, reached, sent = torch.zeros(4, len(weights), *size).unbind(0)
+        batches = (self._far(directions, weights), *(self._near(*light) for light in near))
+        for shade, glow, arrives, whole, some in itertools.chain(*batches):
             shade, glow = (x[:, None].expand(-1, 3, -1, -1) for x in (shade, glow))
             if self.correction is not None:
                 factor, added = self.correction.terms(self.maps.albedo * shade + glow)
@@ -121,7 +159,8 @@ class PortraitField:
             shading = shading + torch.einsum("mlc,lcij->mcij", some, shade)
             highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow)
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
-        return PortraitLight(shading, highlights, reached / weights.sum(1).clamp_min(1e-6)[..., None, None])
+            sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
+        return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6))
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] of the face; of a turned head the neural field's alone."""

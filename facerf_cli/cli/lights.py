@@ -1,23 +1,22 @@
 """The light setups that `facerf relight` renders (maps, rotations, single lights) and their names."""
 
 import glob
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.light_entries import lit_images
 from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.naming import NamePattern, split_frame
-from facerf_cli.cli.values import azel, numbers
+from facerf_cli.cli.values import MOST_FRAMES, is_sweep, numbers, sweep
 from facerf_cli.errors import UsageError
+from facerf_cli.light.studio import StudioLight
 
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "paper"]
 DRAWN = "procedural:"
-_MOST_FRAMES = 9999
-_LIGHT_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,7 @@ class PhotoLight:
 
 @dataclass(frozen=True)
 class LightSetup:
-    """The light of one image of every photo: a map, rotated, or lights (azimuth, elevation, r, g, b).
+    """The light of one image of every photo: a map, rotated, or single lights.
 
     Lights with `names` are layers of the image, too.
     """
@@ -49,7 +48,7 @@ class LightSetup:
     frame: str = ""  # '.0001': frame numbers, which end a file's name
     envmap: Path | DrawnMap | PhotoLight | None = None
     rotate_deg: float = 0.0
-    lights: tuple[tuple[float, ...], ...] = ()
+    lights: tuple[StudioLight, ...] = ()
     names: tuple[str, ...] = ()
 
     def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
@@ -90,9 +89,10 @@ def collect_setups(
         for photo in lit
         for turn, number, degrees in rotations
     ]
-    setups += [_single_lights(text) for text in lights if "=" not in text]
-    if named := [part for text in lights if "=" in text for part in text.split(";")]:
-        setups.append(_named_lights(named))
+    for image in lit_images(lights):
+        for number, shining in enumerate(image.frames):
+            frame = f".{number:04d}" if image.is_numbered else ""
+            setups.append(LightSetup(image.name, frame, lights=shining, names=image.names))
     if not setups:
         raise UsageError("no light given; add --envmap, --light, or --light-from with a photo")
     if rotate is not None and not any(setup.envmap for setup in setups):
@@ -110,8 +110,8 @@ def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
     from facerf_cli.synth.sky.skies import kind_of, parse_envmaps
 
     most = max(len(parse_envmaps(word, seed)) for word in words)
-    if most > _MOST_FRAMES:
-        raise UsageError(f"--envmap {DRAWN}{most}: {_MOST_FRAMES} maps are the most; give fewer")
+    if most > MOST_FRAMES:
+        raise UsageError(f"--envmap {DRAWN}{most}: {MOST_FRAMES} maps are the most; give fewer")
     return [DrawnMap(f"{index:05d}_{kind_of(index, seed)}", index, seed) for index in range(most)]
 
 
@@ -138,42 +138,12 @@ def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
     """Parse `DEG` or `FROM:TO:N` (N frames, TO left out) to (suffix of the name, frame, degrees)."""
     if text is None:
         return [("", "", 0.0)]
-    if ":" not in text:
+    if not is_sweep(text):
         degrees = numbers(text, ("DEG or FROM:TO:N",), "--rotate")[0]
         return [(f"_rot{degrees:g}", "", degrees)]
-    try:
-        start, end, count = numbers(text.replace(":", ","), ("FROM,TO,N",), "--rotate")
-    except UsageError:
-        count = 0.0
-    if not (count.is_integer() and 1 <= count <= _MOST_FRAMES):
-        raise UsageError(f"--rotate {text!r}: give degrees, or FROM:TO:N with N frames, as in 0:360:24")
-    return [("", f".{k:04d}", start + (end - start) * k / count) for k in range(int(count))]
+    return [("", f".{frame:04d}", degrees) for frame, degrees in enumerate(sweep(text, "--rotate"))]
 
 
 def _expand_glob(entry: str) -> list[str]:
     found = [] if Path(entry).exists() else sorted(glob.glob(entry))
     return found or [entry]
-
-
-def _named_lights(parts: Sequence[str]) -> LightSetup:
-    """Parse `NAME=az,el[,r,g,b]` of several lights: one image, with a layer for each."""
-    names, given = [], []
-    for part in parts:
-        name, _, text = part.partition("=")
-        if not _LIGHT_NAME.fullmatch(name.strip()) or name.strip() in names:
-            raise UsageError(f"--light {part!r}: give each light a name of its own, letters and digits")
-        names.append(name.strip())
-        given.append(azel(text, ("AZ,EL", "AZ,EL,R,G,B"), "--light"))
-    return LightSetup(f"light_{'+'.join(names)}", lights=tuple(map(_with_colour, given)), names=tuple(names))
-
-
-def _with_colour(values: Sequence[float]) -> tuple[float, ...]:
-    return tuple(values) if len(values) == 5 else (*values, 1.0, 1.0, 1.0)
-
-
-def _single_lights(text: str) -> LightSetup:
-    """Parse `az,el[,r,g,b][;...]`: lights that shine together."""
-    parts = [part for part in text.split(";") if part.strip()] or [""]
-    given = [azel(part, ("AZ,EL", "AZ,EL,R,G,B"), "--light") for part in parts]
-    name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
-    return LightSetup(f"light_{name}", lights=tuple(map(_with_colour, given)))

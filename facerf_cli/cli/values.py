@@ -8,6 +8,7 @@ from typing import Literal
 from facerf_cli.errors import UsageError
 
 MOST_LIGHTS = 4096
+MOST_FRAMES = 9999
 _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 
@@ -35,6 +36,22 @@ def azel(text: str, forms: tuple[str, ...], option: str) -> list[float]:
     if min(values[2:], default=0) < 0:
         raise UsageError(f"{option} {text!r}: the colour is negative; give values from 0")
     return values
+
+
+def is_sweep(text: str) -> bool:
+    """True for `FROM:TO:N`, a value for each of N frames."""
+    return ":" in text
+
+
+def sweep(text: str, option: str) -> list[float]:
+    """Parse degrees `FROM:TO:N`: N equal steps from FROM on, without TO, so that turns join."""
+    try:
+        start, end, count = numbers(text.replace(":", ","), ("FROM,TO,N",), option)
+    except UsageError:
+        count = 0.0
+    if not (count.is_integer() and 1 <= count <= MOST_FRAMES):
+        raise UsageError(f"{option} {text!r}: give degrees, or FROM:TO:N with N frames, as in 0:360:24")
+    return [start + (end - start) * frame / count for frame in range(int(count))]
 
 
 def parse_pose(text: str | None) -> PoseDeg | None:

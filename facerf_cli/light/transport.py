@@ -135,10 +135,16 @@ def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.Emb
     return scene
 
 
-def occluded(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Test rays [N, 3] for any hit; bool [N]."""
-    hits = scene.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), query="OCCLUDED")
-    return np.asarray(hits) != -1
+def occluded(
+    scene: rtcore_scene.EmbreeScene,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    reach_m: np.ndarray | None = None,
+) -> np.ndarray:
+    """Test rays [N, 3] for any hit, or for one within `reach_m` [N]; bool [N]."""
+    reach = None if reach_m is None else np.ascontiguousarray(reach_m, np.float32)
+    rays = (np.ascontiguousarray(origins), np.ascontiguousarray(directions))
+    return np.asarray(scene.run(*rays, dists=reach, query="OCCLUDED")) != -1
 
 
 def hits_within(
@@ -151,9 +157,12 @@ def hits_within(
 
 
 def on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Unit directions [N, 3] to points on the disc of an area light, from two numbers [N, 1] in 0..1."""
+    """Unit directions [N, 3] to points on the disc of an area light, from two numbers [N, 1] in 0..1.
+
+    `axis` is the direction to its middle, [3], or [N, 3] of a near one.
+    """
     axis = axis.astype(np.float32)
-    tangent, bitangent = (side.astype(np.float32) for side in _tangents(axis[None]))
+    tangent, bitangent = (side.astype(np.float32) for side in _tangents(np.atleast_2d(axis)))
     radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
     turn = 2 * np.pi * around
     rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)

@@ -114,23 +114,25 @@ class PortraitMaps(NamedTuple):
         """Shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
 
         `visible` [B, L, S, S] is the proxy's visibility. The image of a light is albedo times shading plus
-        highlights.
+        highlights. Lights that are near have a direction for each pixel, [B, L, S, S, 3].
         """
-        basis = sh_basis(lights, SHADOW_ORDER)  # [B, L, K]
+        near = lights.dim() == 5
+        product = "blijc,bcij->blij" if near else "blc,bcij->blij"
+        basis = sh_basis(_halved(lights) if near else lights, SHADOW_ORDER)  # [B, L, K] or [B, L, s, s, K]
         few = basis[..., : (LIT_ORDER + 1) ** 2]
         size = self.normals.shape[-2:]
 
         def over(basis: Tensor, maps: Tensor) -> Tensor:
-            coarse = torch.einsum("blk,bkij->blij", basis, maps)
+            coarse = torch.einsum(product, basis, maps)
             return F.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
 
         visible = torch.sigmoid(self.trust * (2 * visible - 1) + over(basis, self.shadow))
-        cosine = torch.einsum("blc,bcij->blij", lights, self.normals)
+        cosine = torch.einsum(product, lights, self.normals)
         lit, around = over(few, self.lit), over(few, self.around)
         shading = visible * cosine.clamp_min(0) + F.relu(visible * lit + around)
         half = F.normalize(lights + lights.new_tensor(_VIEW), dim=-1)
-        n_dot_h = torch.einsum("blc,bcij->blij", half, self.normals).clamp(1e-3, 1).log()
-        t_dot_h = torch.einsum("blc,bcij->blij", half, self.strands)
+        n_dot_h = torch.einsum(product, half, self.normals).clamp(1e-3, 1).log()
+        t_dot_h = torch.einsum(product, half, self.strands)
         glow = torch.exp(-0.5 * _STRAND_SHARPNESS * t_dot_h.square()) * self.gloss[:, -1:]
         for index, sharpness in enumerate(_SHARPNESS):
             lobe = torch.exp(sharpness * n_dot_h) * (sharpness / 8)
@@ -141,6 +143,13 @@ class PortraitMaps(NamedTuple):
         """Images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
         shading, glow, _ = self.shaded(lights, visible)
         return self.albedo[:, None] * shading[:, :, None] + glow[:, :, None]
+
+
+def _halved(directions: Tensor) -> Tensor:
+    """Unit directions [B, L, S, S, 3] at half the side."""
+    people, lights, side = directions.shape[:3]
+    blocks = directions.view(people, lights, side // 2, 2, side // 2, 2, 3)
+    return F.normalize(blocks.mean((3, 5)), dim=-1)
 
 
 class PortraitNetwork(nn.Module):

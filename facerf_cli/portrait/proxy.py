@@ -4,8 +4,9 @@ It gives each pixel a normal and a position, and tells which lights reach it. Sh
 hair and head come from it; what it gets wrong, the Portrait Network corrects.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,8 @@ _OFF_M = 0.003  # of rays, from the surface: hides its facets
 _RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
 _SOFT_PX = 0.7  # standard deviation of a blur of visibility
 _SEED = 7
+# From origins [N, 3] to directions [3] or [N, 3] of a light's middle, and to distances [N] of a near one.
+_Light = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +124,27 @@ def visibility(proxy: Proxy, camera: Camera, directions: Tensor) -> Tensor:
 
     The proxy shades itself; a surface that faces away is not reached.
     """
+    return _reached(proxy, camera, [partial(_along, direction) for direction in directions.numpy()])
+
+
+def visibility_of_points(proxy: Proxy, camera: Camera, places_m: Tensor) -> Tensor:
+    """Share [P, s, s] of lights at camera-space places [P, 3] that reaches each pixel; see `visibility`."""
+    return _reached(proxy, camera, [partial(_toward, place) for place in places_m.numpy()])
+
+
+def _along(direction: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, None]:
+    return direction, None
+
+
+def _toward(place_m: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions [N, 3] from origins [N, 3] to a place [3], and its distances [N]."""
+    offsets = place_m - origins
+    distances_m = np.linalg.norm(offsets, axis=1)
+    return offsets / distances_m[:, None].clip(min=1e-6), distances_m
+
+
+def _reached(proxy: Proxy, camera: Camera, lights: Sequence[_Light]) -> Tensor:
+    """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
     maps = proxy_maps(proxy, camera)
     inside = maps.covered.numpy() > 0
     normals, points = (field.numpy()[:, inside].T for field in (maps.normals, maps.positions_m))
@@ -128,10 +152,11 @@ def visibility(proxy: Proxy, camera: Camera, directions: Tensor) -> Tensor:
     scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
     random = np.random.default_rng(_SEED)
     numbers = random.random((_RAYS, 2, len(origins), 1)).astype(np.float32)
-    found = np.zeros((len(directions), *inside.shape), np.float32)
-    for light, direction in enumerate(directions.numpy()):
-        blocked = [occluded(scene, origins, on_disc(direction, _RADIUS_DEG, *pair)) for pair in numbers]
-        found[light, inside] = 1 - np.mean(blocked, 0)
+    found = np.zeros((len(lights), *inside.shape), np.float32)
+    for number, light in enumerate(lights):
+        axis, reach_m = light(origins)
+        blocked = [occluded(scene, origins, on_disc(axis, _RADIUS_DEG, *pair), reach_m) for pair in numbers]
+        found[number, inside] = 1 - np.mean(blocked, 0)
     filled = inpaint(torch.from_numpy(found), maps.covered)
     return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
 

@@ -337,3 +337,56 @@ def test_a_dry_run_checks_what_a_run_would_load(
     assert relight(given, tmp_path / "out", *line, "--input-colourspace", "nope") == 2
     assert relight(given, tmp_path / "out", *line, "--face-model", "nope.npz") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_near_lights_sweeps_and_rigs_from_the_command_line(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "studio.toml").write_text(
+        "[key]\nat = [0.5, 0.3, 0.8]\nkelvin = 3200\n[rim]\nfrom = [160, 10]\n"
+    )
+    entries = [str(tmp_path / "studio.toml"), "name=near;at=-0.4,0,0.6;size=0.2", "az=-60:60:2"]
+    line = [word for entry in entries for word in ("--light", entry)]
+    assert relight(given, tmp_path / "out", *line, "--background", "0,0,0", "--aov", "shadow") == 0
+    names = ["light_az_-60_60_2.0000", "light_az_-60_60_2.0001", "light_near", "studio"]
+    assert made(tmp_path / "out") == sorted(
+        f"astronaut_{name}{suffix}" for name in names for suffix in (".exr", ".png")
+    )
+    ev = json.loads((tmp_path / "out/report.jsonl").read_text())["exposure_ev"]
+    assert ev[f"astronaut_{names[0]}"] == ev[f"astronaut_{names[1]}"]
+    layers = layers_of(
+        tmp_path / "out/astronaut_studio.exr", *(f"key.{c}" for c in "RGB"), "rim.R", "R", "shadow.R"
+    )
+    red, green, blue, rim, whole, shadow = layers
+    (matte,) = layers_of(tmp_path / "out/astronaut_studio.exr", "person.A")
+    np.testing.assert_allclose(red + rim, whole, rtol=5e-3, atol=2e-3)  # half floats
+    assert red.mean() > green.mean() > blue.mean() and 0.2 < shadow[matte > 0.9].mean() < 1
+    left, right = (face_sides_of(tmp_path / f"out/astronaut_{name}.exr") for name in names[:2])
+    assert left > 1.5 and right > 0  # lit from the image's left; the second frame from ahead
+    assert relight(given, tmp_path / "bad", "--light", "rembrant") == 2
+    (tmp_path / "bad.toml").write_text("[key]\nwatts = 3\n")
+    assert relight(given, tmp_path / "bad", "--light", str(tmp_path / "bad.toml")) == 1
+    assert "bad.toml: key: 'watts': no such key" in capsys.readouterr().err
+
+
+def face_sides_of(path: Path) -> float:
+    """Light on the left half of the person over that on the right."""
+    image = read_image(path).pixels.mean(-1)
+    middle = image.shape[1] * 215 // 512
+    return float(image[60:200, :middle].sum() / image[60:200, middle:].sum())
+
+
+def test_near_lights_need_the_photo_or_a_pose_of_it(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    near = ["--light", "at=0.6,0,0.4"]
+    assert relight(given, tmp_path / "pose", *near, "--pose", "20,0,0") == 0
+    left, right = face_sides(tmp_path / "pose/astronaut_light_at_0.6_0_0.4.exr")
+    assert right > 1.5 * left
+    fixed = ["--checkpoint", str(given / "lambert.safetensors")]
+    olat = ["predict-olat", str(PHOTO), "--lights", "4", "--landmarks", str(given / "astronaut.json")]
+    assert main([*fixed, *olat, "-o", str(tmp_path / "olat")]) == 0
+    stack = tmp_path / "olat/astronaut_olat.exr"
+    assert relight(given, tmp_path / "a", *near, photo=stack) == 1
+    assert "a stack holds far lights" in capsys.readouterr().err
+    assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0

@@ -109,6 +109,29 @@ def test_highlights_lie_where_the_half_vector_meets_the_normal() -> None:
     assert maps.olats(one_light(0, 0), 0 * lit_everywhere()).max() < 1e-6
 
 
+def test_near_lights_have_a_direction_for_each_pixel() -> None:
+    """Where all directions are one, they are that of a far light; halves lit apart are two far lights."""
+    random = torch.Generator().manual_seed(3)
+    wide, half = (1, 3, SIDE, SIDE), (SIDE // 2, SIDE // 2)
+    maps = plain_maps()._replace(
+        normals=F.normalize(torch.randn(wide, generator=random), dim=1),
+        gloss=torch.rand(wide, generator=random),
+        trust=torch.rand(1, 1, SIDE, SIDE, generator=random),
+        lit=torch.randn(1, 16, *half, generator=random),
+        around=torch.randn(1, 16, *half, generator=random),
+        shadow=torch.randn(1, 25, *half, generator=random),
+    )
+    lights = torch.cat([one_light(40, 20), one_light(-60, 10)], 1)
+    far = maps.olats(lights, lit_everywhere(2))
+    by_pixel = lights[:, :, None, None].expand(-1, -1, SIDE, SIDE, -1)
+    torch.testing.assert_close(maps.olats(by_pixel, lit_everywhere(2)), far)
+    split = torch.cat([by_pixel[:, :1, :, : SIDE // 2], by_pixel[:, 1:, :, SIDE // 2 :]], 3)
+    found = maps.olats(split, lit_everywhere())[0, 0]
+    edge = SIDE // 2 - 2, SIDE // 2 + 2  # the coarse maps blend there
+    torch.testing.assert_close(found[..., : edge[0]], far[0, 0, ..., : edge[0]])
+    torch.testing.assert_close(found[..., edge[1] :], far[0, 1, ..., edge[1] :])
+
+
 def test_strands_shine_across_themselves() -> None:
     gloss = torch.zeros(1, 3, SIDE, SIDE)
     gloss[:, 2] = 0.1

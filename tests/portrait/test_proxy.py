@@ -12,7 +12,14 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.proxy import Proxy, proxy_maps, proxy_of, square_camera, visibility
+from facerf_cli.portrait.proxy import (
+    Proxy,
+    proxy_maps,
+    proxy_of,
+    square_camera,
+    visibility,
+    visibility_of_points,
+)
 from facerf_cli.raster.camera import pose_to_rotation
 
 SIDE = 96
@@ -91,3 +98,19 @@ def test_heads_cast_shadows() -> None:
     assert visible[1][face].mean() > 0.9
     neck = slice(66, 72), slice(44, 52)
     assert visible[2][neck].mean() < 0.3 < visible[1][neck].mean()
+
+
+def test_shadows_of_points_are_cast_toward_their_places() -> None:
+    """A point far away is a far light; what stands behind a point casts no shadow."""
+    camera = square_camera(fit(), SQUARE)
+    lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 75.0))])
+    far = visibility_of_points(proxy(), camera, 3000 * lights)
+    torch.testing.assert_close(far, visibility(proxy(), camera, lights), atol=0.5, rtol=0)
+    assert (far - visibility(proxy(), camera, lights)).abs().mean() < 2e-3  # rays that graze
+    points = torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -1.6]])
+    before, behind = visibility_of_points(proxy(), camera, points)
+    face = slice(40, 56), slice(42, 54)
+    assert before[face].mean() > 0.9 and behind[face].mean() < 0.01
+    forehead, tip = proxy_maps(proxy(), camera).positions_m[:, 36, 48], torch.tensor([0.0, 0.0, 0.02])
+    near = visibility_of_points(proxy(), camera, (forehead + tip)[None])[0]
+    assert near[36, 48] > 0.9  # the head behind the point does not count

@@ -1,7 +1,8 @@
 """Light setups as weights of lights: their maps read, drawn or estimated from a photo."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import groupby
 from pathlib import Path
@@ -18,7 +19,7 @@ from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.envmap import ball, rotated_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
-from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.studio_points import NearLights, far_samples, intensity_of
 from facerf_cli.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 
@@ -58,28 +59,63 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
 
 @lru_cache(maxsize=1)
 def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
-    """Directions [L, 3] and rgb weights [M, L, 3] of M setups.
+    """Directions [L, 3] and rgb weights [M, L, 3] of M setups, without their near lights.
 
     Maps are integrated over the rig's lights; single lights follow them as additional lights.
     """
-    single = [(row, light) for row, setup in enumerate(setups) for light in setup.lights]
-    directions = directions_of(rig) if any(setup.envmap for setup in setups) else torch.zeros(0, 3)
-    weights = torch.zeros(len(setups), len(directions) + len(single), 3)
-    weights[:, : len(directions)] = _map_weights(setups, directions, sampling)
-    for column, (row, light) in enumerate(single, len(directions)):
-        weights[row, column] = torch.tensor(light[2:])
-    own = [azel_to_direction(*light[:2]) for _, light in single]
-    return torch.cat([directions, *(direction[None] for direction in own)]), weights
+    directions, weights = weights_of_far_lights(setups)
+    if not any(setup.envmap for setup in setups):
+        return directions, weights
+    every = directions_of(rig)
+    of_maps = _map_weights(setups, every, sampling)
+    return torch.cat([every, directions]), torch.cat([of_maps, weights], 1)
+
+
+def weights_of_far_lights(setups: Sequence[LightSetup]) -> tuple[Tensor, Tensor]:
+    """Directions [L, 3] and rgb weights [M, L, 3] of the far lights of M setups; at least one, if dark."""
+    directions, weights = [], []
+    for row, towards, rgb in _far_lights(setups):
+        directions.append(towards)
+        weights.append(torch.zeros(len(setups), len(towards), 3))
+        weights[-1][row] = rgb
+    if not directions:
+        return torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(len(setups), 1, 3)
+    return torch.cat(directions), torch.cat(weights, 1)
+
+
+def near_lights_of(setups: Sequence[LightSetup]) -> NearLights | None:
+    """The near lights of M setups, each prepared once for all of them; None without any."""
+    near = [
+        (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
+        for row, setup in enumerate(setups)
+        for light in setup.lights
+        if light.at_m is not None
+    ]
+    if not near:
+        return None
+    lights = tuple(dict.fromkeys(light for _, light, _ in near))
+    weights = torch.zeros(len(setups), len(lights), 3)
+    for row, light, rgb in near:
+        weights[row, lights.index(light)] += rgb
+    return NearLights(lights, weights)
 
 
 def weights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
-    """Weights [M, L, 3] of M setups over a stack's lights [L, 3]; a single light is moved to the nearest."""
+    """Weights [M, L, 3] of M setups over a stack's lights [L, 3]; single lights are moved to the nearest."""
     weights = _map_weights(setups, directions, sampling)
+    for row, towards, rgb in _far_lights(setups):
+        nearest = (towards @ directions.T).argmax(1)
+        weights[row].index_add_(0, nearest, rgb)
+    return weights
+
+
+def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
     for row, setup in enumerate(setups):
         for light in setup.lights:
-            nearest = int((directions @ azel_to_direction(*light[:2])).argmax())
-            weights[row, nearest] += torch.tensor(light[2:])
-    return weights
+            if light.azel_deg is not None:
+                towards, shares = far_samples(light)
+                yield row, towards, shares[:, None] * intensity_of(light)
 
 
 def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:

@@ -11,7 +11,12 @@ import torch
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.backdrops import Backdrops
-from facerf_cli.cli.items.light_weights import weights_over_rig, weights_over_stack
+from facerf_cli.cli.items.light_weights import (
+    near_lights_of,
+    weights_of_far_lights,
+    weights_over_rig,
+    weights_over_stack,
+)
 from facerf_cli.cli.items.photos import (
     FittedFace,
     face_model,
@@ -36,7 +41,6 @@ from facerf_cli.face.view import photo_camera
 from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
-from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 
@@ -102,16 +106,13 @@ def _relight_face(
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
     def relit(rows: slice) -> list[Relit]:
-        return list(relit_by(composition, head, reflectance, directions, weights[rows], target))
+        near = near_lights_of(work.setups[rows])
+        return list(relit_by(composition, head, reflectance, directions, weights[rows], target, near))
 
     def apart(setup: LightSetup) -> list[Relit]:
-        towards = torch.stack([azel_to_direction(*light[:2]) for light in setup.lights])
-        colours = torch.tensor([light[2:] for light in setup.lights])
-        return list(
-            relit_by(
-                composition, head, reflectance, towards, torch.diag_embed(colours.T).permute(1, 2, 0), target
-            )
-        )
+        each = _each_light(setup)
+        far, near = weights_of_far_lights(each), near_lights_of(each)
+        return list(relit_by(composition, head, reflectance, *far, target, near))
 
     metadata = provenance(item, work.photo, models.checkpoint_name)
     if work.reflectance != "portrait":
@@ -125,6 +126,11 @@ def _relight_face(
     backdrops = Backdrops(work.background, work.background_blur, camera) if whole else None
     shown = _Shown(composition, relit, apart, bytes_each, alpha, backdrops)
     yield from _write_setups(item, face.tag, shown, work, metadata)
+
+
+def _each_light(setup: LightSetup) -> tuple[LightSetup, ...]:
+    """A setup for each light of a setup alone."""
+    return tuple(replace(setup, lights=(light,)) for light in setup.lights)
 
 
 def _target(item: Item, fit: FaceFit, image: LinearImage, work: Relight) -> Target:
@@ -147,6 +153,8 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         raise InputError(f"{item.input_path}: a stack holds the field; for {work.reflectance} give its photo")
     if work.network_alone:
         raise InputError(f"{item.input_path}: a stack holds the field as predicted; give its photo")
+    if near_lights_of(work.setups) is not None:
+        raise InputError(f"{item.input_path}: a stack holds far lights; for near ones (at=) give its photo")
     stack = read_olat_stack(item.input_path)
     composer, facts = _stack_composer(item, stack, work)
     directions = torch.from_numpy(stack.header.directions).float()
@@ -160,9 +168,9 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     bytes_each = 12 * stack.header.seen.size
 
     def apart(setup: LightSetup) -> list[Relit]:
-        each = tuple(replace(setup, lights=(light,)) for light in setup.lights)
         batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
-        return list(map(Relit, weighted_sum(batches, weights_over_stack(each, directions, work.sampling))))
+        weights = weights_over_stack(_each_light(setup), directions, work.sampling)
+        return list(map(Relit, weighted_sum(batches, weights)))
 
     shown = _Shown(composer, relit, apart, bytes_each)
     return dict(_write_setups(item, "", shown, work, metadata)), facts

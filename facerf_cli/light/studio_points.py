@@ -1,0 +1,107 @@
+"""Studio lights as points: the squares of soft lights are sampled by a regular grid."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.light.blackbody import blackbody_rgb
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.studio import StudioLight
+
+_APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
+_NEAREST_M = 0.05  # distance below which a light does not grow any more
+_FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
+
+
+def intensity_of(light: StudioLight) -> Tensor:
+    """The light's colour times its strength [3], linear Rec.709."""
+    tint = torch.ones(3) if light.kelvin is None else torch.from_numpy(blackbody_rgb(light.kelvin)).float()
+    return torch.tensor(light.rgb) * tint * 2.0**light.stops
+
+
+def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
+    """Unit directions [n, 3] of a far light and its share [n] in each; a surface that faces it receives 1."""
+    assert light.azel_deg is not None
+    middle = azel_to_direction(*light.azel_deg)
+    wide = 2 * math.tan(math.radians(light.size_deg / 2))
+    directions = F.normalize(middle + wide * _grid(middle, light.size_deg), dim=1)
+    return directions, torch.ones(len(directions)) / (directions @ middle).sum()
+
+
+@dataclass(frozen=True, eq=False)
+class PointLights:
+    """The points of one near light, of rgb 1: places [P, 3] in metres, camera space.
+
+    `toward` [3] is the unit vector from the light's middle to the face's centre; `strength` is irradiance
+    times square metres of each point. `is_panel`: it shines by the cosine to `toward`, as a softbox does.
+    """
+
+    places_m: Tensor
+    toward: Tensor
+    strength: float
+    is_panel: bool
+    half_cone_deg: float | None = None
+
+    @staticmethod
+    def of(light: StudioLight, centre_m: Tensor) -> "PointLights":
+        """Set up a near light about a face's centre [3]; a surface there that faces it receives 1."""
+        assert light.at_m is not None
+        offset = torch.tensor(light.at_m)
+        distance_m = float(offset.norm())
+        away = offset / distance_m
+        wide_deg = math.degrees(2 * math.atan2(light.size_m / 2, distance_m))
+        places = centre_m + offset + light.size_m * _grid(away, wide_deg)
+        half = None if light.spot_deg is None else light.spot_deg / 2
+        unit = PointLights(places, -away, 1.0, light.size_m > 0, half)
+        directions, irradiance = unit.arriving(centre_m[:, None, None])
+        received = float((irradiance[:, 0, 0] * (directions[:, 0, 0] @ away)).sum())
+        return PointLights(places, -away, 1 / received, unit.is_panel, half)
+
+    def arriving(self, positions_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [P, H, W, 3] from positions [3, H, W] to the points, and irradiance [P, H, W].
+
+        The irradiance is that of a surface that faces the point, and falls with the square of the distance.
+        """
+        offsets = self.places_m[:, None, None] - positions_m.permute(1, 2, 0)
+        distances_m = offsets.norm(dim=-1).clamp_min(1e-6)
+        directions = offsets / distances_m[..., None]
+        aligned = (-directions @ self.toward).clamp(-1, 1)
+        irradiance = self.strength / distances_m.clamp_min(_NEAREST_M).square()
+        if self.is_panel:
+            irradiance = irradiance * aligned.clamp_min(0)
+        if self.half_cone_deg is not None:
+            edge = (1 - torch.rad2deg(aligned.acos()) / self.half_cone_deg) / (1 - _FULL_CONE)
+            inside = edge.clamp(0, 1)
+            irradiance = irradiance * inside * inside * (3 - 2 * inside)
+        return directions, irradiance
+
+
+@dataclass(frozen=True, eq=False)
+class NearLights:
+    """J near lights, and their rgb weights [M, J, 3] in M sums."""
+
+    lights: tuple[StudioLight, ...]
+    weights: Tensor
+
+    def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
+        """The lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
+        return [
+            (PointLights.of(light, centre_m), self.weights[:, number])
+            for number, light in enumerate(self.lights)
+        ]
+
+
+def _grid(axis: Tensor, wide_deg: float) -> Tensor:
+    """Offsets [n * n, 3] of the cells of a unit square about an axis [3], two of whose sides are level."""
+    if wide_deg == 0:
+        return torch.zeros(1, 3)
+    side = min(max(2, math.ceil(wide_deg / _APART_DEG)), _MOST_A_SIDE)
+    up = torch.tensor([0.0, 1.0, 0.0] if abs(float(axis[1])) < 0.99 else [0.0, 0.0, 1.0])
+    across = F.normalize(torch.linalg.cross(up, axis), dim=0)
+    along = torch.linalg.cross(axis, across)
+    cells = (torch.arange(side) + 0.5) / side - 0.5
+    v, u = torch.meshgrid(cells, cells, indexing="ij")
+    return (u[..., None] * across + v[..., None] * along).view(-1, 3)

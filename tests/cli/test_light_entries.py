@@ -1,0 +1,160 @@
+"""The entries of `--light`: keys, names, sweeps, rig files and presets; and what each fault is told."""
+
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.items.light_weights import near_lights_of, weights_over_rig
+from facerf_cli.cli.light_entries import lit_images, preset_names
+from facerf_cli.cli.lights import collect_setups
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.light.studio import StudioLight
+
+
+def single(text: str) -> StudioLight:
+    (image,) = lit_images([text])
+    ((light,),) = image.frames
+    return light
+
+
+def test_a_light_by_its_keys() -> None:
+    near = single("at=0.5,0.3,1;size=0.4;kelvin=3200;stops=+1;rgb=1,0.5,0.25;spot=40")
+    assert near == StudioLight(None, (0.5, 0.3, 1.0), (1.0, 0.5, 0.25), 3200.0, 1.0, 0.4, 0.0, 40.0)
+    far = StudioLight((40.0, 20.0), kelvin=5600.0, stops=-1.0, size_deg=30.0)
+    assert single("from=40,20; kelvin=5600 ;stops=-1;size_deg=30") == far
+    assert single("az=40;el=20;kelvin=5600;stops=-1;size_deg=30") == far
+    assert single("az=40") == single("40,0") and single("el=20") == single("0,20")
+    assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
+
+
+def test_lights_with_names_share_an_image_whatever_their_form() -> None:
+    entries = ["key=40,20;rim=160,10,1,0,0", "5,6", "name=top;at=0,1,0", "at=0,0,2;size=1"]
+    images = lit_images(entries)
+    assert [image.name for image in images] == [
+        "light_5_6",
+        "light_at_0_0_2_size_1",
+        "light_key+rim+top",
+    ]
+    assert images[2].names == ("key", "rim", "top") and images[0].names == ()
+    (lights,) = images[2].frames
+    assert lights[1] == StudioLight((160.0, 10.0), rgb=(1.0, 0.0, 0.0)) and lights[2].at_m == (0, 1, 0)
+
+
+def test_a_sweep_numbers_its_frames_and_leaves_out_its_end() -> None:
+    setups = collect_setups([], None, ["az=-90:90:3;el=20"], Path("out"))
+    assert [setup.frame for setup in setups] == [".0000", ".0001", ".0002"]
+    assert {setup.name for setup in setups} == {"light_az_-90_90_3_el_20"}  # and so of one exposure
+    assert [setup.lights[0].azel_deg for setup in setups] == [(-90, 20), (-30, 20), (30, 20)]
+    item = Item(Path("a.jpg"), Path("out/a"), "a")
+    assert setups[1].output(item, "", ".exr") == Path("out/a_light_az_-90_90_3_el_20.0001.exr")
+    both = collect_setups([], None, ["az=0:20:2;el=0:90:2;stops=1"], Path("out"))
+    assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
+    assert collect_setups([], None, ["az=0:20:1"], Path("out"))[0].frame == ".0000"
+
+
+def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
+    setups = collect_setups([], None, ["name=key;az=0:90:3", "fill=-40,0"], Path("out"))
+    assert [[light.azel_deg for light in setup.lights] for setup in setups] == [
+        [(0, 0), (-40, 0)],
+        [(30, 0), (-40, 0)],
+        [(60, 0), (-40, 0)],
+    ]
+    assert all(setup.names == ("key", "fill") for setup in setups)
+    with pytest.raises(UsageError, match="sweeps of 2 and 3 frames"):
+        lit_images(["name=a;az=0:90:3", "name=b;az=0:90:2"])
+
+
+@pytest.mark.parametrize(
+    "entry, said",
+    [
+        ("at=0,0,1;colour=red", "'colour': no such key; give at, from"),
+        ("at=0,0", "at '0,0': give X,Y,Z"),
+        ("at=0,0,0.1", "at '0,0,0.1': the distance from the face is out of range; give 0.15"),
+        ("at=0,0,1e9", "out of range"),
+        ("at=0,0,1;from=0,0", "give one of at=X,Y,Z"),
+        ("from=0,0;az=3", "give one of at=X,Y,Z"),
+        ("kelvin=3200", "give one of at=X,Y,Z"),
+        ("at=0,0,1;kelvin=50", "kelvin '50': out of range; give 1667 to 25000"),
+        ("at=0,0,1;kelvin=warm", "kelvin 'warm': give KELVIN, a number"),
+        ("at=0,0,1;stops=100", "stops '100': out of range"),
+        ("at=0,0,1;rgb=1,-1,1", "rgb '1,-1,1': out of range"),
+        ("at=0,0,1;rgb=1", "rgb '1': give R,G,B"),
+        ("at=0,0,1;size=-1", "size '-1': out of range; give 0 to 10"),
+        ("at=0,0,1;size_deg=3", "size_deg is of far lights; give size"),
+        ("from=0,0;size=1", "size is of near lights"),
+        ("from=0,0;spot=20", "spot is of near lights"),
+        ("at=0,0,1;spot=0", "spot '0': out of range"),
+        ("at=0,0,1;at=0,0,2", "at is given twice"),
+        ("az=0:90;el=3", "az '0:90': give degrees, or FROM:TO:N"),
+        ("az=0:90:0", "az '0:90:0': give degrees"),
+        ("az=0:90:2;el=0:9:3", "give one N"),
+        ("el=0:200:4", "the elevation is out of range"),
+        ("from=0:90:3,10", "from '0:90:3,10': give AZ,EL"),
+        ("name=;at=0,0,1", "'': give each light a name of its own"),
+        ("name=a b;at=0,0,1", "'a b': give each light a name"),
+        ("=40,20", "'': give each light a name"),
+        ("rembrant", "no such preset; give AZ,EL, a rig file (.toml) or one of beauty, butterfly"),
+        ("missing.toml", "missing.toml: no such rig file"),
+    ],
+)
+def test_faults_say_what_to_give(entry: str, said: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        collect_setups([], None, [entry], Path("out"))
+    assert said in str(caught.value) and str(caught.value).startswith("--light")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> None:
+    (tmp_path / "studio.toml").write_text(
+        "[key]\nat = [0.5, 0.3, 1]\nsize = 0.4\nkelvin = 3200\n[rim]\naz = '150:170:2'\nel = 10\nstops = -1\n"
+    )
+    setups = collect_setups([], None, [str(tmp_path / "studio.toml"), "key=1,2"], tmp_path / "out")
+    assert [setup.name + setup.frame for setup in setups] == ["studio.0000", "studio.0001", "light_key"]
+    assert setups[0].names == ("key", "rim")
+    assert setups[1].lights == (
+        StudioLight(at_m=(0.5, 0.3, 1.0), kelvin=3200.0, size_m=0.4),
+        StudioLight((160.0, 10.0), stops=-1.0),
+    )
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("[key]\nat = [0, 0, 1]\nwatts = 3\n", "key: 'watts': no such key"),
+        ("[key]\nname = 'a'\nat = [0, 0, 1]\n", "key: 'name': no such key"),
+        ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0': give X,Y,Z"),
+        ("['a b']\nat = [0, 0, 1]\n", "'a b': give each light a name"),
+        ("[a]\naz = '0:9:2'\n[b]\naz = '0:9:3'\n", "sweeps of 2 and 3 frames"),
+    ],
+)
+def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "studio.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        lit_images([str(path)])
+    assert str(caught.value).startswith(f"{path}: ") and said in str(caught.value)
+
+
+def test_every_preset_is_a_rig() -> None:
+    assert preset_names() == ("beauty", "butterfly", "loop", "rembrandt", "rim", "split")
+    setups = collect_setups([], None, preset_names(), Path("out"))
+    assert [setup.name for setup in setups] == list(preset_names())
+    assert all(setup.lights and len(setup.names) == len(setup.lights) for setup in setups)
+
+
+def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
+    entries = ["name=a;at=0,0,1;stops=1", "b=30,0", "at=0,0,1;rgb=1,0,0", "at=0,0,2"]
+    setups = collect_setups([], None, entries, Path("out"))  # the image of names comes last
+    near = near_lights_of(setups)
+    assert near is not None and [light.at_m for light in near.lights] == [(0, 0, 1), (0, 0, 2)]
+    assert near.weights.tolist() == [
+        [[1, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [1, 1, 1]],
+        [[2, 2, 2], [0, 0, 0]],
+    ]
+    directions, weights = weights_over_rig(setups, "150", "cell")
+    assert len(directions) == 1 and weights.sum((1, 2)).tolist() == [0, 0, 3]
+    assert near_lights_of(setups[:0]) is None
+    alone = weights_over_rig(setups[:1], "150", "cell")
+    assert len(alone[0]) == 1 and alone[1].abs().max() == 0  # a dark one, since models want one
