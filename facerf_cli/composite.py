@@ -110,7 +110,9 @@ class AroundFace(Protocol):
 
 
 class PersonAround(AroundFace, Protocol):
-    """A whole person, relit (`whole_person.WholePerson`)."""
+    """A photo's person under sums of lights: `WholePerson`."""
+
+    matte: np.ndarray  # the person's share of the photo [H, W]
 
     def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
         """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
@@ -175,6 +177,11 @@ class Composition:
         mask = self.view.mask.numpy()[..., None]
         person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
         return person
+
+    def person(self, relit: Relit) -> tuple[np.ndarray, np.ndarray]:
+        """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
+        own = self._mask if self._person is None else self._person.matte
+        return self._relit_person(relit), np.minimum(self._matte, own)
 
     def light_layer(self, relit: Relit) -> np.ndarray:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""

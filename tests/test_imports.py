@@ -14,7 +14,7 @@ LEVELS = (
     ("dataset",),
     ("synth", "capture"),
     ("pipeline",),
-    ("field", "baselines", "composite", "near_textures", "portrait_field", "whole_person"),
+    ("field", "baselines", "composite", "group_photo", "near_textures", "portrait_field", "whole_person"),
     ("models", "portrait"),
     ("network", "face"),
     ("raster", "light", "files", "metrics"),

@@ -66,7 +66,7 @@ class Relight:
 
     def outputs_of(self, item: Item) -> list[Path]:
         """An EXR and a PNG for each setup."""
-        tag = self.photo.first_tag
+        tag = "" if self.composite == "photo" else self.photo.first_tag
         return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in _SUFFIXES]
 
     def refuse_meeting(self, items: Sequence[Item]) -> None:

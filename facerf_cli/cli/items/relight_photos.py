@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -41,6 +41,7 @@ from facerf_cli.face.view import photo_camera
 from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
+from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 
@@ -52,18 +53,18 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 
 
 class Composer(Protocol):
-    """A composer of images: `Composition`, or for a stack of rendered images `_RenderedStack`."""
+    """A composer of images: `Composition`, `GroupComposition` of several, or of a stack `_RenderedStack`."""
 
-    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+    def image(self, relit: Any, ev: float, behind: np.ndarray | None) -> RelitImage:
         """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Any) -> dict[str, np.ndarray]:
         """Layers of the image by the names that they have in a file."""
 
-    def light_layer(self, relit: Relit) -> np.ndarray:
+    def light_layer(self, relit: Any) -> np.ndarray:
         """The person under one of several lights, over black."""
 
-    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+    def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
         """The exposure in EV of the person, by a rule."""
 
 
@@ -72,8 +73,8 @@ class _Shown:
     """A head relit by setups, and its composer."""
 
     composer: Composer
-    relit: Callable[[slice], list[Relit]]  # by some of the setups
-    apart: Callable[[LightSetup], list[Relit]]  # by each light of a setup
+    relit: Callable[[slice], list[Any]]  # by some of the setups, as the composer takes it
+    apart: Callable[[LightSetup], list[Any]]  # by each light of a setup
     bytes_each: int
     alpha: np.ndarray | None = None  # of the photo
     backdrops: Backdrops | None = None
@@ -88,15 +89,50 @@ def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
+    metadata = _metadata(item, work)
     written: Written = {}
+    if work.composite == "photo":
+        faces_by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
+        shown = _together([_show_face(item, image, face, work) for face in faces_by_size])
+        return dict(_write_setups(item, "", shown, work, metadata)), facts_of(faces)
     for face in reversed(faces):  # the first one's files mark the photo as finished
-        written.update(_relight_face(item, image, face, work))
+        shown = _show_face(item, image, face, work)
+        written.update(_write_setups(item, face.tag, shown, work, metadata))
     return written, facts_of(faces)
 
 
-def _relight_face(
-    item: Item, image: LinearImage, face: FittedFace, work: Relight
-) -> Iterator[tuple[Path, float]]:
+def _together(shown: Sequence[_Shown]) -> _Shown:
+    """People of one photo in one image; the nearest first."""
+    first = shown[0]
+    if len(shown) == 1:
+        return first
+
+    def relit(rows: slice) -> list[Any]:
+        return list(zip(*(one.relit(rows) for one in shown), strict=True))
+
+    def apart(setup: LightSetup) -> list[Any]:
+        return list(zip(*(one.apart(setup) for one in shown), strict=True))
+
+    bytes_each = sum(one.bytes_each for one in shown)
+    return replace(
+        first,
+        composer=GroupComposition([cast(Composition, one.composer) for one in shown]),
+        relit=relit,
+        apart=apart,
+        bytes_each=bytes_each,
+    )
+
+
+def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    if work.reflectance != "portrait":
+        metadata["facerf:reflectance"] = work.reflectance
+    if work.network_alone:
+        metadata["facerf:network_alone"] = 1
+    return metadata
+
+
+def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> _Shown:
     models, head = load_models_once(work.photo), face.head
     target = _target(item, head.fit, image, work)
     reflectance = reflectance_of(
@@ -114,18 +150,12 @@ def _relight_face(
         far, near = weights_of_far_lights(each), near_lights_of(each)
         return list(relit_by(composition, head, reflectance, *far, target, near))
 
-    metadata = provenance(item, work.photo, models.checkpoint_name)
-    if work.reflectance != "portrait":
-        metadata["facerf:reflectance"] = work.reflectance
-    if work.network_alone:
-        metadata["facerf:network_alone"] = 1
     whole = work.composite == "photo"
     alpha = image.alpha if whole and work.background.kind == "photo" else None
     bytes_each = head.face.texture.nbytes + (composition.surround.nbytes if composition.surround else 0)
     camera = photo_camera(head.fit.crop, *image.pixels.shape[:2])
     backdrops = Backdrops(work.background, work.background_blur, camera) if whole else None
-    shown = _Shown(composition, relit, apart, bytes_each, alpha, backdrops)
-    yield from _write_setups(item, face.tag, shown, work, metadata)
+    return _Shown(composition, relit, apart, bytes_each, alpha, backdrops)
 
 
 def _each_light(setup: LightSetup) -> tuple[LightSetup, ...]:
@@ -227,7 +257,7 @@ def _write_setups(
     parts = [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
     whole = shown.relit(parts[0]) if len(parts) == 1 else None
 
-    def relit_by_part(part: slice) -> list[Relit]:
+    def relit_by_part(part: slice) -> list[Any]:
         return shown.relit(part) if whole is None else whole
 
     exposures_ev = _exposures_ev(parts, relit_by_part, shown.composer, work)
@@ -244,7 +274,7 @@ def _write_setups(
 
 
 def _exposures_ev(
-    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Relit]], composer: Composer, work: Relight
+    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Any]], composer: Composer, work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(work.exposure, float):
