@@ -83,7 +83,7 @@ def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class FolderIndex:
-    """What the outputs of a folder were made from."""
+    """The index of one verb in an output folder, for the recipes of this run."""
 
     def __init__(self, folder: Path, verb: str, shard: Shard, recipes_of: RecipesOf) -> None:
         self._folder, self._verb = folder, verb

@@ -13,7 +13,7 @@ from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
-from facerf_cli.cli.naming import NamePattern
+from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -40,6 +40,7 @@ from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_
 from facerf_cli.errors import FacerfError, UsageError
 
 Composite = Literal["photo", "face"]
+ExposureGroup = Literal["photo", "folder", "sequence"]
 _SUFFIXES = (".exr", ".png")
 
 
@@ -63,11 +64,28 @@ class Relight:
     reflectance: RelightKind = "portrait"
     network_alone: bool = False
     name: NamePattern | None = field(default=None, metadata=NOT_IN_RECIPE)
+    exposure_group: ExposureGroup = "photo"
+    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
 
     def outputs_of(self, item: Item) -> list[Path]:
         """An EXR and a PNG for each setup."""
         tag = "" if self.composite == "photo" else self.photo.first_tag
         return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in _SUFFIXES]
+
+    def with_leaders(self, items: Sequence[Item]) -> "Relight":
+        """These settings with the first photo of each group of --exposure-group."""
+        groups = {self._group(item): item for item in reversed(items)}
+        return replace(self, leaders=tuple(groups.values())) if self.exposure_group != "photo" else self
+
+    def leader_of(self, item: Item) -> Item | None:
+        """The photo whose exposure an item shares; None without groups."""
+        own = self._group(item)
+        return next((leader for leader in self.leaders if self._group(leader) == own), None)
+
+    def _group(self, item: Item) -> Path:
+        if self.exposure_group == "folder":
+            return item.output_base.parent
+        return item.output_base.with_name(split_frame(item.output_base.name)[0])
 
     def refuse_meeting(self, items: Sequence[Item]) -> None:
         """Raise UsageError where two images would have one path, as a --name may make them."""
@@ -83,6 +101,8 @@ class Relight:
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of every output, which holds the light of its own setup alone."""
         shared = recipe_of(self, digest_of)
+        if self.leaders:
+            shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe for recipe in lit for _ in _SUFFIXES]
 
@@ -187,6 +207,13 @@ def relight(
             "by a number of EV.",
         ),
     ] = "auto",
+    exposure_group: Annotated[
+        ExposureGroup,
+        typer.Option(
+            help="Choose an exposure for each photo, or from the first one for a whole folder or sequence "
+            "of frames."
+        ),
+    ] = "photo",
     composite: Annotated[
         Composite | None,
         typer.Option(
@@ -303,9 +330,11 @@ def relight(
         reflectance=reflectance,
         network_alone=network_alone,
         name=pattern,
+        exposure_group=exposure_group,
     )
     options = BatchOptions(output, overwrite, dry_run, jobs)
     items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
+    work = work.with_leaders(items)
     work.refuse_meeting(items)
     finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
     usable = work if finished else work.readable(dry_run)

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -90,19 +91,31 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
     metadata = _metadata(item, work)
+    leader = work.leader_of(item)
+    chosen_ev = None if leader is None or leader == item else _exposures_of(leader, work)
     written: Written = {}
     if work.composite == "photo":
-        faces_by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
-        shown = _together([_show_face(item, image, face, work) for face in faces_by_size])
-        return dict(_write_setups(item, "", shown, work, metadata)), facts_of(faces)
+        shown = _together(item, image, faces, work)
+        return dict(_write_setups(item, "", shown, work, metadata, chosen_ev)), facts_of(faces)
     for face in reversed(faces):  # the first one's files mark the photo as finished
         shown = _show_face(item, image, face, work)
-        written.update(_write_setups(item, face.tag, shown, work, metadata))
+        written.update(_write_setups(item, face.tag, shown, work, metadata, chosen_ev))
     return written, facts_of(faces)
 
 
-def _together(shown: Sequence[_Shown]) -> _Shown:
+@cache
+def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
+    """Exposures of the first photo of a group, which the others share; found once a process."""
+    image = read_photo(leader, work.photo)
+    shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
+    parts = _parts(shown, work)
+    return _exposures_ev(parts, shown.relit, shown.composer, work)
+
+
+def _together(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _Shown:
     """People of one photo in one image; the nearest first."""
+    by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
+    shown = [_show_face(item, image, face, work) for face in by_size]
     first = shown[0]
     if len(shown) == 1:
         return first
@@ -247,20 +260,24 @@ class _RenderedStack:
 
 
 def _write_setups(
-    item: Item, tag: str, shown: _Shown, work: Relight, metadata: Mapping[str, Any]
+    item: Item,
+    tag: str,
+    shown: _Shown,
+    work: Relight,
+    metadata: Mapping[str, Any],
+    chosen_ev: Mapping[str, float] | None = None,
 ) -> Iterator[tuple[Path, float]]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
 
-    Where they do not fit at once, automatic exposure needs a second prediction.
+    Where they do not fit at once, an exposure that is to be found needs a second prediction.
     """
-    at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
-    parts = [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
+    parts = _parts(shown, work)
     whole = shown.relit(parts[0]) if len(parts) == 1 else None
 
     def relit_by_part(part: slice) -> list[Any]:
         return shown.relit(part) if whole is None else whole
 
-    exposures_ev = _exposures_ev(parts, relit_by_part, shown.composer, work)
+    exposures_ev = chosen_ev or _exposures_ev(parts, relit_by_part, shown.composer, work)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
@@ -271,6 +288,12 @@ def _write_setups(
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
             _write(path, image, layers, shown.alpha, ev, metadata)
             yield path, ev
+
+
+def _parts(shown: _Shown, work: Relight) -> list[slice]:
+    """Setups, as many at a time as fit the memory."""
+    at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
+    return [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
 
 
 def _exposures_ev(
