@@ -97,7 +97,9 @@ def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Pers
 def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Person) -> None:
     skin = person.field.person.segmentation.layer("skin") > 0.9
     means = [person.image(StudioLight(at_m=(0.0, 0.0, z)))[skin].mean() for z in (1.0, 4.0)]
-    assert means[0] == pytest.approx(means[1], rel=0.1)  # the nose is nearer than the centre, the ears farther
+    assert means[0] == pytest.approx(
+        means[1], rel=0.1
+    )  # the nose is nearer than the centre, the ears farther
 
 
 @pytest.mark.parametrize("is_near", [True, False], ids=["at", "from"])
@@ -136,7 +138,9 @@ def test_other_models_have_near_lights_too(person: Person, kind: str) -> None:
         return composition.light_layer(relit)
 
     both, key, rim = image(KEY, RIM), image(KEY), image(RIM)
-    np.testing.assert_allclose(both, key + rim, atol=2e-3 * both.max())  # the surround's undershoot is clipped
+    np.testing.assert_allclose(
+        both, key + rim, atol=2e-3 * both.max()
+    )  # the surround's undershoot is clipped
     skin = person.field.person.segmentation.layer("skin") > 0.9
     columns = np.flatnonzero(skin.any(0))
     middle = int(columns.mean())

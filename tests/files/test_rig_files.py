@@ -10,7 +10,9 @@ from facerf_cli.files.rig_files import MOST_RIG_LIGHTS, read_rig
 
 def test_values_become_the_text_of_an_option(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text("# a rig\n[key]\nat = [0.5, 1, -2e-1]\nkelvin = 3200\naz = '0:90:4'\n")
-    assert read_rig(tmp_path / "a.toml") == {"key": {"at": "0.5,1.0,-0.2", "kelvin": "3200.0", "az": "0:90:4"}}
+    assert read_rig(tmp_path / "a.toml") == {
+        "key": {"at": "0.5,1.0,-0.2", "kelvin": "3200.0", "az": "0:90:4"}
+    }
 
 
 @pytest.mark.parametrize(

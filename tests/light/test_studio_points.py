@@ -32,7 +32,10 @@ def test_at_the_centre_of_the_face_a_light_is_as_strong_as_a_far_one(
     assert irradiance_of_wall(points, CENTRE, toward_light) == pytest.approx(1, rel=1e-5)
     offsets = points.places_m - CENTRE - torch.tensor(at_m)
     assert float((offsets @ toward_light).abs().max()) < 1e-6  # a square that faces the face
-    assert float(offsets.mean(0).norm()) < 1e-6 and float(offsets.norm(dim=1).max()) < size_m / math.sqrt(2) + 1e-6
+    assert (
+        float(offsets.mean(0).norm()) < 1e-6
+        and float(offsets.norm(dim=1).max()) < size_m / math.sqrt(2) + 1e-6
+    )
 
 
 def test_irradiance_falls_with_the_square_of_the_distance() -> None:
