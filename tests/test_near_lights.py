@@ -1,5 +1,6 @@
 """Near and soft lights on a whole person: sums, distance, shadows, and agreement with far lights."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -92,6 +93,22 @@ def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Pers
         right = np.arange(image.shape[1]) > middle
         shares.append(image[skin & right].mean() / image[skin & ~right].mean())
     assert shares[0] > 1.3 * shares[1]
+
+
+def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Person) -> None:
+    """Lambert's law, by the proxy's positions: also on hair and garment, where no other field is mixed in."""
+    maps = person.field.maps
+    dark = {name: 0 * getattr(maps, name) for name in ("gloss", "lit", "around", "shadow")}
+    matt = replace(person.field, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
+    light = StudioLight(at_m=(0.1, 0.2, 0.3))
+    ((points, rgb),) = NearLights((light,), torch.ones(1, 1, 3)).around(person.composition.vertices_m.mean(0))
+    lit = matt.lit(*DARK, [(points, rgb)])
+    offsets = points.places_m[0, :, None, None] - person.field.person.maps.positions_m
+    cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)
+    wanted = cosine * points.strength / offsets.square().sum(0)
+    reached = lit.reached[0, 0] > 0.999
+    assert reached.float().mean() > 0.3 and wanted[reached].std() > 0.3
+    torch.testing.assert_close(lit.shading[0, 0][reached], wanted[reached], rtol=2e-3, atol=1e-4)
 
 
 def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Person) -> None:

@@ -50,7 +50,7 @@ def points_of(light: StudioLight) -> PointLights:
     ],
 )
 def test_each_texel_sees_the_light_in_its_own_direction_and_distance(light: StudioLight) -> None:
-    """Between the grid's directions the cosine is interpolated: 2 % of a light of 1, more for a wide patch."""
+    """Between the grid's directions the cosine is interpolated, which costs up to 2 %."""
     found = near_texture(WhiteClay(), points_of(light), vertices(), SIDE)
     directions, irradiance = points_of(light).arriving(positions())
     normals = normal_map(vertices(), grid_triangles(), SIDE)

@@ -32,7 +32,9 @@ def lit_images(entries: Sequence[str]) -> list[LitImage]:
     images: list[LitImage] = []
     named: list[GivenLight] = []
     for text in entries:
-        if (settings := read_keys(text)) is not None:
+        if (path := _rig_path(text)) is not None:
+            images.append(_rig(path))
+        elif (settings := read_keys(text)) is not None:
             name = settings.pop("name", None)
             light = light_by_keys(settings, "--light", name)
             if light.name is None:
@@ -41,8 +43,6 @@ def lit_images(entries: Sequence[str]) -> list[LitImage]:
                 named.append(light)
         elif "=" in text:
             named += [_short_named(part) for part in text.split(";")]
-        elif (path := _rig_path(text)) is not None:
-            images.append(_rig(path))
         else:
             images.append(_short(text))
     if named:

@@ -150,10 +150,13 @@ def relight(
         list[str] | None,
         typer.Option(
             "--light",
-            metavar="[NAME=]AZ,EL[,R,G,B][;...]",
+            metavar="[NAME=]AZ,EL[,R,G,B][;...]|KEY=VALUE;...|RIG.toml|PRESET",
             help="Relight under a single light from an azimuth and elevation in degrees (AZ > 0: from the "
-            "image's right), or under several at once, separated by ;. Repeatable. Lights with names "
-            "(key=40,20) shine together in one image, whose EXR has a layer for each.",
+            "image's right), or under several at once, separated by ;. Or under a light by its keys: "
+            "at=X,Y,Z (metres from the face) or from=AZ,EL, with rgb, kelvin, stops, size, size_deg, spot; "
+            "az=FROM:TO:N renders frames. Or under a rig file or a preset: beauty, butterfly, loop, "
+            "rembrandt, rim, split. Repeatable. Lights with names (key=40,20 or name=key;...) shine "
+            "together in one image, whose EXR has a layer for each.",
             show_default=False,
         ),
     ] = None,

@@ -111,6 +111,7 @@ def test_shadows_of_points_are_cast_toward_their_places() -> None:
     before, behind = visibility_of_points(proxy(), camera, points)
     face = slice(40, 56), slice(42, 54)
     assert before[face].mean() > 0.9 and behind[face].mean() < 0.01
-    forehead, tip = proxy_maps(proxy(), camera).positions_m[:, 36, 48], torch.tensor([0.0, 0.0, 0.02])
-    near = visibility_of_points(proxy(), camera, (forehead + tip)[None])[0]
-    assert near[36, 48] > 0.9  # the head behind the point does not count
+    neck, above = proxy_maps(proxy(), camera).positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
+    places = torch.stack([neck + length_m * above for length_m in (0.02, 0.5)])
+    below_chin, over_head = visibility_of_points(proxy(), camera, places)[:, 72, 48]
+    assert below_chin > 0.9 and over_head < 0.1  # the chin is behind the first
