@@ -268,12 +268,11 @@ class View:
     @property
     def is_srgb(self) -> bool:
         """True if the encoded values are known to be sRGB."""
-        return self.name in ("none", "soft") or self.config == _BUILT_IN
+        return self.name in ("none", "soft") or "srgb" in ocio.display(self.config).casefold()
 
 
 PLAIN_VIEW, SOFT_VIEW = View("none"), View("soft")
-_BUILT_IN = "ocio://default"
-_ACES_VIEW = View("ACES 2.0 - SDR 100 nits (Rec.709)", _BUILT_IN)
+_ACES_VIEW = View("ACES 2.0 - SDR 100 nits (Rec.709)", "ocio://default")
 _VIEWS = {"none": PLAIN_VIEW, "soft": SOFT_VIEW, "aces": _ACES_VIEW}
 
 

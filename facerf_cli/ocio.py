@@ -27,10 +27,14 @@ def names(config: str = "") -> dict[str, str]:
     return {name.casefold(): name for name in spaces}
 
 
+def display(config: str = "") -> str:
+    """Return the name of the configuration's default display."""
+    return str(_opened(config).getDefaultDisplayName())
+
+
 def views(config: str = "") -> list[str]:
     """List the views of the configuration's default display."""
-    found = _opened(config)
-    return list(found.getViewNames(found.getDefaultDisplayName()))
+    return list(_opened(config).getViewNames(display(config)))
 
 
 def converted(pixels: np.ndarray, source: str, target: str, config: str = "") -> np.ndarray | None:
@@ -41,9 +45,8 @@ def converted(pixels: np.ndarray, source: str, target: str, config: str = "") ->
 
 def shown(pixels: np.ndarray, source: str, view: str, config: str = "") -> np.ndarray | None:
     """Encode values for the configuration's default display by a view; None if OpenColorIO cannot."""
-    display = _opened(config).getDefaultDisplayName()
     result = oiio.ImageBufAlgo.ociodisplay(
-        _buffer(pixels), display, view, source, "", False, False, "", "", config
+        _buffer(pixels), display(config), view, source, "", False, False, "", "", config
     )
     return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
 

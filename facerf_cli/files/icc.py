@@ -22,6 +22,7 @@ from facerf_cli.colour import (
     SRGB,
     ColourSpace,
     adaptation,
+    linear_space,
     matrix_to_rec709,
     rgb_to_xyz,
 )
@@ -30,6 +31,7 @@ Curve = Callable[[np.ndarray], np.ndarray]
 _D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the profile connection space
 _KNOWN = (SRGB, DISPLAY_P3, ADOBE_RGB, REC2020, LINEAR, LINEAR_P3, LINEAR_REC2020)
 _SAME_MATRIX, _SAME_CURVE = 2e-3, 5e-4  # rounding in profiles of the same space
+_OUTSIDE = 0.1  # decoded values of a sound curve may leave 0..1 by this
 _FIXED = 65536  # s15Fixed16Number
 _MOST_TAGS, _MOST_ENTRIES = 200, 65536
 # Parameters of each function type: names g a b c d e f of the ICC specification.
@@ -42,7 +44,7 @@ def space_of_profile(profile: bytes, name: str) -> ColourSpace | None:
         space = _space(profile, name or "ICC profile")
     except (ValueError, struct.error, ZeroDivisionError, np.linalg.LinAlgError):
         return None
-    if space is None or space.chromaticities is None or space.decode is None:
+    if space is None or not _is_sound(space):
         return None
     return next((known for known in _KNOWN if _same(space, known)), space)
 
@@ -135,13 +137,26 @@ class _Parametric:
         return (g, a, b, *rest) if self.kind == 4 else (g, a, b, *rest, 0.0, 0.0)
 
 
+def _is_sound(space: ColourSpace) -> bool:
+    """True if the primaries are possible, and black to white decode to about 0 to 1."""
+    assert space.chromaticities is not None
+    with np.errstate(all="ignore"):
+        decoded = _decoded_ramp(space)
+    within = bool((np.abs(decoded - 0.5) < 0.5 + _OUTSIDE).all())
+    return within and linear_space(space.chromaticities) is not None
+
+
 def _same(space: ColourSpace, known: ColourSpace) -> bool:
     """True if two spaces differ by rounding only."""
-    assert space.chromaticities is not None and known.chromaticities is not None and space.decode is not None
+    assert space.chromaticities is not None and known.chromaticities is not None
     matrices = matrix_to_rec709(space.chromaticities), matrix_to_rec709(known.chromaticities)
+    curves = _decoded_ramp(space), _decoded_ramp(known)
+    return np.allclose(*matrices, 0, _SAME_MATRIX) and np.allclose(*curves, 0, _SAME_CURVE)
+
+
+def _decoded_ramp(space: ColourSpace) -> np.ndarray:
     ramp = np.linspace(0, 1, 256, dtype=np.float32)[:, None].repeat(3, 1)
-    curve = ramp if known.decode is None else known.decode(ramp)
-    return np.allclose(*matrices, 0, _SAME_MATRIX) and np.allclose(space.decode(ramp), curve, 0, _SAME_CURVE)
+    return ramp if space.decode is None else space.decode(ramp)
 
 
 def linear_profile(space: ColourSpace) -> bytes:

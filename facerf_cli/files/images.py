@@ -206,12 +206,13 @@ def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterato
 def _exr_data(path: Path, part: _ExrPart) -> tuple[np.ndarray, int]:
     """Return a part's values [H, W, C], and how many were beyond the range of half floats."""
     values = np.stack(list(part.channels.values()), -1)
+    with np.errstate(over="ignore"):
+        data = values.astype(np.float16 if part.kind == "half" else np.float32, copy=False)
+    if np.isfinite(data).all():
+        return data, 0
     if bad := int(np.sum(~np.isfinite(values))):
         raise ValueError(f"{path}: {bad} values are NaN or infinite")
-    if part.kind == "float":
-        return values.astype(np.float32, copy=False), 0
-    count = int(np.sum(np.abs(values) > HALF_MAX))
-    return values.clip(-HALF_MAX, HALF_MAX).astype(np.float16), count
+    return values.clip(-HALF_MAX, HALF_MAX).astype(np.float16), int(np.sum(np.abs(values) > HALF_MAX))
 
 
 def write_tiff(
