@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from facerf_cli.colour import (
+    ACES,
+    ACESCG,
     ADOBE_RGB,
     DISPLAY_P3,
     LINEAR,
@@ -29,7 +31,7 @@ from facerf_cli.colour import (
 
 Curve = Callable[[np.ndarray], np.ndarray]
 _D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the profile connection space
-_KNOWN = (SRGB, DISPLAY_P3, ADOBE_RGB, REC2020, LINEAR, LINEAR_P3, LINEAR_REC2020)
+_KNOWN = (SRGB, DISPLAY_P3, ADOBE_RGB, REC2020, LINEAR, LINEAR_P3, LINEAR_REC2020, ACESCG, ACES)
 _SAME_MATRIX, _SAME_CURVE = 2e-3, 5e-4  # rounding in profiles of the same space
 _OUTSIDE = 0.1  # decoded values of a sound curve may leave 0..1 by this
 _FIXED = 65536  # s15Fixed16Number
@@ -76,13 +78,14 @@ def _tags(profile: bytes) -> dict[bytes, bytes]:
 
 @dataclass(frozen=True)
 class _Curves:
-    """Decodes each channel of [..., 3] by its curve."""
+    """Decodes each channel of [..., 3] by its curve; negative values are mirrored."""
 
     channels: tuple[Curve, ...]
 
     def __call__(self, encoded: np.ndarray) -> np.ndarray:
-        decoded = [curve(encoded[..., index]) for index, curve in enumerate(self.channels)]
-        return np.stack(decoded, -1).astype(np.float32)
+        size = np.abs(encoded)
+        decoded = [curve(size[..., index]) for index, curve in enumerate(self.channels)]
+        return np.copysign(np.stack(decoded, -1), encoded).astype(np.float32)
 
 
 def _curve(tag: bytes) -> Curve:
@@ -104,12 +107,14 @@ def _curve(tag: bytes) -> Curve:
 
 @dataclass(frozen=True)
 class _Table:
-    """A sampled curve, linear between its entries."""
+    """A sampled curve, linear between its entries and beyond the last."""
 
     entries: tuple[float, ...]
 
     def __call__(self, encoded: np.ndarray) -> np.ndarray:
-        return np.interp(encoded, np.linspace(0, 1, len(self.entries)), self.entries)
+        last, slope = self.entries[-1], (self.entries[-1] - self.entries[-2]) * (len(self.entries) - 1)
+        inside = np.interp(encoded, np.linspace(0, 1, len(self.entries)), self.entries)
+        return np.where(encoded > 1, last + slope * (encoded - 1), inside)
 
 
 @dataclass(frozen=True)
