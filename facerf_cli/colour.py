@@ -1,19 +1,18 @@
 """Colour spaces: from the encodings of files to scene-linear Rec.709, and from there to sRGB for display.
 
 Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
-the ACES spaces). A name that is not defined here is looked up in the OpenColorIO configuration ($OCIO, or
-`ocio://default`).
+the ACES spaces). A name that is not defined here is looked up in an OpenColorIO configuration (`ocio`). A
+view turns scene-linear values into values of a display.
 """
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal
 
 import numpy as np
-import OpenImageIO as oiio
 
+from facerf_cli import ocio
 from facerf_cli.errors import UsageError
 
 # Chromaticities x, y of red, green, blue and white.
@@ -23,10 +22,13 @@ _REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.32
 _AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 _AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+_ROMM_CHROMATICITIES = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 0.3585)
 
 # From XYZ to the cone responses of the Bradford transform (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 _ADOBE_GAMMA = 563 / 256
+# Film scans: code values of black and of white (18 % grey is at 445), and code values a factor of 10.
+_CINEON_BLACK, _CINEON_WHITE, _CINEON_DECADE = 95, 685, 300
 _BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
 # Limits of chromaticities: the tolerance of equal ones, the largest coordinate, and the smallest area or
 # coordinate of primaries that span a space.
@@ -37,6 +39,7 @@ ExposureRule = Literal["auto", "face"]
 _FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
+SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -65,6 +68,19 @@ def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
     return (np.sign(encoded) * np.abs(encoded) ** _ADOBE_GAMMA).astype(np.float32)
 
 
+def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert the transfer function of ROMM RGB (ISO 22028-2), which is ProPhoto RGB."""
+    size = np.abs(encoded)
+    return np.copysign(np.where(size < 16 / 512, size / 16, size**1.8), encoded).astype(np.float32)
+
+
+def _cineon_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert Kodak's Cineon curve, of code values 0..1023 as 0..1; black is 0 and diffuse white 1."""
+    black = 10 ** ((_CINEON_BLACK - _CINEON_WHITE) / _CINEON_DECADE)
+    relative = 10 ** ((1023 * encoded - _CINEON_WHITE) / _CINEON_DECADE)
+    return ((relative - black) / (1 - black)).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class ColourSpace:
     """A colour space by its primaries and decoding curve; without primaries OpenColorIO converts it."""
@@ -72,6 +88,7 @@ class ColourSpace:
     name: str
     chromaticities: tuple[float, ...] | None
     decode: Callable[[np.ndarray], np.ndarray] | None = None  # None if linear
+    config: str = ""  # OpenColorIO's, which knows the name
 
     @property
     def is_linear(self) -> bool:
@@ -88,6 +105,8 @@ REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
+PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _romm_to_linear)
+CINEON = ColourSpace("Cineon log", REC709_CHROMATICITIES, _cineon_to_linear)
 
 # Compared without case, spaces and punctuation; includes the interchange names that OpenImageIO uses.
 _ALIASES = {
@@ -100,16 +119,18 @@ _ALIASES = {
     LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
     LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
     ACES: "aces20651 linap0 linap0scene",
+    PROPHOTO: "prophoto prophotorgb romm rommrgb",
+    CINEON: "cineon cineonlog kodaklog",
 }
 _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
 
 
-def find_space(name: str) -> ColourSpace | None:
+def find_space(name: str, config: str = "") -> ColourSpace | None:
     """Return the space of this name, defined here or by OpenColorIO; None if it is unknown."""
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     if plain in _BY_ALIAS:
         return _BY_ALIAS[plain]
-    return ColourSpace(name, None) if name.casefold() in _ocio_names() else None
+    return ColourSpace(name, None, None, config) if name.casefold() in ocio.names(config) else None
 
 
 def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
@@ -130,38 +151,59 @@ def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
     return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
 
 
-def named_space(name: str) -> ColourSpace:
+def named_space(name: str, config: str = "") -> ColourSpace:
     """Return the space that a user names; an unknown name raises a UsageError that lists similar ones."""
-    space = find_space(name)
+    space = find_space(name, config)
     if space is None:
         ours = [known.name for known in _ALIASES]
-        near = difflib.get_close_matches(name, [*ours, *_ocio_names().values()], 3, 0.5)
+        near = difflib.get_close_matches(name, [*ours, *ocio.names(config).values()], 3, 0.5)
         hint = f"similar names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
         raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
     return space
 
 
-@cache
-def _ocio_names() -> dict[str, str]:
-    """Map case-folded names and aliases of the OpenColorIO configuration to their spelling."""
-    configuration = oiio.ColorConfig()
-    if error := configuration.geterror():  # otherwise OpenImageIO continues with a few built-in names
-        raise UsageError(f"$OCIO: {error}")
-    names = [name for name in configuration.getColorSpaceNames() if not configuration.isData(name)]
-    names += [alias for name in names for alias in configuration.getAliases(name)]
-    names += configuration.getRoles()
-    return {name.casefold(): name for name in names}
-
-
 def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
     """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values."""
     if space.chromaticities is None:
-        return _convert_by_ocio(pixels, space.name)
+        for name, matrix in _ocio_bridges():
+            found = ocio.converted(pixels, space.name, name, space.config)
+            if found is not None:
+                return _by_matrix(found, matrix)
+        raise _cannot_convert(space)
     linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
-    matrix = matrix_to_rec709(space.chromaticities)
+    return _by_matrix(linear, matrix_to_rec709(space.chromaticities))
+
+
+def from_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Convert scene-linear Rec.709 [H, W, 3] to a linear space, or to one of OpenColorIO, unclipped."""
+    if space.chromaticities is None:
+        for name, matrix in _ocio_bridges():
+            bridge = _by_matrix(pixels, np.linalg.inv(matrix))
+            found = ocio.converted(bridge, name, space.name, space.config)
+            if found is not None:
+                return found
+        raise _cannot_convert(space)
+    if space.decode is not None:
+        raise ValueError(f"{space.name} is not linear")
+    return _by_matrix(pixels, np.linalg.inv(matrix_to_rec709(space.chromaticities)))
+
+
+def _by_matrix(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Multiply colours [H, W, 3] by a matrix [3, 3]."""
     if np.allclose(matrix, np.eye(3), atol=1e-6):
-        return linear.astype(np.float32, copy=False)
-    return linear @ matrix.T.astype(np.float32)
+        return pixels.astype(np.float32, copy=False)
+    return pixels @ matrix.T.astype(np.float32)
+
+
+def _ocio_bridges() -> Iterator[tuple[str, np.ndarray]]:
+    """Yield names of linear spaces that OpenColorIO may know, each with its matrix to linear Rec.709."""
+    yield from ((name, np.eye(3)) for name in ocio.REC709_NAMES)
+    yield from ((name, matrix_to_rec709(_AP0_CHROMATICITIES)) for name in ocio.ACES_NAMES)
+
+
+def _cannot_convert(space: ColourSpace) -> UsageError:
+    known = "the configuration has neither linear Rec.709 nor ACES2065-1 under a usual name"
+    return UsageError(f"'{space.name}': OpenColorIO cannot convert it; maybe {known}")
 
 
 def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
@@ -171,15 +213,6 @@ def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> 
     for start in range(0, len(pixels), rows):
         result[start : start + rows] = curve(pixels[start : start + rows])
     return result
-
-
-def _convert_by_ocio(pixels: np.ndarray, name: str) -> np.ndarray:
-    source = oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
-    for linear_name in ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)"):
-        converted = oiio.ImageBufAlgo.colorconvert(source, name, linear_name)
-        if not converted.has_error:
-            return np.asarray(converted.get_pixels(oiio.FLOAT))
-    raise UsageError(f"colour space '{name}': OpenColorIO cannot convert it: {converted.geterror()}")
 
 
 def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
@@ -192,9 +225,13 @@ def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
 def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
     """Return the matrix [3, 3] from linear RGB of these primaries to linear Rec.709 (Bradford adaptation)."""
     source, target = rgb_to_xyz(chromaticities), rgb_to_xyz(REC709_CHROMATICITIES)
-    gain = (_BRADFORD @ target.sum(1)) / (_BRADFORD @ source.sum(1))
-    adaptation = np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
-    return np.linalg.inv(target) @ adaptation @ source
+    return np.linalg.inv(target) @ adaptation(source.sum(1), target.sum(1)) @ source
+
+
+def adaptation(from_white: np.ndarray, to_white: np.ndarray) -> np.ndarray:
+    """Return the matrix [3, 3] of the Bradford adaptation between two whites, XYZ [3]."""
+    gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
+    return np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
 
 
 def luminance(linear: np.ndarray) -> np.ndarray:
@@ -252,3 +289,61 @@ def chosen_exposure_ev(
 def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> float:
     values = luminance(linear)[mask > 0.5]
     return float(np.percentile(values, percentile)) if values.size else 0.0
+
+
+@dataclass(frozen=True)
+class View:
+    """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `shoulder` before it.
+
+    Others are views of an OpenColorIO configuration's default display.
+    """
+
+    name: str = "none"
+    config: str = ""
+
+    @property
+    def is_srgb(self) -> bool:
+        """True if the encoded values are known to be sRGB."""
+        return self.name in ("none", "soft") or "srgb" in ocio.display(self.config).casefold()
+
+
+PLAIN_VIEW, SOFT_VIEW = View("none"), View("soft")
+_ACES_VIEW = View("ACES 2.0 - SDR 100 nits (Rec.709)", "ocio://default")
+_VIEWS = {"none": PLAIN_VIEW, "soft": SOFT_VIEW, "aces": _ACES_VIEW}
+
+
+def named_view(name: str, config: str = "") -> View:
+    """Return the view that a user names; an unknown name raises a UsageError that lists the known ones."""
+    if name in _VIEWS:
+        return _VIEWS[name]
+    known = ocio.views(config)
+    for view in known:
+        if view.casefold() == name.casefold():
+            return View(view, config)
+    raise UsageError(f"unknown view '{name}' (known: {', '.join([*_VIEWS, *known])})")
+
+
+def shoulder(linear: np.ndarray) -> np.ndarray:
+    """Keep values up to s = 0.8, and let higher ones approach 1: 1 - (1 - s) exp(-(x - s) / (1 - s))."""
+    start = np.float32(SHOULDER_START_LINEAR)
+    above = np.maximum(linear - start, 0) / (1 - start)
+    return np.where(above > 0, 1 - (1 - start) * np.exp(-above), linear)
+
+
+def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = None) -> np.ndarray:
+    """Encode exposed linear Rec.709 [H, W, 3] for a display, 0..1.
+
+    `share` [H, W] in 0..1 is how far the soft shoulder applies to a pixel: what was photographed, and so is
+    encoded already, keeps its look without it.
+    """
+    if view.name == "none":
+        return in_blocks(lambda block: linear_to_srgb(np.clip(block, 0, 1)), linear)
+    if view.name == "soft":
+        soft = in_blocks(shoulder, linear)
+        mixed = soft if share is None else linear + share[..., None] * (soft - linear)
+        return encode_display(mixed, PLAIN_VIEW)
+    for name, matrix in _ocio_bridges():
+        found = ocio.shown(_by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config)
+        if found is not None:
+            return found.clip(0, 1)
+    raise _cannot_convert(ColourSpace(view.name, None))

@@ -1,6 +1,7 @@
 """Colour spaces against colour-science and OpenColorIO."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ ORACLE_NAMES = {
     ours.ACES: "ACES2065-1",
     ours.DISPLAY_P3: "Display P3",
     ours.LINEAR: "ITU-R BT.709",
+    ours.PROPHOTO: "ROMM RGB",
 }
 
 
@@ -61,6 +63,104 @@ def test_curves_are_colour_science_s() -> None:
     adobe = ours.ADOBE_RGB.decode(ENCODED)  # type: ignore[misc]
     expected = oracle.RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding(ENCODED)
     np.testing.assert_allclose(adobe, expected, atol=1e-6)
+
+
+def test_curves_of_prophoto_and_of_film_are_colour_science_s() -> None:
+    prophoto = ours.PROPHOTO.decode(ENCODED)  # type: ignore[misc]
+    np.testing.assert_allclose(prophoto, oracle.models.cctf_decoding_ROMMRGB(ENCODED), atol=1e-6)
+    film = ours.CINEON.decode(ENCODED)  # type: ignore[misc]
+    np.testing.assert_allclose(film, oracle.models.log_decoding_Cineon(ENCODED), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["linear", "ACEScg", "ACES2065-1", "lin_rec2020", "ACEScct", "lin_adobergb"])
+def test_from_linear_rec709_is_the_way_back(name: str) -> None:
+    space = ours.named_space(name)
+    there = ours.from_linear_rec709(RGB.clip(0.01), space)
+    np.testing.assert_allclose(ours.to_linear_rec709(there, space), RGB.clip(0.01), rtol=1e-4, atol=1e-4)
+    if space.is_linear:
+        expected = oracle.RGB_to_RGB(RGB, "ITU-R BT.709", name, "Bradford") if name == "ACEScg" else None
+        if expected is not None:
+            np.testing.assert_allclose(ours.from_linear_rec709(RGB, space), expected, atol=2e-3)
+
+
+def test_a_curve_has_no_way_back() -> None:
+    with pytest.raises(ValueError, match="sRGB is not linear"):
+        ours.from_linear_rec709(RGB, ours.SRGB)
+
+
+def test_the_shoulder_meets_the_plain_curve_with_its_slope_and_never_reaches_1() -> None:
+    below = np.linspace(-0.5, 0.8, 50, dtype=np.float32)
+    np.testing.assert_array_equal(ours.shoulder(below), below)
+    near = np.float32([0.8 + 1e-3, 0.8 + 2e-3])
+    assert np.diff(ours.shoulder(near))[0] == pytest.approx(1e-3, rel=0.02)
+    assert ours.shoulder(np.float32([1.0]))[0] == pytest.approx(1 - 0.2 / np.e, abs=1e-6)
+    above = ours.shoulder(np.linspace(0.8, 2.5, 100, dtype=np.float32))
+    assert (np.diff(above) > 0).all() and above.max() < 1
+
+
+def test_views_by_name() -> None:
+    grey = np.full((2, 3, 3), 0.18, np.float32)
+    plain = ours.linear_to_srgb(grey)
+    for name in ("none", "soft", "Un-tone-mapped", "un-TONE-mapped"):
+        np.testing.assert_allclose(ours.encode_display(grey, ours.named_view(name)), plain, atol=2e-4)
+    aces = ours.encode_display(grey, ours.named_view("aces"))
+    # ACES 2 shows 18 % grey at 10 nits of 100.
+    np.testing.assert_allclose(ours.srgb_to_linear(aces), 0.1, atol=0.01)
+    assert all(ours.named_view(name).is_srgb for name in ("none", "soft", "aces", "Un-tone-mapped"))
+    with pytest.raises(UsageError, match=r"unknown view 'nope' \(known: none, soft, aces, ACES 2"):
+        ours.named_view("nope")
+
+
+MATRIX = "0.6954522414,0.1406786965,0.1638690622,0, 0.0447945634,0.8596711185,0.0955343182,0, "
+MATRIX += "-0.0055258826,0.0040252103,1.0015006723,0, 0,0,0,1"  # ACEScg to ACES2065-1
+SHOW = f"""ocio_profile_version: 2
+roles: {{scene_linear: Show Linear, ROLE, default: Show Linear}}
+displays:
+  Monitor:
+    - !<View> {{name: Show Look, colorspace: Show Monitor}}
+colorspaces:
+  - !<ColorSpace> {{name: ACES2065-1}}
+  - !<ColorSpace>
+    name: Show Linear
+    to_scene_reference: !<MatrixTransform> {{matrix: [{MATRIX}]}}
+  - !<ColorSpace>
+    name: Show Half
+    to_scene_reference: !<GroupTransform>
+      children:
+        - !<MatrixTransform> {{matrix: [2,0,0,0, 0,2,0,0, 0,0,2,0, 0,0,0,1]}}
+        - !<MatrixTransform> {{matrix: [{MATRIX}]}}
+  - !<ColorSpace>
+    name: Show Monitor
+    to_scene_reference: !<GroupTransform>
+      children:
+        - !<ExponentTransform> {{value: [2, 2, 2, 1]}}
+        - !<MatrixTransform> {{matrix: [{MATRIX}]}}
+"""
+
+
+@pytest.mark.parametrize("role", ["aces_interchange: ACES2065-1", "matte_paint: Show Linear"])
+def test_a_configuration_of_a_show(tmp_path: Path, role: str) -> None:
+    """Also one without the role by which OpenImageIO finds ACES, as older configurations are."""
+    (tmp_path / "show.ocio").write_text(SHOW.replace("ROLE", role))
+    config = str(tmp_path / "show.ocio")
+    half = ours.named_space("show half", config)
+    acescg = ours.from_linear_rec709(RGB, ours.ACESCG)
+    np.testing.assert_allclose(ours.from_linear_rec709(RGB, half), acescg / 2, atol=1e-4)
+    np.testing.assert_allclose(ours.to_linear_rec709(acescg / 2, half), RGB, atol=2e-4)
+    view = ours.named_view("show look", config)
+    shown = ours.encode_display(RGB.clip(0.01, 0.9), view)
+    expected = np.sqrt(ours.from_linear_rec709(RGB.clip(0.01, 0.9), ours.ACESCG))
+    np.testing.assert_allclose(shown, expected, atol=1e-4)
+    assert not view.is_srgb
+    with pytest.raises(UsageError, match=r"unknown view 'aCES' \(known: none, soft, aces, Show Look"):
+        ours.named_view("aCES", config)
+
+
+def test_a_file_that_is_no_configuration(tmp_path: Path) -> None:
+    (tmp_path / "bad.ocio").write_text("hello")
+    for look_up in (ours.named_view, ours.named_space):
+        with pytest.raises(UsageError, match=r"bad\.ocio: Error"):
+            look_up("Show", str(tmp_path / "bad.ocio"))
 
 
 def test_srgb_there_and_back_beyond_the_gamut() -> None:

@@ -11,7 +11,8 @@ from facerf_cli.cli.naming import NamePattern, fields_of
 from facerf_cli.errors import UsageError
 
 PHOTO_SUFFIXES = frozenset(
-    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm", ".webp"}
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
+    | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
 )
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 

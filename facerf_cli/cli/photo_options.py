@@ -72,6 +72,7 @@ class PhotoOptions:
     geometry: Geometry | None = None  # None: as the checkpoint was trained
     texture_side: int | None = None  # None: the checkpoint's
     landmarks_from: LandmarksFrom = "facerf"
+    ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
 
     def check(self) -> None:
         """Raise UsageError for an option that would fail every photo; nothing heavy is loaded."""

@@ -1,5 +1,7 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
+import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,7 +26,20 @@ from facerf_cli.cli.options import (
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
+    refuse_given,
     settings_of,
+)
+from facerf_cli.cli.output_options import (
+    STDOUT,
+    ColourspaceOption,
+    CompressionOption,
+    FormatOption,
+    OcioOption,
+    OutputOptions,
+    ViewOption,
+    check_stdout,
+    config_of,
+    parse_formats,
 )
 from facerf_cli.cli.photo_options import (
     FaceOption,
@@ -41,7 +56,6 @@ from facerf_cli.errors import FacerfError, UsageError
 
 Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
-_SUFFIXES = (".exr", ".png")
 
 
 @dataclass(frozen=True)
@@ -61,6 +75,7 @@ class Relight:
     exposure: Exposure
     memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     asked_for_photo: bool = field(metadata=NOT_IN_RECIPE)  # --composite photo is on the command line
+    output: OutputOptions
     reflectance: RelightKind = "portrait"
     network_alone: bool = False
     name: NamePattern | None = field(default=None, metadata=NOT_IN_RECIPE)
@@ -68,9 +83,10 @@ class Relight:
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """An EXR and a PNG for each setup."""
+        """A file of each format for each setup."""
         tag = "" if self.composite == "photo" else self.photo.first_tag
-        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in _SUFFIXES]
+        suffixes = self.output.suffixes
+        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in suffixes]
 
     def with_leaders(self, items: Sequence[Item]) -> "Relight":
         """These settings with the first photo of each group of --exposure-group."""
@@ -104,7 +120,7 @@ class Relight:
         if self.leaders:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
-        return [recipe for recipe in lit for _ in _SUFFIXES]
+        return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
     def readable(self, dry_run: bool) -> "Relight":
         """Load the models, and keep the setups whose maps can be read.
@@ -112,7 +128,9 @@ class Relight:
         A dry run loads no networks, and so estimates no light of a photo.
         """
         from facerf_cli.cli.items.light_weights import readable
+        from facerf_cli.cli.items.outputs import check_output
 
+        check_output(self.output)
         self.photo.preparation(dry_run)()
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self
@@ -126,7 +144,7 @@ class Relight:
         from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self)
-        outputs = [path.with_suffix(suffix) for path in written for suffix in _SUFFIXES]
+        outputs = [path.with_suffix(suffix) for path in written for suffix in self.output.suffixes]
         exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
         return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
 
@@ -206,8 +224,8 @@ def relight(
         str,
         typer.Option(
             metavar="auto|face|EV",
-            help="Expose the PNG so that the face is as bright as in the photo (auto) or well lit (face); or "
-            "by a number of EV.",
+            help="Expose PNG and JPEG so that the face is as bright as in the photo (auto) or well lit "
+            "(face); or by a number of EV.",
         ),
     ] = "auto",
     exposure_group: Annotated[
@@ -217,6 +235,11 @@ def relight(
             "of frames."
         ),
     ] = "photo",
+    view: ViewOption = OutputOptions.view,
+    format_: FormatOption = "",
+    output_colourspace: ColourspaceOption = None,
+    compression: CompressionOption = OutputOptions.compression,
+    ocio: OcioOption = None,
     composite: Annotated[
         Composite | None,
         typer.Option(
@@ -292,14 +315,16 @@ def relight(
     """Relight photos under environment maps and single lights.
 
     Each image is written as a scene-linear EXR, with the layer person.A (the matte) and those of --aov, and
-    as a PNG at --exposure. One prediction serves all maps and rotations of a photo. Frame numbers at the end
-    of a name (sky.0001.exr) stay at the end.
+    as a PNG at --exposure, or as --format says; -o - writes one image to standard output. One prediction
+    serves all maps and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the
+    end.
 
     An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
     the nearest of them.
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
+    formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
@@ -307,13 +332,23 @@ def relight(
     if network_alone and reflectance not in ("field", "portrait"):
         raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
     photo = PhotoOptions(
-        settings, input_colourspace, face_model, face, landmarks, geometry, texture_size, landmarks_from
+        settings,
+        input_colourspace,
+        face_model,
+        face,
+        landmarks,
+        geometry,
+        texture_size,
+        landmarks_from,
+        config_of(ocio),
     )
     photo.check()
     behind = parse_background(background)
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     check_companion(matte, "--matte")
+    if aov and "exr" not in formats:
+        raise UsageError("--aov: only EXR has layers; add exr to --format")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))
     work = Relight(
@@ -330,11 +365,16 @@ def relight(
         exposure=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
+        output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
         reflectance=reflectance,
         network_alone=network_alone,
         name=pattern,
         exposure_group=exposure_group,
     )
+    if output == STDOUT:
+        refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
+        _write_to_stdout(inputs, work)
+        return
     options = BatchOptions(output, overwrite, dry_run, jobs)
     items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
     work = work.with_leaders(items)
@@ -347,8 +387,19 @@ def relight(
     raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))
 
 
+def _write_to_stdout(inputs: list[str], work: Relight) -> None:
+    """Write the one image of one photo as bytes; raises UsageError where there are several."""
+    with tempfile.TemporaryDirectory() as folder:
+        items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
+        images = len(items) * len(work.setups)
+        check_stdout(images if work.photo.face != "all" else 2 * images, work.output.formats)
+        (path,) = work.readable(False)(items[0]).outputs
+        sys.stdout.buffer.write(path.read_bytes())
+        sys.stdout.buffer.flush()
+
+
 def _write_balls(work: Relight, options: BatchOptions) -> None:
-    """Write the balls under each map to `balls/NAME.exr` and `.png`, unless they are there."""
+    """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
 
     def path_of(setup: LightSetup) -> Path:
         return options.output / "balls" / f"{setup.name}{setup.frame}.exr"
@@ -357,10 +408,11 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
     missing = [
         setup
         for setup in maps
-        if options.overwrite == "always" or not path_of(setup).with_suffix(".png").exists()
+        if options.overwrite == "always"
+        or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
     ]
     if missing:
         from facerf_cli.cli.items.light_weights import readable, write_balls
 
         drawn = readable(missing)
-        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure)
+        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure, work.output)

@@ -1,7 +1,7 @@
 """Image files without their pixels: size, number format and colour space in the header; XMP provenance.
 
-Provenance is written as an XMP packet into PNG and JPEG files, where viewers look for IPTC's digital source
-type.
+Provenance is written as an XMP packet into PNG, JPEG and TIFF files, where viewers look for IPTC's digital
+source type.
 """
 
 import logging
@@ -17,6 +17,7 @@ import OpenImageIO as oiio
 
 from facerf_cli.colour import (
     ADOBE_RGB,
+    CINEON,
     DISPLAY_P3,
     LINEAR,
     REC2020,
@@ -26,13 +27,18 @@ from facerf_cli.colour import (
     linear_space,
 )
 from facerf_cli.errors import InputError
-from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.files.icc import space_of_profile
+from facerf_cli.logs import LOGGER_NAME, one_line
 
 Attributes = Mapping[str, str | int | float]
 
-# Colour spaces by a part of an ICC profile's description in lower case; the first match counts.
+# Colour spaces by a part of the description, in lower case, of ICC profiles that hold tables; the first match
+# counts.
 _ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
+_SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
 _JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
 _XMP_NAMESPACES = {
     "Iptc4xmpExt": "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
@@ -94,14 +100,15 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
 def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     """Return the colour space that the file states; by default floats are linear Rec.709, integers sRGB."""
     default = LINEAR if is_floating(spec) else SRGB
-    profile = spec.get_string_attribute("ICCProfile:profile_description")
-    name = profile or spec.get_string_attribute("oiio:ColorSpace")
-    if profile:
-        named = next((space for part, space in _ICC_SPACES.items() if part in profile.lower()), None)
-    elif name in ("", "Rec709"):  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
-        named = default
+    description = spec.get_string_attribute("ICCProfile:profile_description")
+    profile = spec.getattribute("ICCProfile")
+    if profile is not None or description:
+        return _space_of_icc(path, b"" if profile is None else bytes(profile), description, default)
+    name = spec.get_string_attribute("oiio:ColorSpace") or spec.get_string_attribute(OCIO_SPACE)
+    if name == "" and spec.get_string_attribute("dpx:Transfer") == "Printing density":
+        named: ColourSpace | None = CINEON
     else:
-        named = find_space(name)
+        named = default if name in _SAYS_NOTHING else find_space(name)
     if named is None:
         log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
         named = default
@@ -112,6 +119,25 @@ def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     if by_primaries is None:
         log.warning("%s: impossible primaries in the header; those of %s are used", path, named.name)
     return named if by_primaries in (None, LINEAR) else by_primaries
+
+
+def _space_of_icc(path: Path, profile: bytes, description: str, default: ColourSpace) -> ColourSpace:
+    """Return the space of an embedded profile; of one that is not understood, by its name."""
+    found = space_of_profile(profile, description)
+    if found is None:
+        lower = description.lower()
+        found = next((space for part, space in _ICC_SPACES.items() if part in lower), None)
+    if found is None:
+        kind = f"embedded profile '{one_line(description)}' is not understood"
+        log.warning("%s: the %s; taken for %s", path, kind, default.name)
+    return found or default
+
+
+def states_space(spec: oiio.ImageSpec) -> bool:
+    """Return whether a file says anything about its colour space."""
+    names = (OCIO_SPACE, "ICCProfile", "ICCProfile:profile_description", "chromaticities")
+    says = spec.get_string_attribute("oiio:ColorSpace") not in _SAYS_NOTHING
+    return says or any(spec.getattribute(name) is not None for name in names)
 
 
 def is_floating(spec: oiio.ImageSpec) -> bool:
@@ -139,9 +165,13 @@ def require_whole_png(path: Path) -> None:
 
 
 def embed_xmp(path: Path, metadata: Attributes) -> None:
-    """Insert an XMP packet into a finished PNG or JPEG; a file of another kind stays as it is."""
-    data = path.read_bytes() if path.suffix.lower() in (".png", ".jpg", ".jpeg") else b""
-    packet = xmp_packet(metadata)
+    """Insert an XMP packet into a finished PNG, JPEG or TIFF; a file of another kind stays as it is."""
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
+        return
+    data, packet = path.read_bytes(), xmp_packet(metadata)
+    if data.startswith(_TIFF_START):
+        path.write_bytes(_tiff_with_xmp(data, packet))
+        return
     if data.startswith(_JPEG_START):
         body = _JPEG_XMP_SIGNATURE + packet
         segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
@@ -155,6 +185,21 @@ def embed_xmp(path: Path, metadata: Attributes) -> None:
     else:
         return
     path.write_bytes(data[:at] + segment + data[at:])
+
+
+def _tiff_with_xmp(data: bytes, packet: bytes) -> bytes:
+    """Append an XMP packet to a little-endian TIFF, and its directory with the tag that points to it."""
+    (at,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, at)
+    entries = [data[at + 2 + 12 * index :][:12] for index in range(count)]
+    kept = [entry for entry in entries if struct.unpack_from("<H", entry)[0] != _TIFF_XMP_TAG]
+    data += bytes(len(data) % 2)  # offsets are even
+    added = struct.pack("<HHII", _TIFF_XMP_TAG, 1, len(packet), len(data))
+    data += packet + bytes(len(packet) % 2)
+    directory = sorted([*kept, added], key=lambda entry: int(struct.unpack_from("<H", entry)[0]))
+    end = data[at + 2 + 12 * count :][:4]  # the offset of the next directory
+    header = _TIFF_START + struct.pack("<I", len(data))
+    return header + data[8:] + struct.pack("<H", len(directory)) + b"".join(directory) + end
 
 
 def xmp_packet(metadata: Attributes) -> bytes:

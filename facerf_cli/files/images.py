@@ -1,8 +1,11 @@
-"""Image files: read from any encoding as scene-linear float32 Rec.709; written as EXR, PNG or JPEG."""
+"""Image files: read from any encoding as scene-linear float32 Rec.709; written as EXR, TIFF, PNG or JPEG.
+
+An EXR with layers has several parts: the image, which any program opens, and then a part for each layer, so
+that tools which want four channels find four.
+"""
 
 import logging
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -11,23 +14,32 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.colour import (
+    ACES,
+    ACESCG,
     LINEAR,
-    REC709_CHROMATICITIES,
+    LINEAR_P3,
+    LINEAR_REC2020,
+    PLAIN_VIEW,
+    ColourSpace,
+    View,
     auto_exposure_ev,
-    in_blocks,
-    linear_to_srgb,
+    encode_display,
+    from_linear_rec709,
     named_space,
     to_linear_rec709,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.decoding import decode, full_frame, pick_channels, upright
+from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import (
+    OCIO_SPACE,
     Attributes,
     embed_xmp,
     is_floating,
     metadata_of,
-    require_whole_png,
     space_of_file,
+    states_space,
     utf8_path,
 )
 from facerf_cli.logs import LOGGER_NAME, one_line
@@ -36,6 +48,14 @@ PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
 HALF_MAX = 65504.0  # the largest finite half float
 JPEG_QUALITY = 95
+_PNG_LEVEL = 4  # of zlib: half the time of 6 for two hundredths more bytes
+_OIIO_NAMES = {
+    LINEAR: "lin_rec709_scene",
+    LINEAR_REC2020: "lin_rec2020_scene",
+    LINEAR_P3: "lin_p3d65_scene",
+    ACESCG: "lin_ap1_scene",
+    ACES: "lin_ap0_scene",
+}
 # Channel letters and number format of special layers. Positions and UVs are single precision, since a half
 # float has steps of half a millimetre at a metre.
 _LAYER_CHANNELS = {
@@ -60,7 +80,7 @@ class LinearImage:
 
 def read_image(
     path: Path | str,
-    colourspace: str | None = None,
+    colourspace: str | ColourSpace | None = None,
     limit_px: int = PHOTO_LIMIT_PX,
     non_finite: Literal["error", "zero"] = "error",
 ) -> LinearImage:
@@ -70,96 +90,30 @@ def read_image(
     0 with a warning if `non_finite` is "zero".
     """
     path = Path(path)
-    values, spec = _decode(path, limit_px)
-    colour_at, alpha_at = _pick_channels(list(spec.channelnames), spec.alpha_channel)
+    values, spec = decode(path, limit_px)
+    colour_at, alpha_at = pick_channels(list(spec.channelnames), spec.alpha_channel)
     values = values[..., colour_at if alpha_at is None else [*colour_at, alpha_at]]
-    values = _upright(_full_frame(values, spec), spec.get_int_attribute("Orientation", 1))
+    values = upright(full_frame(values, spec), spec.get_int_attribute("Orientation", 1))
     values = _finite(path, values, non_finite)
     alpha = None if alpha_at is None else np.clip(values[..., -1], 0, 1)
     colour = np.broadcast_to(values[..., : len(colour_at)], (*values.shape[:2], 3))
     if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
         colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
-    space = named_space(colourspace) if colourspace else space_of_file(path, spec)
+    space = _space(path, colourspace, spec)
     if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
     pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
     return LinearImage(pixels, alpha, space.name, metadata_of(spec))
 
 
-def _decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """Decode all channels [H, W, C] of the first part as float32; integers are scaled to 0..1."""
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not an image; give an image file")
-    if not path.is_file() or not path.stat().st_size:
-        raise InputError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
-    require_whole_png(path)
-    settings = oiio.ImageSpec()
-    settings.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(utf8_path(path), settings)
-    if stream is None:
-        advice = f"save it again as EXR, PNG or JPEG ({_reason(path, oiio.geterror())})"
-        raise InputError(f"{path}: not a readable image; {advice}")
-    try:
-        spec = stream.spec()
-        size_px = max(spec.width * spec.height, spec.full_width * spec.full_height)
-        if size_px > limit_px:
-            raise InputError(
-                f"{path}: {spec.width} x {spec.height} pixels; at most {limit_px / 1e6:.0f} megapixels are "
-                "read, so make it smaller"
-            )
-        values = stream.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
-        message = _reason(path, stream.geterror())
-    finally:
-        stream.close()
-    if values is None or "premature end" in message.lower():  # a JPEG cut short decodes to grey
-        raise InputError(f"{path}: damaged or cut short; copy it again ({message or 'no pixels in it'})")
-    if message:
-        log.warning("%s: %s", path, message)
-    return np.asarray(values, np.float32).reshape(spec.height, spec.width, spec.nchannels), spec
-
-
-def _reason(path: Path, message: str) -> str:
-    """Shorten OpenImageIO's error message to its first line, without the path."""
-    line = (message.strip().splitlines() or [""])[0]
-    line = re.sub(r' \("?' + re.escape(str(path)) + r'"?\)', "", line).replace(f'"{path}"', "it")
-    return one_line(re.sub(r"\bEXR_ERR_\w+ |: magic 0x.*| Is it a file format .*", "", line))
-
-
-def _pick_channels(names: list[str], alpha_channel: int) -> tuple[list[int], int | None]:
-    """Choose the indices of colour (one for grey, otherwise three) and alpha.
-
-    The colour is R, G, B; else the first layer's R, G, B; else the first channels.
-    """
-    lower = [name.lower() for name in names]
-    layers = ["", *(name[: -len("r")] for name in lower if name.endswith(".r"))]
-    for layer in layers:
-        if all(layer + letter in lower for letter in "rgb"):
-            alpha = lower.index(layer + "a") if layer + "a" in lower else None
-            return [lower.index(layer + letter) for letter in "rgb"], alpha
-    rest = [index for index in range(len(names)) if index != alpha_channel]
-    colour = rest[:3] if len(rest) >= 3 else rest[:1] or [0]
-    return colour, alpha_channel if alpha_channel >= 0 and alpha_channel not in colour else None
-
-
-def _full_frame(values: np.ndarray, spec: oiio.ImageSpec) -> np.ndarray:
-    """Paste an EXR file's data window into its display window; the rest is zero."""
-    x, y = spec.x - spec.full_x, spec.y - spec.full_y
-    if (x, y, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
-        return values
-    frame = np.zeros((spec.full_height, spec.full_width, values.shape[2]), np.float32)
-    top, left = max(y, 0), max(x, 0)
-    room = slice(max(spec.full_height - top, 0)), slice(max(spec.full_width - left, 0))
-    part = values[max(-y, 0) :, max(-x, 0) :][room]
-    frame[top : top + part.shape[0], left : left + part.shape[1]] = part
-    return frame
-
-
-def _upright(values: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate and mirror an image [H, W, C] to undo EXIF orientation 1..8."""
-    if orientation >= 5:
-        values = values.swapaxes(0, 1)
-    flip_rows, flip_columns = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-    return values[:: -1 if flip_rows else 1, :: -1 if flip_columns else 1]
+def _space(path: Path, colourspace: str | ColourSpace | None, spec: oiio.ImageSpec) -> ColourSpace:
+    """Return the space in which the caller wants a file read, or that the file states."""
+    if colourspace:
+        return named_space(colourspace) if isinstance(colourspace, str) else colourspace
+    found = space_of_file(path, spec)
+    if is_floating(spec) and not states_space(spec):
+        log.info("%s: does not say its colour space; read as %s", path, found.name)
+    return found
 
 
 def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
@@ -181,53 +135,106 @@ def write_exr(
     alpha: np.ndarray | None = None,
     layers: Mapping[str, np.ndarray] | None = None,
     metadata: Attributes | None = None,
+    space: ColourSpace = LINEAR,
+    compression: str = "zip",
 ) -> int:
-    """Write scene-linear Rec.709 [H, W, 3] as half floats; return how many values were out of range.
+    """Write linear Rec.709 [H, W, 3] in half floats in a colour space; return how many were out of range.
 
     The colour must not be premultiplied; it is written multiplied by alpha [H, W], as EXR requires. `layers`
     are [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z, depth.Z and uv.U/V in float, others as R,
-    G, B in half. Values beyond the range of half floats (65504) are clamped with a warning.
+    G, B in half. Each name before the dot is a part. Values beyond the range of half floats (65504) are
+    clamped with a warning.
     """
-    channels = list(_exr_channels(pixels, alpha, layers or {}))
-    names, kinds, _ = zip(*channels, strict=True)
-    data = np.empty((*pixels.shape[:2], len(channels)), np.float32)
-    bad = count = 0
-    for index, (_, kind, values) in enumerate(channels):  # one at a time saves memory
-        bad += int(np.sum(~np.isfinite(values)))
-        count += int(np.sum(np.abs(values) > HALF_MAX)) if kind == "half" else 0
-        data[..., index] = values.clip(-HALF_MAX, HALF_MAX) if kind == "half" else values
-    if bad:
-        raise ValueError(f"{path}: {bad} values are NaN or infinite")
+    converted = from_linear_rec709(pixels, space)
+    parts = [_exr_image(converted, alpha), *_exr_layers(layers or {}, space)]
+    specs, arrays, count = [], [], 0
+    for part in parts:
+        data, beyond = _exr_data(path, part)
+        count += beyond
+        spec = _spec(data, part.kind)
+        spec.channelnames = tuple(part.channels)
+        spec.alpha_channel = part.alpha_channel
+        if len(parts) > 1:
+            spec.attribute("name", part.name)
+        spec.attribute("compression", compression)
+        spec.attribute("oiio:ColorSpace", _OIIO_NAMES.get(space, space.name))
+        if space.chromaticities is None:  # its name may be unknown to OpenImageIO, which then leaves it out
+            spec.attribute(OCIO_SPACE, space.name)
+        else:  # the same in all parts, as OpenEXR requires
+            spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
+        specs.append(spec)
+        arrays.append(data)
     if count:
         log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
-    spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], "half")
-    spec.channelnames = names
-    spec.channelformats = tuple(oiio.TypeDesc(kind) for kind in kinds)
-    spec.alpha_channel = names.index("A") if "A" in names else -1
-    spec.attribute("compression", "zip")
-    spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
-    spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
-    _write(path, spec, data, metadata)
+    _write(path, specs, arrays, metadata)
     return count
 
 
-def _exr_channels(
-    pixels: np.ndarray, alpha: np.ndarray | None, layers: Mapping[str, np.ndarray]
-) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Yield the name, number format and values [H, W] of each channel."""
-    for index, letter in enumerate("RGB"):
-        yield letter, "half", pixels[..., index] if alpha is None else pixels[..., index] * alpha
-    if alpha is not None:
-        yield "A", "half", alpha
+@dataclass(frozen=True, eq=False)
+class _ExrPart:
+    """A part of an EXR: its channels [H, W] by name, all of one number format."""
+
+    name: str
+    kind: str
+    channels: dict[str, np.ndarray]
+    alpha_channel: int = -1
+
+
+def _exr_image(pixels: np.ndarray, alpha: np.ndarray | None) -> _ExrPart:
+    """Return the image itself, R, G, B and A, premultiplied."""
+    colour = pixels if alpha is None else pixels * alpha[..., None]
+    channels = {letter: colour[..., index] for index, letter in enumerate("RGB")}
+    if alpha is None:
+        return _ExrPart("rgba", "half", channels)
+    return _ExrPart("rgba", "half", {**channels, "A": alpha}, alpha_channel=3)
+
+
+def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterator[_ExrPart]:
+    """Yield a part for the layers of each name before the dot; colours are converted to the space."""
+    grouped: dict[str, _ExrPart] = {}
     for layer, values in layers.items():
         letters, kind = _LAYER_CHANNELS.get(layer, ("RGB", "half"))
+        group = grouped.setdefault(layer.split(".")[0], _ExrPart(layer.split(".")[0], kind, {}))
         if values.ndim == 2:
-            yield layer, kind, values
-        else:
-            yield from (
-                (f"{layer}.{letters[index]}", kind, values[..., index]) for index in range(values.shape[2])
-            )
+            group.channels[layer] = values
+            continue
+        shown = from_linear_rec709(values, space) if letters == "RGB" else values
+        group.channels.update({f"{layer}.{letters[k]}": shown[..., k] for k in range(values.shape[2])})
+    yield from grouped.values()
+
+
+def _exr_data(path: Path, part: _ExrPart) -> tuple[np.ndarray, int]:
+    """Return a part's values [H, W, C], and how many were beyond the range of half floats."""
+    values = np.stack(list(part.channels.values()), -1)
+    with np.errstate(over="ignore"):
+        data = values.astype(np.float16 if part.kind == "half" else np.float32, copy=False)
+    if np.isfinite(data).all():
+        return data, 0
+    if bad := int(np.sum(~np.isfinite(values))):
+        raise ValueError(f"{path}: {bad} values are NaN or infinite")
+    return values.clip(-HALF_MAX, HALF_MAX).astype(np.float16), int(np.sum(np.abs(values) > HALF_MAX))
+
+
+def write_tiff(
+    path: Path,
+    pixels: np.ndarray,
+    alpha: np.ndarray | None = None,
+    metadata: Attributes | None = None,
+    space: ColourSpace = LINEAR,
+) -> None:
+    """Write linear Rec.709 [H, W, 3] as a 32-bit TIFF in a colour space, with the profile of a linear one.
+
+    The colour must not be premultiplied, and is not in the file.
+    """
+    colour = from_linear_rec709(pixels, space).astype(np.float32, copy=False)
+    data = colour if alpha is None else np.dstack([colour, alpha.astype(np.float32)])
+    spec = _spec(data, "float")
+    spec.attribute("compression", "zip")
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    if space.is_linear:
+        profile = np.frombuffer(linear_profile(space), np.uint8)
+        spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
+    _write(path, [spec], [data], metadata)
 
 
 def write_display(
@@ -236,39 +243,56 @@ def write_display(
     exposure: float | Literal["auto"] = 0.0,
     alpha: np.ndarray | None = None,
     metadata: Attributes | None = None,
+    view: View = PLAIN_VIEW,
+    share: np.ndarray | None = None,
+    bits: Literal[8, 16] = 8,
 ) -> float:
-    """Write linear Rec.709 [H, W, 3] as an 8-bit sRGB PNG or JPEG, by the suffix; return the exposure in EV.
+    """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
 
     "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha, with colour that
-    is not premultiplied; JPEG has no alpha and shows the image over black.
+    is not premultiplied; JPEG has no alpha and shows the image over black. `view` and `share` are those of
+    `colour.encode_display`; `bits` are of a PNG.
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
-    linear = pixels * alpha[..., None] if alpha is not None and jpeg else pixels
-    gain = np.float32(2.0**chosen_ev)
-    data = in_blocks(lambda block: linear_to_srgb(np.clip(np.nan_to_num(block) * gain, 0, 1)), linear)
+    seen = pixels * alpha[..., None] if alpha is not None and jpeg else pixels
+    data = encode_display(np.nan_to_num(seen * np.float32(2.0**chosen_ev)), view, share)
     if alpha is not None and not jpeg:
-        data = np.concatenate([data, alpha[..., None].astype(np.float32)], -1)
-    spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], "uint8")
+        data = np.dstack([data, alpha.astype(np.float32)])
+    spec = _spec(data, f"uint{8 if jpeg else bits}")
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("oiio:ColorSpace", "sRGB")
+    if view.is_srgb:
+        spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("CompressionQuality", JPEG_QUALITY)
     spec.attribute("jpeg:subsampling", "4:4:4")
-    _write(path, spec, data, {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
+    spec.attribute("png:compressionLevel", _PNG_LEVEL)
+    _write(path, [spec], [data], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
     return chosen_ev
 
 
-def _write(path: Path, spec: oiio.ImageSpec, data: np.ndarray, metadata: Attributes | None) -> None:
-    """Write an image atomically, with its metadata in the header and as XMP."""
+def _spec(data: np.ndarray, kind: str) -> oiio.ImageSpec:
+    spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], kind)
+    spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
+    return spec
+
+
+def _write(
+    path: Path, specs: Sequence[oiio.ImageSpec], parts: Sequence[np.ndarray], metadata: Attributes | None
+) -> None:
+    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP."""
     for name, value in (metadata or {}).items():
-        spec.attribute(name, value)
+        specs[0].attribute(name, value)
     with atomic_path(path) as temporary:
         stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:
             oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
             raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
-        written = stream.open(str(temporary), spec) and stream.write_image(np.ascontiguousarray(data))
+        name = str(temporary)
+        good = stream.open(name, tuple(specs)) if len(specs) > 1 else stream.open(name, specs[0])
+        for number, (spec, part) in enumerate(zip(specs, parts, strict=True)):
+            good = good and (number == 0 or stream.open(name, spec, "AppendSubimage"))
+            good = good and stream.write_image(np.ascontiguousarray(part))
         message = stream.geterror()
-        if not (stream.close() and written):
+        if not (stream.close() and good):
             raise FacerfError(f"{path}: cannot write: {one_line(message or stream.geterror())}")
         embed_xmp(temporary, metadata or {})

@@ -15,6 +15,7 @@ from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import render_texture
+from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
@@ -73,12 +74,7 @@ def test_the_mesh_seen_by_the_fit_is_the_photo(fitted: Path, kind: str) -> None:
 
 
 def test_texture_says_what_was_seen_and_normals_are_of_unit_length(fitted: Path) -> None:
-    import OpenImageIO as oiio
-
-    stream = oiio.ImageInput.open(str(fitted / "astronaut_texture.exr"))
-    names = list(stream.spec().channelnames)
-    visible = stream.read_image()[..., names.index("visible")]
-    stream.close()
+    visible = exr_layers(fitted / "astronaut_texture.exr")["visible"]
     assert visible.min() == 0 and visible.max() == 1
     normals = read_image(fitted / "astronaut_normals.exr").pixels
     assert np.allclose(np.linalg.norm(normals, axis=-1), 1, atol=2e-3)

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -20,6 +19,7 @@ from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, De
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import normal_map
 from facerf_cli.synth.sky.skies import kind_of
+from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 WIDTHS = (4, 8, 8)
@@ -128,7 +128,7 @@ def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
     assert ((shadow >= 0) & (shadow <= 1.001)).all() and (albedo[matte == 0] == 0).all()
     assert (specular >= 0).all() and albedo[mask > 0.5].mean() > 0.02
     assert relight(given, tmp_path / "few", "--light", "40,10") == 0
-    assert channels_of(tmp_path / "few/astronaut_light_40_10.exr") == ["R", "G", "B", "person.A"]
+    assert list(exr_layers(tmp_path / "few/astronaut_light_40_10.exr")) == ["R", "G", "B", "person.A"]
     assert relight(given, tmp_path / "bad", "--light", "40,10", "--aov", "beauty") == 2
 
 
@@ -148,18 +148,9 @@ def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -
         assert relight(given, tmp_path / "x", *line) == 2
 
 
-def channels_of(path: Path) -> list[str]:
-    stream = oiio.ImageInput.open(str(path))
-    names = list(stream.spec().channelnames)
-    stream.close()
-    return names
-
-
 def layers_of(path: Path, *names: str) -> list[np.ndarray]:
-    stream = oiio.ImageInput.open(str(path))
-    pixels, every = np.asarray(stream.read_image("float")), stream.spec().channelnames
-    stream.close()
-    return [pixels[..., every.index(name)] for name in names]
+    found = exr_layers(path)
+    return [found[name] for name in names]
 
 
 def test_positive_azimuth_lights_the_images_right(given: Path, tmp_path: Path) -> None:

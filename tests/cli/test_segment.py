@@ -11,6 +11,7 @@ from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
 from facerf_cli.portrait.classes import CLASSES
+from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 ENDINGS = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
@@ -25,9 +26,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def layers(cut: Path) -> dict[str, np.ndarray]:
-    image = oiio.ImageBuf(str(cut / "astronaut_segment.exr"))
-    pixels = image.get_pixels(oiio.FLOAT)
-    return {name: pixels[..., index] for index, name in enumerate(image.spec().channelnames)}
+    return exr_layers(cut / "astronaut_segment.exr")
 
 
 def test_every_file_is_there_and_in_the_report(cut: Path) -> None:

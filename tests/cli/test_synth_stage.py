@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 import torch
 from safetensors.numpy import load_file
@@ -16,6 +15,7 @@ from facerf_cli.capture.layouts import read_capture
 from facerf_cli.files.images import read_image
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.main import main
+from tests.exr_layers import exr_layers
 
 LIGHTS = 6
 Said = pytest.CaptureFixture[str]
@@ -114,16 +114,8 @@ def test_a_missing_path_tracer_is_named_before_anything_is_written(
     assert not (tmp_path / "capture").exists()
 
 
-def layers(path: Path) -> dict[str, np.ndarray]:
-    stream = oiio.ImageInput.open(str(path))
-    pixels = stream.read_image(oiio.FLOAT)
-    names = stream.spec().channelnames
-    stream.close()
-    return {name: pixels[..., index] for index, name in enumerate(names)}
-
-
 def test_every_camera_has_its_truth(capture: Path) -> None:
-    found = layers(capture / "0000" / "truth" / "C0.exr")
+    found = exr_layers(capture / "0000" / "truth" / "C0.exr")
     classes = np.stack([values for name, values in found.items() if name.startswith("class.")])
     np.testing.assert_allclose(classes.sum(0), 1, atol=4e-3)  # half floats
     np.testing.assert_allclose(found["person.A"], 1 - found["class.background"], atol=2e-3)
@@ -138,6 +130,6 @@ def test_every_camera_has_its_truth(capture: Path) -> None:
 
 def test_a_bust_shows_more_of_the_garment(tmp_path: Path, capture: Path) -> None:
     assert photograph(tmp_path / "bust", "--subjects", "1", "--frame", "bust") == 0
-    head, bust = (layers(folder / "0000" / "truth" / "C0.exr") for folder in (capture, tmp_path / "bust"))
+    head, bust = (exr_layers(folder / "0000" / "truth" / "C0.exr") for folder in (capture, tmp_path / "bust"))
     assert bust["class.garment"].sum() > 2 * head["class.garment"].sum()
     assert 0.3 < bust["class.skin"].sum() / head["class.skin"].sum() < 0.55  # (0.36 / 0.56)^2 is 0.41

@@ -6,16 +6,16 @@ from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import groupby
 from pathlib import Path
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from facerf_cli.cli.items.outputs import Exposure, OutputImage, write_output
 from facerf_cli.cli.items.photo_lights import light_of_photo
 from facerf_cli.cli.items.photos import directions_of, face_model
 from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.envmap import ball, rotated_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
@@ -131,17 +131,17 @@ def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: S
     return weights
 
 
-def write_balls(setups: Sequence[LightSetup], paths: Sequence[Path], exposure: float | str) -> None:
-    """Write, as EXR and PNG, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
+def write_balls(
+    setups: Sequence[LightSetup], paths: Sequence[Path], exposure: float | str, output: OutputOptions
+) -> None:
+    """Write, in every format, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
     for setup, path in zip(setups, paths, strict=True):
         assert setup.envmap is not None
         envmap = read_map(setup.envmap)
         both = [ball(envmap, _BALL_PX, kind, setup.rotate_deg) for kind in ("mirror", "diffuse")]
         pixels = torch.cat(both, 1).numpy()
-        metadata = _metadata_of(setup.envmap)
-        write_exr(path, pixels, metadata=metadata)
-        shown_ev: float | Literal["auto"] = exposure if isinstance(exposure, float) else "auto"
-        write_display(path.with_suffix(".png"), pixels, shown_ev, metadata=metadata)
+        chosen: Exposure = exposure if isinstance(exposure, float) else "auto"
+        write_output(path, OutputImage(pixels), chosen, output, _metadata_of(setup.envmap))
 
 
 def _metadata_of(envmap: Path | DrawnMap | PhotoLight) -> dict[str, str | int]:

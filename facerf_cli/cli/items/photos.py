@@ -57,7 +57,7 @@ class FittedFace:
 def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
     """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
     if options.colourspace is not None:
-        named_space(options.colourspace)
+        named_space(options.colourspace, options.ocio_config)
     face_model(options)
     if with_networks:
         models = load_models_once(options)
@@ -79,7 +79,8 @@ def face_model(options: PhotoOptions) -> MorphableModel:
 
 def read_photo(item: Item, options: PhotoOptions) -> LinearImage:
     """The item's image, scene-linear Rec.709."""
-    return read_image(item.input_path, options.colourspace)
+    space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
+    return read_image(item.input_path, space)
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:

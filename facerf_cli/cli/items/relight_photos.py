@@ -18,6 +18,7 @@ from facerf_cli.cli.items.light_weights import (
     weights_over_rig,
     weights_over_stack,
 )
+from facerf_cli.cli.items.outputs import OutputImage, write_output
 from facerf_cli.cli.items.photos import (
     FittedFace,
     face_model,
@@ -40,7 +41,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera
 from facerf_cli.field import weighted_sum
-from facerf_cli.files.images import LinearImage, write_display, write_exr
+from facerf_cli.files.images import LinearImage
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
@@ -286,7 +287,14 @@ def _write_setups(
             if setup.names:
                 each = map(shown.composer.light_layer, shown.apart(setup))
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
-            _write(path, image, layers, shown.alpha, ev, metadata)
+            write_output(
+                path,
+                _output(image, layers, shown.alpha, work),
+                ev,
+                work.output,
+                {**metadata, "facerf:exposure_ev": ev},
+            )
+            log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.suffixes[-1]), ev)
             yield path, ev
 
 
@@ -294,6 +302,15 @@ def _parts(shown: _Shown, work: Relight) -> list[slice]:
     """Setups, as many at a time as fit the memory."""
     at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
     return [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
+
+
+def _output(
+    image: RelitImage, layers: Mapping[str, np.ndarray], photo_alpha: np.ndarray | None, work: Relight
+) -> OutputImage:
+    """The image to write; a soft view leaves what was photographed, and a given background, as it looks."""
+    alpha = photo_alpha if image.alpha is None else image.alpha
+    keeps = image.alpha is None and work.background.kind != "envmap"
+    return OutputImage(image.pixels, alpha, layers, layers.get("person.A") if keeps else None)
 
 
 def _exposures_ev(
@@ -308,19 +325,3 @@ def _exposures_ev(
             chosen_ev = round(composer.exposure_ev(relit, work.exposure), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
     return found
-
-
-def _write(
-    path: Path,
-    image: RelitImage,
-    layers: Mapping[str, np.ndarray],
-    photo_alpha: np.ndarray | None,
-    exposure_ev: float,
-    metadata: Mapping[str, Any],
-) -> None:
-    """Write an image as EXR, and exposed as PNG."""
-    metadata = {**metadata, "facerf:exposure_ev": exposure_ev}  # of the PNG, in both
-    alpha = photo_alpha if image.alpha is None else image.alpha
-    write_display(path.with_suffix(".png"), image.pixels, exposure_ev, alpha, metadata)
-    write_exr(path, image.pixels, alpha, layers, metadata)
-    log.info("%s: exposure %+.2f EV", path.with_suffix(".png"), exposure_ev)

@@ -1,0 +1,107 @@
+"""Options of written images: formats, colours, compression; and one image on standard output."""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from facerf_cli.cli.recipe import NOT_IN_RECIPE
+from facerf_cli.errors import UsageError
+
+Format = Literal["exr", "png", "png16", "tiff", "jpg"]
+Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
+SUFFIXES: dict[Format, str] = {"exr": ".exr", "png": ".png", "png16": ".png", "tiff": ".tif", "jpg": ".jpg"}
+STDOUT = Path("-")
+
+FormatOption = Annotated[
+    str,
+    typer.Option(
+        "--format",
+        metavar="NAME,...",
+        help="Write each image as some of exr (half floats, with layers) and tiff (32-bit floats), both "
+        "scene-linear, and png, png16 (16 bits) and jpg, exposed for a display.",
+        show_default="exr,png; with -o - png",
+    ),
+]
+ColourspaceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--output-colourspace",
+        metavar="NAME",
+        help="Write EXR and TIFF in this colour space: ACEScg, lin_rec2020, or any name of the OCIO "
+        "configuration.",
+        show_default="linear Rec.709",
+    ),
+]
+CompressionOption = Annotated[
+    Compression,
+    typer.Option("--compression", help="Compress EXR files; zip, zips, piz and rle lose nothing."),
+]
+ViewOption = Annotated[
+    str,
+    typer.Option(
+        "--view",
+        metavar="soft|none|aces|NAME",
+        help="Show PNG and JPEG by the sRGB curve with a soft shoulder above 0.8; clipped at 1; by the SDR "
+        "view of ACES 2; or by a view of the OCIO configuration.",
+    ),
+]
+OcioOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--ocio",
+        metavar="FILE",
+        help="Look up colour spaces and views in this OpenColorIO configuration.",
+        show_default="$OCIO, or the built-in one",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class OutputOptions:
+    """Formats and colours of written images, which can be sent to other processes."""
+
+    formats: tuple[Format, ...] = field(default=("exr", "png"), metadata=NOT_IN_RECIPE)  # each in its own
+    colourspace: str | None = None  # of EXR and TIFF; None: linear Rec.709
+    compression: Compression = "zip"
+    view: str = "soft"
+    config: str = ""  # OpenColorIO's; '' is $OCIO, or the built-in one
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """Suffixes of the files of each image."""
+        return tuple(SUFFIXES[name] for name in self.formats)
+
+
+def parse_formats(text: str) -> tuple[Format, ...]:
+    """Parse `--format`; raises UsageError for an unknown format, or two with the same file name."""
+    names = dict.fromkeys(name.strip() for name in text.split(",") if name.strip())
+    formats = tuple(name for name in SUFFIXES if name in names)
+    if unknown := [name for name in names if name not in SUFFIXES]:
+        raise UsageError(f"--format {unknown[0]!r}: no such format; give some of {', '.join(SUFFIXES)}")
+    if not formats:
+        raise UsageError(f"--format: names no format; give some of {', '.join(SUFFIXES)}")
+    if "png" in formats and "png16" in formats:
+        raise UsageError("--format: png and png16 would both be NAME.png; give one of them")
+    return formats
+
+
+def config_of(path: Path | None) -> str:
+    """The configuration of `--ocio` as OpenImageIO takes it; raises UsageError for a missing file."""
+    if path is None:
+        return ""
+    if not path.is_file():
+        raise UsageError(f"--ocio {path}: no such file; give an OpenColorIO configuration")
+    return str(path)
+
+
+def check_stdout(images: int, formats: tuple[Format, ...]) -> None:
+    """Raise UsageError unless exactly one file goes to standard output, and not to a terminal."""
+    if images != 1:
+        raise UsageError(f"-o -: there would be {images} images; give one photo, one face and one light")
+    if len(formats) != 1:
+        raise UsageError("-o -: takes one image; give one format, such as --format exr")
+    if sys.stdout.isatty():
+        raise UsageError("-o -: standard output is a terminal; redirect it to a file or a program")

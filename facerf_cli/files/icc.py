@@ -1,0 +1,192 @@
+"""ICC profiles: an embedded profile as a colour space, and the profile of a linear space.
+
+Profiles of cameras, phones and displays are three primaries and a curve each (matrix/TRC; ICC.1:2022, 8.3.3),
+or a grey curve. Profiles of tables, as printers have, are not understood. The colours of a profile are
+adapted to D50, so its space has that white.
+"""
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from facerf_cli.colour import (
+    ACES,
+    ACESCG,
+    ADOBE_RGB,
+    DISPLAY_P3,
+    LINEAR,
+    LINEAR_P3,
+    LINEAR_REC2020,
+    REC709_CHROMATICITIES,
+    REC2020,
+    SRGB,
+    ColourSpace,
+    adaptation,
+    linear_space,
+    matrix_to_rec709,
+    rgb_to_xyz,
+)
+
+Curve = Callable[[np.ndarray], np.ndarray]
+_D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the profile connection space
+_KNOWN = (SRGB, DISPLAY_P3, ADOBE_RGB, REC2020, LINEAR, LINEAR_P3, LINEAR_REC2020, ACESCG, ACES)
+_SAME_MATRIX, _SAME_CURVE = 2e-3, 5e-4  # rounding in profiles of the same space
+_OUTSIDE = 0.1  # decoded values of a sound curve may leave 0..1 by this
+_FIXED = 65536  # s15Fixed16Number
+_MOST_TAGS, _MOST_ENTRIES = 200, 65536
+# Parameters of each function type: names g a b c d e f of the ICC specification.
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
+
+
+def space_of_profile(profile: bytes, name: str) -> ColourSpace | None:
+    """Return the colour space of an RGB or grey profile; None if it is broken, or is not matrix/TRC."""
+    try:
+        space = _space(profile, name or "ICC profile")
+    except (ValueError, struct.error, ZeroDivisionError, np.linalg.LinAlgError):
+        return None
+    if space is None or not _is_sound(space):
+        return None
+    return next((known for known in _KNOWN if _same(space, known)), space)
+
+
+def _space(profile: bytes, name: str) -> ColourSpace | None:
+    tags, kind = _tags(profile), profile[16:20]
+    if kind == b"GRAY" and b"kTRC" in tags:
+        return ColourSpace(name, REC709_CHROMATICITIES, _Curves((_curve(tags[b"kTRC"]),) * 3))
+    wanted = [letter + part for part in (b"XYZ", b"TRC") for letter in (b"r", b"g", b"b")]
+    if kind != b"RGB " or not all(tag in tags for tag in wanted):
+        return None
+    colorants = np.array([struct.unpack_from(">3i", tags[tag], 8) for tag in wanted[:3]]) / _FIXED
+    sums = colorants.sum(1, keepdims=True)
+    white = colorants.sum(0)
+    if (sums <= 0).any() or (white <= 0).any():
+        return None
+    xy = np.vstack([colorants / sums, white / white.sum()])[:, :2]
+    return ColourSpace(name, tuple(xy.ravel()), _Curves(tuple(_curve(tags[tag]) for tag in wanted[3:])))
+
+
+def _tags(profile: bytes) -> dict[bytes, bytes]:
+    """Return the contents of the tags by signature."""
+    (count,) = struct.unpack_from(">I", profile, 128)
+    if profile[36:40] != b"acsp" or count > _MOST_TAGS:
+        raise ValueError("not an ICC profile")
+    entries = (struct.unpack_from(">4sII", profile, 132 + 12 * index) for index in range(count))
+    return {signature: profile[offset : offset + size] for signature, offset, size in entries}
+
+
+@dataclass(frozen=True)
+class _Curves:
+    """Decodes each channel of [..., 3] by its curve; negative values are mirrored."""
+
+    channels: tuple[Curve, ...]
+
+    def __call__(self, encoded: np.ndarray) -> np.ndarray:
+        size = np.abs(encoded)
+        decoded = [curve(size[..., index]) for index, curve in enumerate(self.channels)]
+        return np.copysign(np.stack(decoded, -1), encoded).astype(np.float32)
+
+
+def _curve(tag: bytes) -> Curve:
+    """Parse a curveType or a parametricCurveType."""
+    if tag[:4] == b"para":
+        (kind,) = struct.unpack_from(">H", tag, 8)
+        if kind not in _PARAMETERS:
+            raise ValueError(f"function type {kind}")
+        values = [value / _FIXED for value in struct.unpack_from(f">{_PARAMETERS[kind]}i", tag, 12)]
+        return _Parametric(kind, tuple(values))
+    (count,) = struct.unpack_from(">I", tag, 8)
+    if tag[:4] != b"curv" or count > _MOST_ENTRIES:
+        raise ValueError("not a curve")
+    if count <= 1:
+        gamma = struct.unpack_from(">H", tag, 12)[0] / 256 if count else 1.0
+        return _Parametric(0, (gamma,))
+    return _Table(tuple(value / 65535 for value in struct.unpack_from(f">{count}H", tag, 12)))
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A sampled curve, linear between its entries and beyond the last."""
+
+    entries: tuple[float, ...]
+
+    def __call__(self, encoded: np.ndarray) -> np.ndarray:
+        last, slope = self.entries[-1], (self.entries[-1] - self.entries[-2]) * (len(self.entries) - 1)
+        inside = np.interp(encoded, np.linspace(0, 1, len(self.entries)), self.entries)
+        return np.where(encoded > 1, last + slope * (encoded - 1), inside)
+
+
+@dataclass(frozen=True)
+class _Parametric:
+    """A function of table 68 of the ICC specification: (a x + b)^g + e from x = d on, and c x + f below."""
+
+    kind: int
+    parameters: tuple[float, ...]
+
+    def __call__(self, encoded: np.ndarray) -> np.ndarray:
+        g, a, b, c, d, e, f = self._as_the_last_kind()
+        power = np.maximum(a * encoded + b, 0) ** g + e
+        return np.where(encoded >= d, power, c * encoded + f)
+
+    def _as_the_last_kind(self) -> tuple[float, ...]:
+        """Return g, a, b, c, d, e, f; types 0 to 3 leave some of them out."""
+        g, *rest = self.parameters
+        if self.kind == 0:
+            return g, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        a, b, *rest = rest
+        if self.kind == 1:
+            return g, a, b, 0.0, -b / a, 0.0, 0.0
+        if self.kind == 2:
+            return g, a, b, 0.0, -b / a, rest[0], rest[0]
+        return (g, a, b, *rest) if self.kind == 4 else (g, a, b, *rest, 0.0, 0.0)
+
+
+def _is_sound(space: ColourSpace) -> bool:
+    """True if the primaries are possible, and black to white decode to about 0 to 1."""
+    assert space.chromaticities is not None
+    with np.errstate(all="ignore"):
+        decoded = _decoded_ramp(space)
+    within = bool((np.abs(decoded - 0.5) < 0.5 + _OUTSIDE).all())
+    return within and linear_space(space.chromaticities) is not None
+
+
+def _same(space: ColourSpace, known: ColourSpace) -> bool:
+    """True if two spaces differ by rounding only."""
+    assert space.chromaticities is not None and known.chromaticities is not None
+    matrices = matrix_to_rec709(space.chromaticities), matrix_to_rec709(known.chromaticities)
+    curves = _decoded_ramp(space), _decoded_ramp(known)
+    return np.allclose(*matrices, 0, _SAME_MATRIX) and np.allclose(*curves, 0, _SAME_CURVE)
+
+
+def _decoded_ramp(space: ColourSpace) -> np.ndarray:
+    ramp = np.linspace(0, 1, 256, dtype=np.float32)[:, None].repeat(3, 1)
+    return ramp if space.decode is None else space.decode(ramp)
+
+
+def linear_profile(space: ColourSpace) -> bytes:
+    """Return an ICC profile (version 2.4) of a linear space, for files that have no other way to state it."""
+    assert space.chromaticities is not None and space.decode is None
+    matrix = rgb_to_xyz(space.chromaticities)
+    colorants = adaptation(matrix.sum(1), _D50_XYZ) @ matrix
+    text = space.name.encode("ascii") + b"\0"
+    description = b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(4 + 4 + 2 + 1 + 67)
+    line = b"curv\0\0\0\0" + bytes(4)  # without entries: the identity
+    tags = {b"desc": description, b"cprt": b"text\0\0\0\0No copyright\0", b"wtpt": _xyz(_D50_XYZ)}
+    for letter, column in zip((b"r", b"g", b"b"), colorants.T, strict=True):
+        tags[letter + b"XYZ"], tags[letter + b"TRC"] = _xyz(column), line
+    table, body, start = b"", b"", 132 + 12 * len(tags)
+    for signature, content in tags.items():
+        table += signature + struct.pack(">II", start + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    header = bytearray(128)
+    header[8:12], header[12:24], header[36:40] = b"\x02\x40\0\0", b"mntrRGB XYZ ", b"acsp"
+    struct.pack_into(">6H", header, 24, 2026, 1, 1, 0, 0, 0)  # fixed, so that files are reproducible
+    header[68:80] = _xyz(_D50_XYZ)[8:]
+    whole = bytes(header) + struct.pack(">I", len(tags)) + table + body
+    return struct.pack(">I", len(whole)) + whole[4:]
+
+
+def _xyz(values: np.ndarray) -> bytes:
+    """Return an XYZType."""
+    return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(float(value) * _FIXED) for value in values))

@@ -1,0 +1,68 @@
+"""OpenColorIO through OpenImageIO: names of colour spaces, conversions, and display views.
+
+`config` is a configuration's file or `ocio://` name; '' is $OCIO, or without it the built-in `ocio://default`.
+Values are float32 [H, W, 3].
+"""
+
+from functools import cache
+
+import numpy as np
+import OpenImageIO as oiio
+
+from facerf_cli.errors import UsageError
+
+# Names of linear Rec.709, and then of ACES2065-1, in configurations. OpenImageIO finds the first one in all
+# configurations that have the role aces_interchange.
+REC709_NAMES = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)")
+ACES_NAMES = ("ACES2065-1", "ACES - ACES2065-1")
+
+
+@cache
+def names(config: str = "") -> dict[str, str]:
+    """Map case-folded names, aliases and roles of the configuration to their spelling."""
+    found = _opened(config)
+    spaces = [name for name in found.getColorSpaceNames() if not found.isData(name)]
+    spaces += [alias for name in spaces for alias in found.getAliases(name)]
+    spaces += found.getRoles()
+    return {name.casefold(): name for name in spaces}
+
+
+def display(config: str = "") -> str:
+    """Return the name of the configuration's default display."""
+    return str(_opened(config).getDefaultDisplayName())
+
+
+def views(config: str = "") -> list[str]:
+    """List the views of the configuration's default display."""
+    return list(_opened(config).getViewNames(display(config)))
+
+
+def converted(pixels: np.ndarray, source: str, target: str, config: str = "") -> np.ndarray | None:
+    """Convert values from one colour space to another; None if OpenColorIO cannot."""
+    result = oiio.ImageBufAlgo.colorconvert(_buffer(pixels), source, target, False, "", "", config)
+    return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
+
+
+def shown(pixels: np.ndarray, source: str, view: str, config: str = "") -> np.ndarray | None:
+    """Encode values for the configuration's default display by a view; None if OpenColorIO cannot."""
+    result = oiio.ImageBufAlgo.ociodisplay(
+        _buffer(pixels), display(config), view, source, "", False, False, "", "", config
+    )
+    return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
+
+
+@cache
+def _opened(config: str) -> oiio.ColorConfig:
+    found = oiio.ColorConfig(config) if config else oiio.ColorConfig()
+    if error := found.geterror():  # otherwise OpenImageIO continues with a few built-in names
+        raise UsageError(f"{config or '$OCIO'}: {error}")
+    return found
+
+
+def _buffer(pixels: np.ndarray) -> oiio.ImageBuf:
+    return oiio.ImageBuf(np.ascontiguousarray(pixels, np.float32))
+
+
+def _error(result: oiio.ImageBuf) -> str:
+    """Return a result's error, which OpenImageIO prints if nobody asks for it."""
+    return str(result.geterror()) if result.has_error else ""

@@ -1,0 +1,163 @@
+"""Formats, colours and the standard output of `facerf relight`."""
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image
+
+from facerf_cli import colour
+from facerf_cli.cli.output_options import OutputOptions, check_stdout, parse_formats
+from facerf_cli.errors import UsageError
+from facerf_cli.files.images import read_image, write_exr
+from tests.cli.test_relight import PHOTO, given, relight
+from tests.exr_layers import exr_layers
+
+__all__ = ["given"]  # the fixture
+NAME = "astronaut_light_40_10"
+LIGHT = ("--light", "40,10")
+
+
+def test_formats_of_the_command_line() -> None:
+    assert parse_formats("png, exr") == ("exr", "png")
+    options = OutputOptions(parse_formats("jpg,tiff,png16"))
+    assert options.suffixes == (".png", ".tif", ".jpg")
+    for wrong in ("", "png,png16", "bmp", "exr,gif"):
+        with pytest.raises(UsageError, match="--format"):
+            parse_formats(wrong)
+
+
+def test_every_format_holds_the_same_image(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = [*LIGHT, "--exposure", "0", "--view", "none", "--format", "jpg,exr,tiff,png16", "--aov", "albedo"]
+    assert relight(given, tmp_path, *line, "--output-colourspace", "ACEScg", "--compression", "piz") == 0
+    printed = [Path(text).name for text in capsys.readouterr().out.splitlines()]
+    assert printed == [f"{NAME}{suffix}" for suffix in (".exr", ".png", ".tif", ".jpg")]
+    assert json.loads((tmp_path / "report.jsonl").read_text())["outputs"] == printed
+    spec = oiio.ImageBuf(str(tmp_path / f"{NAME}.exr")).spec()
+    assert spec.get_string_attribute("compression") == "piz"
+    assert spec.getattribute("chromaticities") == pytest.approx(colour.ACESCG.chromaticities, abs=1e-6)
+    linear = read_image(tmp_path / f"{NAME}.exr").pixels
+    np.testing.assert_allclose(read_image(tmp_path / f"{NAME}.tif").pixels, linear, atol=3e-3)
+    for suffix, atol in (".png", 2e-3), (".jpg", 0.25):
+        image = read_image(tmp_path / f"{NAME}{suffix}")
+        np.testing.assert_allclose(image.pixels, linear.clip(0, 1), atol=atol)
+        assert image.metadata.get("facerf:view", "none") == "none"
+    assert "albedo.R" in exr_layers(tmp_path / f"{NAME}.exr")
+    assert relight(given, tmp_path, *line) == 0  # finished
+
+
+def test_the_soft_view_changes_the_bright_person_alone(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "40,10,3,3,3", "--exposure", "0.5", "--format", "png16,exr"]
+    stem = "astronaut_light_40_10_3_3_3"
+    for view in ("soft", "none"):
+        assert relight(given, tmp_path / view, *line, "--view", view) == 0
+    soft, none = (read_image(tmp_path / view / f"{stem}.png").pixels for view in ("soft", "none"))
+    matte = exr_layers(tmp_path / "soft" / f"{stem}.exr")["person.A"]
+    assert (soft[matte == 0] == none[matte == 0]).all() and none[matte == 0].max() > 0.95
+    linear = read_image(tmp_path / "soft" / f"{stem}.exr").pixels * 2**0.5
+    person = matte == 1
+    np.testing.assert_allclose(soft[person], colour.shoulder(linear[person]).clip(0, 1), atol=2e-3)
+    assert (linear[person] > 1.2).mean() > 0.01 and np.abs(soft - none)[person].max() > 0.05
+
+
+def test_a_background_colour_keeps_its_look_and_a_map_does_not(given: Path, tmp_path: Path) -> None:
+    white = [*LIGHT, "--background", "#ffffff", "--format", "png,exr"]
+    assert relight(given, tmp_path / "white", *white) == 0
+    matte = exr_layers(tmp_path / "white" / f"{NAME}.exr")["person.A"]
+    assert (read_image(tmp_path / "white" / f"{NAME}.png").pixels[matte == 0] == 1).all()
+    write_exr(tmp_path / "ones.exr", np.ones((8, 16, 3), np.float32))
+    sky = ["--envmap", str(tmp_path / "ones.exr"), "--background", "envmap", "--exposure", "0"]
+    assert relight(given, tmp_path / "map", *sky) == 0
+    shown = read_image(tmp_path / "map/astronaut_ones.png").pixels[matte == 0]
+    assert shown == pytest.approx(1 - 0.2 / np.e, abs=5e-3)  # 8 bits
+
+
+def test_one_image_on_standard_output(
+    given: Path, tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert relight(given, Path("-"), *LIGHT) == 0
+    with Image.open(io.BytesIO(capsysbinary.readouterr().out)) as image:
+        assert image.format == "PNG" and image.size == (512, 512)
+    assert relight(given, Path("-"), *LIGHT, "--format", "exr", "--composite", "face") == 0
+    (tmp_path / "piped.exr").write_bytes(capsysbinary.readouterr().out)
+    assert read_image(tmp_path / "piped.exr").alpha is not None
+    assert relight(given, Path("-"), *LIGHT, photo=tmp_path / "missing.png") == 1
+    assert capsysbinary.readouterr().out == b"" and not Path("-").exists()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        ("--light", "1,2"),
+        ("--format", "exr,png"),
+        ("--ball",),
+        ("--dry-run",),
+        ("--face", "all"),
+        (str(PHOTO.parent),),  # a folder with photos and maps
+    ],
+)
+def test_several_images_are_refused_before_anything_is_loaded(
+    given: Path, line: tuple[str, ...], capsysbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert relight(given, Path("-"), *LIGHT, *line) == 2
+    said = capsysbinary.readouterr()
+    assert said.out == b"" and b"-o -" in said.err and said.err.count(b"\n") == 1
+
+
+def test_a_terminal_gets_no_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    with pytest.raises(UsageError, match="is a terminal; redirect it"):
+        check_stdout(1, ("png",))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (("--view", "nope"), "unknown view 'nope' (known: none, soft, aces, "),
+        (("--output-colourspace", "ACEScgg"), "unknown colour space 'ACEScgg' (similar names: ACEScg"),
+        (("--output-colourspace", "sRGB"), "--output-colourspace sRGB: EXR and TIFF are linear"),
+        (("--ocio", "missing.ocio"), "--ocio missing.ocio: no such file; give"),
+        (("--format", "gif"), "--format 'gif': no such format; give some of exr, png, png16, tiff, jpg"),
+        (("--format", "png", "--aov", "normal"), "--aov: only EXR has layers; add exr to --format"),
+    ],
+)
+def test_wrong_options_are_one_line(
+    given: Path, tmp_path: Path, line: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path / "out", *LIGHT, *line) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_configuration_of_a_show_names_spaces_in_and_out(given: Path, tmp_path: Path) -> None:
+    """In its space "Half" values are half of linear Rec.709; its view takes square roots."""
+    (tmp_path / "show.ocio").write_text(
+        "ocio_profile_version: 2\nroles: {scene_linear: lin_rec709, default: lin_rec709}\n"
+        "displays: {Monitor: [!<View> {name: Root, colorspace: Roots}]}\ncolorspaces:\n"
+        "  - !<ColorSpace> {name: lin_rec709}\n"
+        "  - !<ColorSpace> {name: Half, to_scene_reference: !<MatrixTransform> "
+        "{matrix: [2,0,0,0, 0,2,0,0, 0,0,2,0, 0,0,0,1]}}\n"
+        "  - !<ColorSpace> {name: Roots, to_scene_reference: !<ExponentTransform> {value: [2, 2, 2, 1]}}\n"
+    )
+    show = ["--ocio", str(tmp_path / "show.ocio"), "--exposure", "0", "--background", "0.04,0.25,0.81"]
+    out = ["--view", "root", "--output-colourspace", "half", "--format", "exr,png16"]
+    assert relight(given, tmp_path / "out", *LIGHT, *show, *out) == 0
+    stored = exr_layers(tmp_path / "out" / f"{NAME}.exr")
+    behind = stored["person.A"] == 0
+    np.testing.assert_allclose(
+        [stored[letter][behind].mean() for letter in "RGB"], [0.02, 0.125, 0.405], rtol=2e-3
+    )
+    png = oiio.ImageBuf(str(tmp_path / "out" / f"{NAME}.png")).get_pixels(oiio.FLOAT)
+    np.testing.assert_allclose(png[behind].mean(0), [0.2, 0.5, 0.9], atol=1e-3)
+    write_exr(tmp_path / "astronaut.exr", read_image(PHOTO).pixels / 2)
+    line = [*show[:4], *LIGHT, "--input-colourspace", "Half", "--format", "exr"]
+    assert relight(given, tmp_path / "in", *line, photo=tmp_path / "astronaut.exr") == 0
+    assert relight(given, tmp_path / "in2", *line[2:6], "--format", "exr") == 0
+    one, two = (read_image(tmp_path / folder / f"{NAME}.exr").pixels for folder in ("in", "in2"))
+    np.testing.assert_allclose(one, two, atol=0.02)

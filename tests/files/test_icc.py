@@ -1,0 +1,140 @@
+"""ICC profiles, against littleCMS in Pillow."""
+
+import io
+import logging
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image, ImageCms
+
+from facerf_cli import colour
+from facerf_cli.files.icc import linear_profile, space_of_profile
+from facerf_cli.files.images import read_image
+from tests import icc_profiles
+
+COLOURS = np.random.default_rng(5).integers(30, 226, (12, 17, 3), np.uint8)
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
+
+
+def by_littlecms(pixels: np.ndarray, profile: bytes) -> np.ndarray:
+    """8-bit sRGB of 8-bit values in the space of a profile, colorimetric, clipped to the gamut of sRGB."""
+    source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+    image = ImageCms.profileToProfile(Image.fromarray(pixels), source, SRGB, 1)
+    assert image is not None
+    return np.asarray(image).astype(int)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize(
+    ("profile", "name"), [(icc_profiles.DISPLAY_P3, "Display P3"), (icc_profiles.PROPHOTO, "ProPhoto RGB")]
+)
+def test_an_embedded_profile_gives_the_colours_of_littlecms(
+    tmp_path: Path, suffix: str, profile: bytes, name: str
+) -> None:
+    path = tmp_path / f"a.{suffix}"
+    lossless = {"lossless": True} if suffix == "webp" else {}
+    flat = np.repeat(np.repeat(COLOURS, 16, 0), 16, 1)  # blocks of 16 pixels, which JPEG keeps
+    Image.fromarray(flat).save(path, icc_profile=profile, quality=98, subsampling=0, **lossless)
+    image = read_image(path)
+    assert image.colourspace_name == name
+    with Image.open(path) as written:
+        stored = np.asarray(written)[8::16, 8::16]
+    shown = 255 * colour.linear_to_srgb(image.pixels[8::16, 8::16].clip(0, 1))
+    assert np.abs(shown - by_littlecms(stored, profile)).max() < 2.5  # both round to 8 bits
+    as_srgb = 255 * colour.linear_to_srgb(read_image(path, "sRGB").pixels[8::16, 8::16])
+    assert np.abs(shown - as_srgb).max() > 15
+
+
+def test_known_spaces_are_recognised() -> None:
+    assert space_of_profile(icc_profiles.DISPLAY_P3, "x") is colour.DISPLAY_P3
+    assert space_of_profile(SRGB.tobytes(), "x") is colour.SRGB
+    prophoto = space_of_profile(icc_profiles.PROPHOTO, "My camera")
+    assert prophoto is not None and prophoto.name == "My camera" and prophoto.chromaticities is not None
+    ours = colour.matrix_to_rec709(colour.PROPHOTO.chromaticities or ())
+    np.testing.assert_allclose(colour.matrix_to_rec709(prophoto.chromaticities), ours, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "encoded", "decoded"),
+    [
+        (0, (2.0,), 0.5, 0.25),
+        (1, (2.0, 1.25, -0.25), 0.1, 0.0),  # below 0.2 it is 0
+        (1, (2.0, 1.25, -0.25), 0.6, 0.25),
+        (2, (2.0, 1.25, -0.25, 0.0625), 0.1, 0.0625),
+        (2, (2.0, 1.25, -0.25, 0.0625), 0.6, 0.3125),
+        (3, (2.0, 1.0, 0.0, 0.5, 0.25), 0.125, 0.0625),
+        (3, (2.0, 1.0, 0.0, 0.5, 0.25), 0.5, 0.25),
+        (4, (2.0, 1.0, 0.0, 0.5, 0.25, 0.0625, 0.03125), 0.125, 0.09375),
+        (4, (2.0, 1.0, 0.0, 0.5, 0.25, 0.0625, 0.03125), 0.5, 0.3125),
+    ],
+)
+def test_parametric_curves(kind: int, parameters: tuple[float, ...], encoded: float, decoded: float) -> None:
+    curve = icc_profiles.parametric(kind, *parameters)
+    space = space_of_profile(icc_profiles.rgb_profile("x", np.eye(3) * 0.9 + 0.03, curve), "x")
+    assert space is not None and space.decode is not None
+    assert space.decode(np.full((1, 1, 3), encoded, np.float32)) == pytest.approx(decoded, abs=2e-5)
+
+
+def test_a_sampled_curve_is_linear_between_its_entries_and_each_channel_has_its_own() -> None:
+    tags = {b"rTRC": icc_profiles.sampled(0, 16384, 65535), b"gTRC": icc_profiles.sampled(), b"bTRC": b""}
+    tags[b"bTRC"] = icc_profiles.sampled(512)  # a power of 2
+    for letter, column in zip((b"r", b"g", b"b"), np.eye(3) * 0.9 + 0.03, strict=True):
+        tags[letter + b"XYZ"] = b"XYZ " + bytes(4) + icc_profiles.fixed(*column)
+    space = space_of_profile(icc_profiles.profile(tags), "x")
+    assert space is not None and space.decode is not None
+    found = space.decode(np.full((1, 1, 3), 0.25, np.float32))
+    np.testing.assert_allclose(found[0, 0], [0.125, 0.25, 0.0625], atol=2e-5)
+
+
+def test_a_grey_profile(tmp_path: Path) -> None:
+    grey = icc_profiles.grey_profile("Grey", icc_profiles.sampled(512))
+    Image.fromarray(np.full((6, 9), 128, np.uint8)).save(tmp_path / "a.png", icc_profile=grey)
+    assert read_image(tmp_path / "a.png").pixels == pytest.approx((128 / 255) ** 2, rel=1e-4)
+
+
+def test_broken_profiles_are_no_space() -> None:
+    whole = icc_profiles.DISPLAY_P3
+    assert all(space_of_profile(whole[:size], "x") is None for size in range(0, len(whole) - 60, 13))
+    assert space_of_profile(whole.replace(b"rTRC", b"xTRC"), "x") is None  # as a profile of tables
+    generator = np.random.default_rng(0)
+    for _ in range(300):  # none raises
+        damaged = bytearray(whole)
+        for at in generator.integers(0, len(whole), 8):
+            damaged[at] = generator.integers(256)
+        space_of_profile(bytes(damaged), "x")
+
+
+def test_a_profile_of_tables_is_one_line_that_says_what_is_assumed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+    tables = icc_profiles.DISPLAY_P3.replace(b"rTRC", b"A2B0").replace(*(
+        name.encode("utf-16-be") for name in ("Display P3", "Scanner 77")
+    ))  # fmt: skip
+    Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=tables)
+    assert read_image(tmp_path / "a.png").colourspace_name == "sRGB"
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.endswith("a.png: the embedded profile 'Scanner 77' is not understood; taken for sRGB")
+
+
+@pytest.mark.parametrize("space", [colour.LINEAR, colour.ACESCG, colour.ACES], ids=lambda space: space.name)
+def test_the_profile_of_a_linear_space(space: colour.ColourSpace) -> None:
+    made = linear_profile(space)
+    assert ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(made))).strip() == space.name
+    found = space_of_profile(made, space.name)
+    assert found is not None and found.chromaticities is not None and space.chromaticities is not None
+    expected = colour.matrix_to_rec709(space.chromaticities)
+    np.testing.assert_allclose(colour.matrix_to_rec709(found.chromaticities), expected, atol=1e-3)
+    if space is colour.LINEAR:
+        assert found is space
+        ramp = np.arange(0, 256, 5, np.uint8)[None, :, None].repeat(3, -1)
+        encoded = 255 * colour.linear_to_srgb(ramp / np.float32(255))
+        assert np.abs(by_littlecms(ramp, made) - encoded).max() < 1
+
+
+def test_openimageio_hands_the_profile_over(tmp_path: Path) -> None:
+    Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=icc_profiles.DISPLAY_P3)
+    found = oiio.ImageBuf(str(tmp_path / "a.png")).spec().getattribute("ICCProfile")
+    assert bytes(found) == icc_profiles.DISPLAY_P3

@@ -1,0 +1,208 @@
+"""Every format that folders are searched for: its pixels, its orientation, its colour space."""
+
+import logging
+import shutil
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+from PIL import Image
+
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES
+from facerf_cli.colour import linear_to_srgb
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import read_image, write_display
+from tests import icc_profiles
+
+HEIC = Path(__file__).with_name("phone.heic")  # upright: green above red on the left, blue below right
+LEVELS = np.random.default_rng(2).integers(0, 256, (24, 40, 3), np.uint8)
+BLOCKS = np.repeat(np.repeat(LEVELS[::8, ::8], 8, 0), 8, 1)  # which lossy formats keep roughly
+LOSSY = {".jpg": 3, ".jpeg": 3, ".webp": 12}  # largest error inside a block, of 255
+
+
+def save_by_oiio(path: Path, values: np.ndarray, kind: str = "uint8", **attributes: object) -> Path:
+    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
+    for name, value in attributes.items():
+        spec.attribute(name.replace("__", ":"), value)
+    stream = oiio.ImageOutput.create(str(path))
+    assert stream.open(str(path), spec) and stream.write_image(np.ascontiguousarray(values))
+    assert stream.close()
+    return path
+
+
+def save_psd(path: Path, values: np.ndarray, profile: bytes = b"") -> Path:
+    """A flattened PSD of 8 bits, by its specification."""
+    height, width, _ = values.shape
+    size = struct.pack(">I", len(profile))
+    resource = b"8BIM" + struct.pack(">H", 1039) + b"\0\0" + size + profile + bytes(len(profile) % 2)
+    head = b"8BPS" + struct.pack(">H6xHIIHHI", 1, 3, height, width, 8, 3, 0)
+    resources = resource if profile else b""
+    body = struct.pack(">I", len(resources)) + resources + struct.pack(">IH", 0, 0)
+    path.write_bytes(head + body + np.moveaxis(values, -1, 0).tobytes())
+    return path
+
+
+def save_cineon(path: Path, codes: np.ndarray) -> Path:
+    """A Cineon file of three 10-bit code values in each 32-bit word."""
+    height, width, _ = codes.shape
+    head = bytearray(2048)
+    struct.pack_into(">6I", head, 0, 0x802A5FD7, 2048, 1024, 1024, 0, 2048 + 4 * width * height)
+    head[24:28], head[193] = b"V4.5", 3
+    for channel in range(3):
+        numbers = 0, channel + 1, 10, 0, width, height, 0, 0, 1023, 2.046
+        struct.pack_into(">4B2I4f", head, 196 + 28 * channel, *numbers)
+    head[681] = 5
+    red, green, blue = np.moveaxis(codes.astype(np.uint32), -1, 0)
+    path.write_bytes(bytes(head) + (red << 22 | green << 12 | blue << 2).astype(">u4").tobytes())
+    return path
+
+
+def save(path: Path, levels: np.ndarray) -> Path:
+    """Write 8-bit sRGB values in the format of the suffix."""
+    suffix = path.suffix
+    if suffix in (".heic", ".heif"):
+        shutil.copy(HEIC, path)
+    elif suffix == ".psd":
+        save_psd(path, levels)
+    elif suffix == ".cin":
+        save_cineon(path, levels.astype(int) * 4)
+    elif suffix == ".jp2":
+        Image.fromarray(levels).save(path)  # OpenImageIO writes files that it does not read
+    elif suffix in (".exr", ".hdr"):
+        save_by_oiio(path, levels / np.float32(255), "float")
+    else:
+        save_by_oiio(path, levels, **({"CompressionQuality": 98} if suffix in LOSSY else {}))
+    return path
+
+
+@pytest.mark.parametrize("suffix", sorted(PHOTO_SUFFIXES - {".heic", ".heif", ".cin"}))
+def test_every_suffix_that_folders_are_searched_for_is_read(tmp_path: Path, suffix: str) -> None:
+    lossy = suffix in LOSSY
+    levels = BLOCKS if lossy else LEVELS
+    image = read_image(save(tmp_path / f"a{suffix}", levels))
+    found = image.pixels if suffix in (".exr", ".hdr") else linear_to_srgb(image.pixels)
+    inside = np.s_[3::8, 3::8] if lossy else np.s_[:]
+    error = np.abs(255 * found - levels)[inside]
+    assert error.max() < {".hdr": 2.1}.get(suffix, 0.6) + LOSSY.get(suffix, 0)
+
+
+def test_a_photo_of_a_phone() -> None:
+    image = read_image(HEIC)
+    assert image.colourspace_name == "Display P3" and image.pixels.shape == (64, 48, 3)
+    stored = 255 * linear_to_srgb(read_image(HEIC, "sRGB").pixels)
+    for at, level in {(5, 5): (40, 200, 60), (-5, 5): (50, 60, 210), (5, -5): (220, 60, 40)}.items():
+        np.testing.assert_allclose(stored[at], level, atol=4)
+
+
+def test_a_heic_under_another_name_and_a_broken_one(tmp_path: Path) -> None:
+    shutil.copy(HEIC, tmp_path / "a.jpg")
+    assert read_image(tmp_path / "a.jpg").pixels.shape == (64, 48, 3)
+    whole = HEIC.read_bytes()
+    for size in (13, 200, len(whole) - 300):
+        (tmp_path / "cut.heic").write_bytes(whole[:size])
+        with pytest.raises(InputError, match=r"cut.heic: (not a readable image|damaged)") as caught:
+            read_image(tmp_path / "cut.heic")
+        assert "\n" not in str(caught.value)
+    (tmp_path / "text.heic").write_text("no image at all\n" * 9)
+    with pytest.raises(InputError, match="not a readable image"):
+        read_image(tmp_path / "text.heic")
+    with pytest.raises(InputError, match="48 x 64 pixels; at most"):
+        read_image(HEIC, limit_px=1000)
+
+
+def test_without_pi_heif_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    with pytest.raises(InputError, match=r"pip install 'facerf\[heic\]'"):
+        read_image(HEIC)
+
+
+def by_pillow(levels: np.ndarray, path: Path, orientation: int) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    lossless = {"lossless": True} if path.suffix == ".webp" else {"quality": 98, "subsampling": 0}
+    Image.fromarray(levels).save(path, exif=exif.tobytes(), **lossless)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_turns_a_photo_upright_once(tmp_path: Path, suffix: str, orientation: int) -> None:
+    """A file is turned as EXIF says, and what is written of it needs no turning."""
+    stored = np.full((24, 40, 3), 40, np.uint8)
+    stored[:8, :8] = 220  # in the corner of the first row and the first column
+    image = read_image(by_pillow(stored, tmp_path / f"a.{suffix}", orientation))
+    # Where EXIF puts the first row and the first column.
+    row, column = {1: "tl", 2: "tr", 3: "br", 4: "bl", 5: "tl", 6: "tr", 7: "br", 8: "bl"}[orientation]
+    turned = orientation >= 5
+    assert image.pixels.shape == ((40, 24, 3) if turned else (24, 40, 3))
+    corner = image.pixels[{"t": np.s_[:8], "b": np.s_[-8:]}[row], {"l": np.s_[:8], "r": np.s_[-8:]}[column]]
+    assert corner.min() > 0.5 and (image.pixels > 0.3).all(-1).sum() == pytest.approx(64, abs=8)
+    write_display(tmp_path / "out.jpg", image.pixels, metadata={"Software": "x"})
+    with Image.open(tmp_path / "out.jpg") as written:
+        assert written.getexif().get(0x0112, 1) == 1 and written.size == image.pixels.shape[1::-1]
+    np.testing.assert_allclose(read_image(tmp_path / "out.jpg").pixels, image.pixels, atol=0.06)
+
+
+def test_every_orientation_is_another_image(tmp_path: Path) -> None:
+    """All eight, against Pillow's own transposition of an image without symmetry."""
+    from PIL import ImageOps
+
+    for orientation in range(1, 9):
+        path = by_pillow(LEVELS, tmp_path / f"{orientation}.png", orientation)
+        with Image.open(path) as stored:
+            expected = np.asarray(ImageOps.exif_transpose(stored))
+        found = np.rint(255 * linear_to_srgb(read_image(path).pixels)).astype(int)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_film_scans_are_decoded_by_the_cineon_curve(tmp_path: Path) -> None:
+    """Code values of black, of 18 % grey and of white."""
+    codes = np.broadcast_to([95, 445, 685], (6, 9, 3))
+    image = read_image(save_cineon(tmp_path / "a.cin", codes))
+    assert image.colourspace_name == "Cineon log"
+    np.testing.assert_allclose(image.pixels[0, 0], [0, 0.15, 1], atol=0.003)
+    values = (codes / 1023).astype(np.float32)
+    for transfer in ("Logarithmic", "Printing density"):
+        path = save_by_oiio(
+            tmp_path / "a.dpx", values, "uint16", oiio__BitsPerSample=10, dpx__Transfer=transfer
+        )
+        np.testing.assert_allclose(read_image(path).pixels, image.pixels, atol=2e-3)
+
+
+def test_a_dpx_on_its_side_is_refused(tmp_path: Path) -> None:
+    path = save_by_oiio(tmp_path / "a.dpx", LEVELS, Orientation=6)
+    with pytest.raises(InputError, match="lies on its side is not read; save it upright"):
+        read_image(path)
+
+
+def test_a_psd_has_its_profile(tmp_path: Path) -> None:
+    assert read_image(save_psd(tmp_path / "a.psd", LEVELS, icc_profiles.DISPLAY_P3)).colourspace_name == (
+        "Display P3"
+    )
+
+
+def test_floats_without_a_stated_space_are_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+    caplog.set_level(logging.INFO, "facerf")
+    values = LEVELS / np.float32(255)
+    for name, attributes, lines in (
+        ("bare.exr", {}, 1),
+        ("stated.exr", {"oiio__ColorSpace": "lin_ap1_scene"}, 0),
+        ("bare.tif", {}, 1),
+        ("a.hdr", {}, 0),  # Radiance files are Rec.709
+    ):
+        caplog.clear()
+        read_image(save_by_oiio(tmp_path / name, values, "float", **attributes))
+        said = [record.getMessage() for record in caplog.records]
+        assert len(said) == lines
+        if lines:
+            assert said[0].endswith(f"{name}: does not say its colour space; read as linear Rec.709")
+    caplog.clear()
+    read_image(tmp_path / "bare.exr", "ACEScg")
+    read_image(save_by_oiio(tmp_path / "a.png", LEVELS))
+    assert not caplog.records

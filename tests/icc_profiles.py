@@ -1,0 +1,57 @@
+"""ICC profiles for tests, built tag by tag from published numbers (ICC.1:2022)."""
+
+import struct
+from collections.abc import Mapping, Sequence
+
+# Colorants under D50 and the curve of Apple's Display P3 profile.
+_P3_COLORANTS = ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189), (0.15710, 0.06657, 0.78407))
+_SRGB_CURVE = (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+# Of ProPhoto RGB, whose profiles have a plain power of 1.8.
+_PROPHOTO_COLORANTS = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491))
+
+
+def fixed(*values: float) -> bytes:
+    return struct.pack(f">{len(values)}i", *(round(value * 65536) for value in values))
+
+
+def parametric(kind: int, *parameters: float) -> bytes:
+    return b"para" + bytes(4) + struct.pack(">HH", kind, 0) + fixed(*parameters)
+
+
+def sampled(*entries: int) -> bytes:
+    return b"curv" + bytes(4) + struct.pack(f">I{len(entries)}H", len(entries), *entries)
+
+
+def profile(tags: Mapping[bytes, bytes], kind: bytes = b"RGB ") -> bytes:
+    """A display profile (version 4) with these tags."""
+    table, body, start = b"", b"", 132 + 12 * len(tags)
+    for name, content in tags.items():
+        table += name + struct.pack(">II", start + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    header = bytearray(128)
+    header[8:12], header[12:24], header[36:40] = b"\x04\x30\0\0", b"mntr" + kind + b"XYZ ", b"acsp"
+    header[68:80] = fixed(0.9642, 1.0, 0.8249)
+    whole = bytes(header) + struct.pack(">I", len(tags)) + table + body
+    return struct.pack(">I", len(whole)) + whole[4:]
+
+
+def described(name: str) -> dict[bytes, bytes]:
+    """The tags that every profile has."""
+    text = name.encode("utf-16-be")
+    content = b"mluc" + bytes(4) + struct.pack(">II4sII", 1, 12, b"enUS", len(text), 28) + text
+    return {b"desc": content, b"cprt": content, b"wtpt": b"XYZ " + bytes(4) + fixed(0.9642, 1.0, 0.8249)}
+
+
+def grey_profile(name: str, curve: bytes) -> bytes:
+    return profile({**described(name), b"kTRC": curve}, b"GRAY")
+
+
+def rgb_profile(name: str, colorants: Sequence[Sequence[float]], curve: bytes) -> bytes:
+    tags = described(name)
+    for letter, colorant in zip((b"r", b"g", b"b"), colorants, strict=True):
+        tags |= {letter + b"XYZ": b"XYZ " + bytes(4) + fixed(*colorant), letter + b"TRC": curve}
+    return profile(tags)
+
+
+DISPLAY_P3 = rgb_profile("Display P3", _P3_COLORANTS, parametric(3, *_SRGB_CURVE))
+PROPHOTO = rgb_profile("ProPhoto RGB", _PROPHOTO_COLORANTS, sampled(461))  # 1.8 in 256ths
