@@ -30,8 +30,11 @@ from facerf_cli.cli.photo_options import (
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, OneRecipe
 from facerf_cli.cli.values import parse_lights, parse_pose
+from facerf_cli.errors import UsageError
 
 Precision = Literal["float32", "bf16"]
+Frame = Literal["photo", "face", "uv"]
+_LARGEST_PX = 16384
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ class PredictOlat:
     photo: PhotoOptions
     lights: str
     pose: str | None
-    image: bool
+    frame: Frame
+    size_px: int
     network_alone: bool
     memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     precision: Precision
@@ -78,9 +82,23 @@ def predict_olat(
             metavar="YAW,PITCH,ROLL", help="Turn the head to a pose, in degrees.", show_default="the photo's"
         ),
     ] = None,
-    image: Annotated[
-        bool, typer.Option("--image/--texture", help="Write images of the face, or UV textures.")
-    ] = False,
+    frame: Annotated[
+        Frame | None,
+        typer.Option(
+            help="Predict the whole person in the photo's frame; the face alone in that of its crop; or UV "
+            "textures, which other poses can be rendered from.",
+            show_default="photo; face with --pose",
+        ),
+    ] = None,
+    size: Annotated[
+        int,
+        typer.Option(
+            min=64,
+            max=_LARGEST_PX,
+            metavar="PX",
+            help="Scale larger photos down to this longer side, with --frame photo.",
+        ),
+    ] = 1024,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
     memory: MemoryOption = 2.0,
@@ -95,10 +113,11 @@ def predict_olat(
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
 ) -> None:
-    """Predict a photo's face under every single light of a rig (OLAT, one light at a time).
+    """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
-    Each photo gives an OLAT stack (an OpenEXR file with a part for each light, and the fit in its header;
-    `facerf relight` takes it in place of a photo) and a contact sheet. Lights are fixed to the camera and of
+    Each photo gives an OLAT stack (an OpenEXR file with a part for each light, the person over black;
+    `facerf relight` takes it in place of a photo, and with --photo puts it back on its photo) and a contact
+    sheet. Lights are fixed to the camera and of
     unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from above.
     """
     settings = settings_of(context)
@@ -108,7 +127,10 @@ def predict_olat(
         settings, input_colourspace, face_model, face, landmarks, geometry, texture_size, landmarks_from
     )
     photo.check()
-    work = PredictOlat(photo, lights, pose, image, network_alone, int(memory * 2**30), precision)
+    if frame == "photo" and pose is not None:
+        raise UsageError("--pose: turns the head out of its photo; use --frame face or uv with it")
+    chosen: Frame = frame or ("photo" if pose is None else "face")
+    work = PredictOlat(photo, lights, pose, chosen, size, network_alone, int(memory * 2**30), precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
         "predict-olat",

@@ -80,6 +80,7 @@ class Relight:
     network_alone: bool = False
     name: NamePattern | None = field(default=None, metadata=NOT_IN_RECIPE)
     exposure_group: ExposureGroup = "photo"
+    photo_of_stack: Path | None = None
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -282,6 +283,15 @@ def relight(
             show_default=False,
         ),
     ] = None,
+    photo_of_stack: Annotated[
+        Path | None,
+        typer.Option(
+            "--photo",
+            metavar="FILE|DIR|PATTERN",
+            help="Put an OLAT stack of predict-olat back on its photo, at the photo's resolution.",
+            show_default=False,
+        ),
+    ] = None,
     ball: Annotated[
         bool, typer.Option("--ball", help="Write a mirror ball and a diffuse ball under each map, too.")
     ] = False,
@@ -347,6 +357,7 @@ def relight(
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     check_companion(matte, "--matte")
+    check_companion(photo_of_stack, "--photo")
     if aov and "exr" not in formats:
         raise UsageError("--aov: only EXR has layers; add exr to --format")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
@@ -370,6 +381,7 @@ def relight(
         network_alone=network_alone,
         name=pattern,
         exposure_group=exposure_group,
+        photo_of_stack=photo_of_stack,
     )
     if output == STDOUT:
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")

@@ -44,6 +44,10 @@ class Crop:
         """Crop pixels for each photo pixel."""
         return self.size_px / self.side_px
 
+    def of_scaled(self, scale: float) -> "Crop":
+        """The same square of the photo when that is scaled."""
+        return Crop(self.x0_px * scale, self.y0_px * scale, self.side_px * scale, self.size_px)
+
     def to_crop(self, photo_px: np.ndarray) -> np.ndarray:
         """Convert photo positions [..., 2] to the crop's pixels."""
         return (np.asarray(photo_px, np.float64) - (self.x0_px, self.y0_px)) * self.scale

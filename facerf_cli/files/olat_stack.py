@@ -39,14 +39,18 @@ _HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
 
 @dataclass(frozen=True, eq=False)
 class StackHeader:
-    """A stack without its OLATs; if the kind is 'texture', H = W = T, the texture's side."""
+    """A stack without its OLATs.
 
-    kind: Literal["texture", "image"]
+    The kinds: 'photo', the photo's person over black, in the photo's frame; 'image', the face in the frame of
+    its crop; 'texture', where H = W = T, the texture's side.
+    """
+
+    kind: Literal["photo", "texture", "image"]
     directions: np.ndarray  # [L, 3] unit, toward the lights, camera space
     rotation: np.ndarray  # [3, 3] head_to_camera that the lights were predicted for
-    source: np.ndarray  # [H, W, 3] linear: the unwrapped photo, or the face rendered from it
-    seen: np.ndarray  # [H, W] in 0..1: visibility of texels, or coverage of the face
-    normals: np.ndarray  # [H, W, 3] camera space; for the photo's pose (texture) or `rotation` (image)
+    source: np.ndarray  # [H, W, 3] linear: the photo, unwrapped, or the face rendered from it
+    seen: np.ndarray  # [H, W] in 0..1: the matte, visibility of texels, or coverage of the face
+    normals: np.ndarray  # [H, W, 3] camera space; for the photo's pose, or `rotation` (image)
     layout_version: int  # of the UV map
     fit: dict[str, np.ndarray]  # `face.fit.fit_to_arrays`
     metadata: dict[str, Any] = field(default_factory=dict)  # provenance
@@ -228,7 +232,7 @@ def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
         raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
     try:
         content = json.loads(text) if len(text) <= _MOST_HEADER_BYTES else {}
-        if content["format"] != FORMAT or content["kind"] not in ("texture", "image"):
+        if content["format"] != FORMAT or content["kind"] not in ("photo", "texture", "image"):
             raise ValueError(f"format {content['format']!r}, kind {content['kind']!r}")
         rotation = np.array(content["rotation"], np.float64)
         if rotation.shape != (3, 3) or not np.isfinite(rotation).all():

@@ -47,7 +47,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def predict(given: Path, output: Path, *line: str, photo: Path = PHOTO, checkpoint: str = "lambert") -> int:
     head = ["--checkpoint", str(given / f"{checkpoint}.safetensors"), "predict-olat", str(photo)]
-    return main([*head, "-o", str(output), "--landmarks", str(given / "astronaut.json"), *line])
+    frame = () if "--frame" in line else ("--frame", "uv")
+    return main([*head, "-o", str(output), "--landmarks", str(given / "astronaut.json"), *frame, *line])
 
 
 def stack_of(given: Path, output: Path, *line: str) -> OlatStack:
@@ -64,18 +65,38 @@ def side_of_light(stack: OlatStack, light: int) -> np.ndarray:
     return (centres[0] - centres[1]) / len(seen)
 
 
-@pytest.mark.parametrize("kind", ["--texture", "--image"])
+@pytest.mark.parametrize("kind", ["uv", "face"])
 def test_lights_fall_from_where_the_stack_says(given: Path, tmp_path: Path, kind: str) -> None:
-    stack = stack_of(given, tmp_path, "--lights", SIDES, kind)
-    assert stack.header.kind == kind[2:]
+    stack = stack_of(given, tmp_path, "--lights", SIDES, "--frame", kind)
+    assert stack.header.kind == {"uv": "texture", "face": "image"}[kind]
     expected = azel_to_direction(torch.tensor([70.0, -70, 0]), torch.tensor([0.0, 0, 80])).numpy()
     assert np.abs(stack.header.directions - expected).max() < 1e-6
     right, left, above = (side_of_light(stack, light) for light in range(3))
     assert right[0] > 0.04 and left[0] < -0.04 and above[1] < -0.01
-    side = {"--texture": 256, "--image": 512}[kind]
+    side = {"uv": 256, "face": 512}[kind]
     assert stack.olats.shape == (3, 3, side, side) and (stack.olats >= 0).all()
     sheet = read_image(tmp_path / "astronaut_olat.png").pixels
     assert sheet.shape[0] in (128, 258) and sheet.max() > 0.5
+
+
+def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_path: Path) -> None:
+    line = ["--lights", SIDES, "--frame", "photo", "--size", "256"]
+    stack = stack_of(given, tmp_path / "olat", *line)
+    header = stack.header
+    assert header.kind == "photo" and stack.olats.shape == (3, 3, 256, 256)
+    assert 0.2 < header.seen.mean() < 0.8 and float(stack.olats[:, :, header.seen == 0].abs().max()) == 0
+    right, left, _ = (side_of_light(stack, light) for light in range(3))
+    assert right[0] > left[0] + 0.05
+    assert predict(given, tmp_path / "x", *line, "--pose", "20,0,0") == 2
+    path = tmp_path / "olat/astronaut_olat.exr"
+    lit = ["--light", "70,0", "--exposure", "0", "-o"]
+    assert main(["relight", str(path), "--photo", str(PHOTO), *lit, str(tmp_path / "on")]) == 0
+    whole = read_image(tmp_path / "on/astronaut_olat_light_70_0.exr")
+    photo = read_image(PHOTO).pixels
+    assert whole.pixels.shape == photo.shape and whole.alpha is None
+    np.testing.assert_allclose(whole.pixels[:20, -20:], photo[:20, -20:], atol=2e-3)  # the background
+    assert main(["relight", str(path), *lit, str(tmp_path / "alone")]) == 0
+    assert read_image(tmp_path / "alone/astronaut_olat_light_70_0.exr").alpha is not None
 
 
 def test_the_stack_is_enough_to_render_the_face(given: Path, tmp_path: Path) -> None:

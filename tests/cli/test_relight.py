@@ -224,6 +224,8 @@ def test_a_stack_gives_what_its_photo_gives(given: Path, tmp_path: Path) -> None
                 str(tmp_path / "olat"),
                 "--lights",
                 "12",
+                "--frame",
+                "uv",
                 *landmarks,
             ]
         )
@@ -304,6 +306,8 @@ def test_the_network_alone(given: Path, tmp_path: Path, capsys: pytest.CaptureFi
         str(PHOTO),
         "--lights",
         "4",
+        "--frame",
+        "uv",
         "--landmarks",
         landmarks,
         "-o",
@@ -375,7 +379,16 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
     left, right = face_sides(tmp_path / "pose/astronaut_light_at_0.6_0_0.4.exr")
     assert right > 1.5 * left
     fixed = ["--checkpoint", str(given / "lambert.safetensors")]
-    olat = ["predict-olat", str(PHOTO), "--lights", "4", "--landmarks", str(given / "astronaut.json")]
+    olat = [
+        "predict-olat",
+        str(PHOTO),
+        "--lights",
+        "4",
+        "--frame",
+        "uv",
+        "--landmarks",
+        str(given / "astronaut.json"),
+    ]
     assert main([*fixed, *olat, "-o", str(tmp_path / "olat")]) == 0
     stack = tmp_path / "olat/astronaut_olat.exr"
     assert relight(given, tmp_path / "a", *near, photo=stack) == 1

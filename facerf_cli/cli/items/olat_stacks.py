@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import (
@@ -22,31 +22,103 @@ from facerf_cli.cli.items.photos import (
     rotation_of,
 )
 from facerf_cli.cli.predict_olat import PredictOlat
+from facerf_cli.composite import Target
 from facerf_cli.face.fit import FaceFit, fit_to_arrays
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.drawings import contact_sheet, mark_light
-from facerf_cli.files.images import write_display
+from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
-from facerf_cli.pipeline import predict_olat
+from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
 
 _TILE_PX = 128  # of the contact sheet
+_LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
 
 
 def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, Any]]:
     """Predict and write the stack of each chosen face of a photo; the files, and facts for the report."""
     directions = directions_of(work.lights)
-    faces = fit_faces(item, read_photo(item, work.photo), work.photo)
+    image = read_photo(item, work.photo)
+    faces = fit_faces(item, image, work.photo)
     outputs: list[Path] = []
     for face in reversed(faces):
         stack, sheet = work.files_of(item, face.tag)
-        header = _header(item, face, directions, work)
         tiles: list[np.ndarray] = []
-        write_olat_stack(stack, header, _olats(face, directions, work, tiles))
+        if work.frame == "photo":
+            header, olats = _of_person(item, image, face, directions, work, tiles)
+        else:
+            header, olats = _header(item, face, directions, work), _olats(face, directions, work, tiles)
+        write_olat_stack(stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         outputs += [stack, sheet]
     return outputs, facts_of(faces) | {"lights": len(directions)}
+
+
+def _at_most(image: LinearImage, side_px: int) -> LinearImage:
+    """The image, its longer side at most so many pixels."""
+    scale = side_px / max(image.pixels.shape[:2])
+    if scale >= 1:
+        return image
+    height, width = (max(1, round(side * scale)) for side in image.pixels.shape[:2])
+
+    def smaller(values: np.ndarray) -> np.ndarray:
+        stacked = torch.from_numpy(np.ascontiguousarray(values)).permute(2, 0, 1)[None]
+        return np.asarray(interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0).numpy())
+
+    alpha = None if image.alpha is None else smaller(image.alpha[..., None])[..., 0]
+    return replace(image, pixels=smaller(image.pixels), alpha=alpha)
+
+
+def _of_person(
+    item: Item,
+    image: LinearImage,
+    face: FittedFace,
+    directions: Tensor,
+    work: PredictOlat,
+    tiles: list[np.ndarray],
+) -> tuple[StackHeader, Iterator[Tensor]]:
+    """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
+    models, large_px = load_models_once(work.photo), max(image.pixels.shape[:2])
+    image = _at_most(image, work.size_px)
+    fit = replace(face.fit, crop=face.fit.crop.of_scaled(max(image.pixels.shape[:2]) / large_px))
+    head = replace(face.head, fit=fit)
+    reflectance = reflectance_of(
+        models, head, "portrait", work.network_alone, work.memory_bytes, image.pixels
+    )
+    composition = composition_of(models, image.pixels, head, reflectance, Target(background="none"))
+
+    def olats() -> Iterator[Tensor]:
+        for some in torch.split(directions, _LIGHTS_AT_ONCE):
+            single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
+            relit = relit_by(composition, head, reflectance, some, single)
+            layers = np.stack([composition.light_layer(one) for one in relit])
+            batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
+            scale = _TILE_PX / max(batch.shape[-2:])
+            small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
+            tiles.append(small.permute(0, 2, 3, 1).numpy())
+            yield batch
+
+    single = torch.eye(1)[..., None].expand(-1, -1, 3)
+    relit = next(iter(relit_by(composition, head, reflectance, directions[:1], single)))
+    layers = composition.layers(("normal",), relit)
+    header = StackHeader(
+        kind="photo",
+        directions=directions.numpy(),
+        rotation=fit.rotation.numpy(),
+        source=image.pixels,
+        seen=layers["person.A"],
+        normals=layers["normal"],
+        layout_version=LAYOUT_VERSION,
+        fit=fit_to_arrays(fit),
+        metadata=_metadata(item, work),
+    )
+    return header, olats()
+
+
+def _metadata(item: Item, work: PredictOlat) -> dict[str, str | int]:
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    return metadata | ({"facerf:network_alone": 1} if work.network_alone else {})
 
 
 def _olats(
@@ -66,7 +138,7 @@ def _olats(
     )
     for textures in olats:
         tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
-        yield render_face(textures, *large) if work.image else textures
+        yield render_face(textures, *large) if work.frame == "face" else textures
 
 
 def _uv_and_coverage(
@@ -85,16 +157,13 @@ def _posed(face: FittedFace, work: PredictOlat) -> FaceFit:
 def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat) -> StackHeader:
     posed, uv_maps = _posed(face, work), face.head.face
     source, normals, seen = uv_maps.texture, uv_maps.normals, uv_maps.visible
-    if work.image:
+    if work.frame == "face":
         uv, seen = _uv_and_coverage(face, work)
         turn = face.fit.turn_to(posed.rotation)
         both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
         source, normals = render_face(both, uv, seen)
-    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
-    if work.network_alone:
-        metadata["facerf:network_alone"] = 1
     return StackHeader(
-        kind="image" if work.image else "texture",
+        kind="image" if work.frame == "face" else "texture",
         directions=directions.numpy(),
         rotation=posed.rotation.numpy(),
         source=source.permute(1, 2, 0).numpy(),
@@ -102,7 +171,7 @@ def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat)
         normals=normals.permute(1, 2, 0).numpy(),
         layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(face.fit),
-        metadata=metadata,
+        metadata=_metadata(item, work),
     )
 
 

@@ -10,8 +10,9 @@ from typing import Any, Protocol, cast
 import numpy as np
 import torch
 
-from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.backdrops import Backdrops
+from facerf_cli.cli.items.companions import companion
 from facerf_cli.cli.items.light_weights import (
     near_lights_of,
     weights_of_far_lights,
@@ -31,17 +32,18 @@ from facerf_cli.cli.items.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
-from facerf_cli.colour import ExposureRule, auto_exposure_ev
+from facerf_cli.colour import ExposureRule
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.face.view import photo_camera
+from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.field import weighted_sum
-from facerf_cli.files.images import LinearImage
+from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
@@ -55,7 +57,7 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 
 
 class Composer(Protocol):
-    """A composer of images: `Composition`, `GroupComposition` of several, or of a stack `_RenderedStack`."""
+    """A composer of images: `Composition`, `GroupComposition`; of stacks `PersonStack`, `RenderedStack`."""
 
     def image(self, relit: Any, ev: float, behind: np.ndarray | None) -> RelitImage:
         """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
@@ -200,7 +202,14 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     if near_lights_of(work.setups) is not None:
         raise InputError(f"{item.input_path}: a stack holds far lights; for near ones (at=) give its photo")
     stack = read_olat_stack(item.input_path)
-    composer, facts = _stack_composer(item, stack, work)
+    composer: Composer
+    backdrops: Backdrops | None = None
+    if stack.header.kind == "photo":
+        composer, backdrops, facts = _person_composer(item, stack, work)
+    elif work.photo_of_stack is not None:
+        raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
+    else:
+        composer, facts = _stack_composer(item, stack, work)
     directions = torch.from_numpy(stack.header.directions).float()
     weights = weights_over_stack(work.setups, directions, work.sampling)
 
@@ -216,15 +225,40 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         weights = weights_over_stack(_each_light(setup), directions, work.sampling)
         return list(map(Relit, weighted_sum(batches, weights)))
 
-    shown = _Shown(composer, relit, apart, bytes_each)
+    shown = _Shown(composer, relit, apart, bytes_each, backdrops=backdrops)
     return dict(_write_setups(item, "", shown, work, metadata)), facts
+
+
+def _person_composer(
+    item: Item, stack: OlatStack, work: Relight
+) -> tuple[PersonStack, Backdrops | None, dict[str, Any]]:
+    """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
+    header = stack.header
+    try:
+        fit = fit_from_arrays(header.fit)
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
+    size_px = header.seen.shape
+    vertices = fit.vertices_camera(face_model(work.photo))
+    view = view_face(vertices, photo_camera(fit.crop, *size_px), fit.crop.side_px)
+    face = view.full(view.mask)
+    if work.photo_of_stack is None:
+        return PersonStack(header, face), None, fit_facts(fit)
+    path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
+    photo = read_image(path, work.photo.colourspace).pixels
+    scale = photo.shape[0] / size_px[0]
+    if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
+        raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
+    camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
+    backdrops = Backdrops(work.background, work.background_blur, camera)
+    return PersonStack(header, face, photo, work.background.kind == "photo"), backdrops, fit_facts(fit)
 
 
 def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Composer, dict[str, Any]]:
     """The composer of a stack's images in the frame of its crop, and facts of its fit."""
     header = stack.header
     if header.kind == "image":
-        return _RenderedStack(header.seen, header.normals), {}
+        return RenderedStack(header.seen, header.normals), {}
     try:
         if header.layout_version != LAYOUT_VERSION:
             raise ValueError("it has another UV layout")
@@ -236,28 +270,6 @@ def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Compos
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
     return composition, fit_facts(fit)
-
-
-@dataclass(frozen=True, eq=False)
-class _RenderedStack:
-    """Composes stacks of images that are rendered already; seen [H, W] is the face's coverage."""
-
-    seen: np.ndarray
-    normals: np.ndarray  # [H, W, 3]
-
-    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
-        return RelitImage(relit.texture.permute(1, 2, 0).numpy(), self.seen)
-
-    def light_layer(self, relit: Relit) -> np.ndarray:
-        return np.asarray(relit.texture.permute(1, 2, 0).numpy() * self.seen[..., None])
-
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
-        if other := [name for name in names if name != "normal"]:
-            raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
-        return {"normal": self.normals} if names else {}
-
-    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        return auto_exposure_ev(relit.texture.permute(1, 2, 0).numpy(), self.seen)
 
 
 def _write_setups(

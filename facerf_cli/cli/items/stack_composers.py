@@ -1,0 +1,118 @@
+"""Composers of OLAT stacks: sums of their lights as images, alone or back on the photo."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
+from facerf_cli.composite import Relit, RelitImage
+from facerf_cli.errors import UsageError
+from facerf_cli.files.olat_stack import StackHeader
+
+_DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedStack:
+    """Composes stacks of images that are rendered already; seen [H, W] is the face's coverage."""
+
+    seen: np.ndarray
+    normals: np.ndarray  # [H, W, 3]
+
+    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+        """The face as relit, with its coverage as alpha."""
+        return RelitImage(_pixels(relit), self.seen)
+
+    def light_layer(self, relit: Relit) -> np.ndarray:
+        """The face under one of several lights, over black."""
+        return np.asarray(_pixels(relit) * self.seen[..., None])
+
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+        """The layer of normals; raises UsageError for others."""
+        return _only_normals(names, self.normals)
+
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure that shows the face well, whatever the rule: there is no photo to compare with."""
+        return auto_exposure_ev(_pixels(relit), self.seen)
+
+
+@dataclass(frozen=True, eq=False)
+class PersonStack:
+    """Composes stacks of a photo's person over black, alone, or with `photo` [H, W, 3] in that photo.
+
+    The photo may be larger than the stack: then the change of light is enlarged, and the photo keeps its
+    detail. `keeps_background` shows the photo's own.
+    """
+
+    header: StackHeader
+    face: np.ndarray  # [H, W] coverage, by which the exposure is chosen
+    photo: np.ndarray | None = None
+    keeps_background: bool = True
+
+    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+        """The person before the photo's background at `ev`, before another, or with alpha."""
+        person, matte = self._person(relit)
+        if behind is None and (self.photo is None or not self.keeps_background):
+            return RelitImage(person, matte)
+        shown = self.photo * np.float32(2.0**-ev) if behind is None and self.photo is not None else behind
+        assert shown is not None
+        return RelitImage(shown + matte[..., None] * (person - shown))
+
+    def light_layer(self, relit: Relit) -> np.ndarray:
+        """The person under one of several lights, over black."""
+        person, matte = self._person(relit)
+        return np.asarray(person * matte[..., None])
+
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+        """The matte and the layer of normals; raises UsageError for others."""
+        normals = _resized(self.header.normals, self._size())
+        return {"person.A": self._matte()} | _only_normals(names, normals)
+
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure in EV of the person, by a rule."""
+        person, seen = _straight(_pixels(relit), self.header.seen), self.header.seen
+        if rule == "face":
+            return auto_exposure_ev(person, seen)
+        return anchored_exposure_ev(person, self.header.source, self.face * seen, seen)
+
+    def _person(self, relit: Relit) -> tuple[np.ndarray, np.ndarray]:
+        """The person's own colours [H, W, 3], and its matte [H, W]."""
+        own = _straight(_pixels(relit), self.header.seen)
+        if self.photo is None or self._size() == self.header.seen.shape:
+            return own, self.header.seen
+        source = self.header.source
+        change = own / (source + _DARK * source.mean())
+        return self.photo * _resized(change, self._size()), self._matte()
+
+    def _matte(self) -> np.ndarray:
+        return _resized(self.header.seen[..., None], self._size())[..., 0]
+
+    def _size(self) -> tuple[int, ...]:
+        return self.header.seen.shape if self.photo is None else self.photo.shape[:2]
+
+
+def _pixels(relit: Relit) -> np.ndarray:
+    return np.asarray(relit.texture.permute(1, 2, 0).numpy())
+
+
+def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """Colours before they were multiplied by the matte; 0 where it is."""
+    share = matte[..., None]
+    return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
+
+
+def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    if values.shape[:2] == tuple(size):
+        return values
+    stacked = torch.from_numpy(np.ascontiguousarray(values, np.float32)).permute(2, 0, 1)[None]
+    sized = F.interpolate(stacked, tuple(size), mode="bilinear", align_corners=False)[0]
+    return np.asarray(sized.permute(1, 2, 0).numpy())
+
+
+def _only_normals(names: Sequence[str], normals: np.ndarray) -> dict[str, np.ndarray]:
+    if other := [name for name in names if name != "normal"]:
+        raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
+    return {"normal": normals} if names else {}
