@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.options import Settings
+from facerf_cli.cli.options import FACE, METHOD, Settings
 from facerf_cli.errors import UsageError
 
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
@@ -18,6 +18,7 @@ FaceOption = Annotated[
         "--face",
         metavar="largest|all|INDEX",
         help="Choose the face of a photo with several; INDEX counts from the left, from 0.",
+        rich_help_panel=FACE,
     ),
 ]
 LandmarksOption = Annotated[
@@ -27,6 +28,7 @@ LandmarksOption = Annotated[
         metavar="FILE|DIR",
         help="Read 68 landmarks (.pts or .json) from a file, or from a folder with a file for each photo.",
         show_default="detect them",
+        rich_help_panel=FACE,
     ),
 ]
 LandmarksFrom = Literal["facerf", "dlib"]
@@ -36,6 +38,7 @@ LandmarksFromOption = Annotated[
         "--landmarks-from",
         help="Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence excludes "
         "commercial use).",
+        rich_help_panel=FACE,
     ),
 ]
 Geometry = Literal["landmarks", "network"]
@@ -44,7 +47,8 @@ GeometryOption = Annotated[
     typer.Option(
         "--geometry",
         help="Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
-        show_default="as the checkpoint was trained: landmarks; network after `train --stage joint`",
+        show_default="as the checkpoint was trained",
+        rich_help_panel=FACE,
     ),
 ]
 TextureSizeOption = Annotated[
@@ -54,6 +58,7 @@ TextureSizeOption = Annotated[
         metavar="T",
         help="Side of the UV texture; a multiple of 256.",
         show_default="the checkpoint's; 256 for the shipped one",
+        rich_help_panel=METHOD,
     ),
 ]
 

@@ -9,6 +9,9 @@ import typer
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
+    IMAGE,
+    LIGHT,
+    METHOD,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -69,30 +72,39 @@ def predict_olat(
         typer.Option(
             metavar="N|FILE|'AZ,EL;...'",
             help="Predict a uniform rig of N lights, or directions in degrees: a text file, or a list.",
+            rich_help_panel=LIGHT,
         ),
     ] = "150",
     pose: Annotated[
         str | None,
         typer.Option(
-            metavar="YAW,PITCH,ROLL", help="Turn the head to a pose, in degrees.", show_default="the photo's"
+            metavar="YAW,PITCH,ROLL",
+            help="Turn the head to a pose, in degrees.",
+            show_default="the photo's",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     image: Annotated[
-        bool, typer.Option("--image/--texture", help="Write images of the face, or UV textures.")
+        bool,
+        typer.Option(
+            "--image/--texture", help="Write images of the face, or UV textures.", rich_help_panel=IMAGE
+        ),
     ] = False,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
-    memory: MemoryOption = 2.0,
-    precision: Annotated[Precision, typer.Option(help="Compute the network in this precision.")] = "float32",
-    overwrite: OverwriteOption = False,
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
+    precision: Annotated[
+        Precision, typer.Option(help="Compute the network in this precision.", rich_help_panel=METHOD)
+    ] = "float32",
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = False,
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
+    memory: MemoryOption = 2.0,
 ) -> None:
     """Predict a photo's face under every single light of a rig (OLAT, one light at a time).
 
