@@ -40,7 +40,8 @@ def envmap(
     """Write environment maps drawn from a seed: suns, overcast skies, rooms, studios, streets and stages.
 
     Lat-long OpenEXR, scene-linear Rec.709; --size changes the resolution, not the scene. Map number n depends
-    only on --seed, n and the kinds, so a larger --count adds maps and changes none.
+    only on --seed, n and the kinds, so a larger --count adds maps and changes none. envmaps.png shows all of
+    them, each beside a white ball under its light; `relight --envmap DIR` reads the maps alone.
     """
     if size % 2:
         raise UsageError(f"--size {size}: the height is half of it; give an even number")
