@@ -13,6 +13,9 @@ from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.options import (
+    IMAGE,
+    LIGHT,
+    METHOD,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -101,6 +104,7 @@ def relight(
             "estimate-light or convert-light (.json); or the first N maps that facerf envmap draws from "
             "--seed. Repeatable; .exr and .hdr files that follow it directly are maps, too.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     light: Annotated[
@@ -112,6 +116,7 @@ def relight(
             "image's right), or under several at once, separated by ;. Repeatable. Lights with names "
             "(key=40,20) shine together in one image, whose EXR has a layer for each.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     light_from: Annotated[
@@ -122,6 +127,7 @@ def relight(
             help="Relight under the light of another photo, estimated from its largest face as `facerf "
             "estimate-light` does by default (with this --reflectance). Repeatable.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     lights: Annotated[
@@ -130,6 +136,7 @@ def relight(
             "--lights",
             metavar="N|FILE",
             help="Approximate maps by a rig of N lights, or by a file of directions.",
+            rich_help_panel=LIGHT,
         ),
     ] = "150",
     rotate: Annotated[
@@ -139,6 +146,7 @@ def relight(
             metavar="DEG|FROM:TO:N",
             help="Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.",
             show_default="as they are",
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     pose: Annotated[
@@ -147,24 +155,31 @@ def relight(
             metavar="YAW,PITCH,ROLL",
             help="Turn the head to a pose, in degrees; shows the face alone.",
             show_default="the photo's",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     reflectance: Annotated[
         RelightKind,
         typer.Option(
             help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
-            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
+            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md).",
+            rich_help_panel=METHOD,
         ),
     ] = "portrait",
     exposure: Annotated[
         str,
-        typer.Option(metavar="EV|auto", help="Exposure of the PNG in EV, or auto: expose the lit face well."),
+        typer.Option(
+            metavar="EV|auto",
+            help="Exposure of the PNG in EV, or auto: expose the lit face well.",
+            rich_help_panel=IMAGE,
+        ),
     ] = "auto",
     composite: Annotated[
         Composite | None,
         typer.Option(
             help="Show the photo with its face relit, or the rendered face alone, with alpha.",
             show_default="photo; face with --pose",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     background: Annotated[
@@ -173,6 +188,7 @@ def relight(
             metavar="photo|envmap|none|FILE|COLOUR",
             help="Show behind the person the photo's background, as it was; the map, seen by the photo's "
             "camera; nothing (alpha); an image; or a colour, #RRGGBB or linear R,G,B.",
+            rich_help_panel=IMAGE,
         ),
     ] = "photo",
     background_blur: Annotated[
@@ -182,6 +198,7 @@ def relight(
             min=0.0,
             max=50.0,
             help="Blur the map behind the person as a lens does, in percent of the longer side.",
+            rich_help_panel=IMAGE,
         ),
     ] = 1.0,
     aov: Annotated[
@@ -191,6 +208,7 @@ def relight(
             help="Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the "
             "face alone face (its soft mask) and uv. The matte, person.A, is always there.",
             show_default="none",
+            rich_help_panel=IMAGE,
         ),
     ] = "",
     matte: Annotated[
@@ -199,29 +217,36 @@ def relight(
             metavar="FILE",
             help="Change only what a grey image, or its alpha, of the photo's size shows.",
             show_default=False,
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     ball: Annotated[
-        bool, typer.Option("--ball", help="Write a mirror ball and a diffuse ball under each map, too.")
+        bool,
+        typer.Option(
+            "--ball",
+            help="Write a mirror ball and a diffuse ball under each map, too.",
+            rich_help_panel=IMAGE,
+        ),
     ] = False,
     envmap_sampling: Annotated[
         Sampling,
         typer.Option(
-            help="Give each light the map's integral over its cell, or, as in the paper, one pixel."
+            help="Give each light the map's integral over its cell, or, as in the paper, one pixel.",
+            rich_help_panel=LIGHT,
         ),
     ] = "cell",
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
-    memory: MemoryOption = 2.0,
-    overwrite: OverwriteOption = False,
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = False,
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
+    memory: MemoryOption = 2.0,
 ) -> None:
     """Relight photos under environment maps and single lights.
 
