@@ -1,10 +1,10 @@
-# make demo | test | lint | bench | man. The first call makes the virtual environment.
+# make demo | test | lint | bench | man | completions | dist. The first call makes the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 STAMP := $(VENV)/.installed
 FACERF := $(VENV)/bin/facerf
 
-.PHONY: demo test lint bench man setup clean
+.PHONY: demo test lint bench man completions dist setup clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml constraints.txt
@@ -32,5 +32,12 @@ bench: $(STAMP)
 man: $(STAMP)
 	$(VENV)/bin/python -m facerf_cli.manpages man
 
+completions: $(STAMP)
+	$(VENV)/bin/python -m facerf_cli.completions completions
+
+# The source distribution, and the wheel from it, as tests/test_distribution.py builds them.
+dist: $(STAMP)
+	$(VENV)/bin/python -m build --no-isolation
+
 clean:
-	rm -rf out build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache

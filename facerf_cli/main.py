@@ -1,9 +1,9 @@
 """The command line: verbs, global options, errors to exit codes.
 
-A verb is a function in `facerf_cli/cli/`, named like the verb and listed in `VERBS`. typer needs every verb's
-signature before it parses the line, so this module imports all of them. To keep `facerf --help` fast, the
-modules directly in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a verb is in
-`cli/items/`, behind a deferred import. A test checks it.
+A verb is a function in `facerf_cli/cli/`, named like the verb and listed under its panel in `VERBS`. typer
+needs every verb's signature before it parses the line, so this module imports all of them. To keep
+`facerf --help` fast, the modules directly in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy):
+the work of a verb is in `cli/items/`, behind a deferred import. A test checks it.
 """
 
 import logging
@@ -25,7 +25,7 @@ from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, DeviceName, Settings, with_machines
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, DeviceName, Settings, unwrapped, with_machines
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
@@ -36,24 +36,19 @@ from facerf_cli.cli.train import train
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
 
-VERBS: tuple[Callable[..., Any], ...] = (
-    relight,
-    estimate_light,
-    convert_light,
-    predict_olat,
-    fit_geometry,
-    segment,
-    synth_stage,
-    prepare_dataset,
-    relight_dataset,
-    train,
-    envmap,
-    check,
-    doctor,
-    config,
-)
-# Verbs with subcommands.
-GROUPS: dict[str, typer.Typer] = {"evaluate": evaluate.app, "face-model": face_model.app}
+_PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
+# The verbs by panel of the help, in the order of a user's day.
+VERBS: dict[str, tuple[Callable[..., Any], ...]] = {
+    _PHOTOS: (relight, estimate_light, predict_olat, segment, fit_geometry),
+    _LIGHT: (convert_light, envmap),
+    _DATA: (synth_stage, prepare_dataset, relight_dataset, train),
+    _SETUP: (check, doctor, config),
+}
+# Verbs with subcommands, and their panels; typer lists them after the verbs of a panel.
+GROUPS: dict[str, tuple[typer.Typer, str]] = {
+    "evaluate": (evaluate.app, _DATA),
+    "face-model": (face_model.app, _SETUP),
+}
 
 # Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version", "-0", "--null"})
@@ -124,10 +119,15 @@ def _global_options(
     context.obj = Settings(verbosity, log_json, device, checkpoint, seed, null)
 
 
-for _verb in VERBS:
-    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_machines(_verb))
-for _name, _group in GROUPS.items():
-    app.add_typer(_group, name=_name)
+for _panel, _verbs in VERBS.items():
+    for _verb in _verbs:
+        _add = app.command(epilog=EPILOG, context_settings=HELP_NAMES, rich_help_panel=_panel)
+        _add(with_machines(_verb))
+for _name, (_group, _panel) in GROUPS.items():
+    app.add_typer(_group, name=_name, rich_help_panel=_panel)
+for _verbs_of in (app, *(group for group, _ in GROUPS.values())):
+    for _command in _verbs_of.registered_commands:
+        _command.help = unwrapped(_command.callback.__doc__ or "")
 
 
 def run() -> None:

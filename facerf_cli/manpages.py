@@ -1,7 +1,7 @@
 """Man pages from the app: `python -m facerf_cli.manpages DIR` writes facerf.1 and a page for each verb."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,12 +47,17 @@ def _page(path: tuple[str, ...], command: Any) -> str:
     lines += [".SH DESCRIPTION", _text(summary)]
     for paragraph in filter(None, rest.replace("\b", "").split("\n\n")):
         lines += [".PP", _text(" ".join(paragraph.split()))]
-    options = [parameter.get_help_record(context) for parameter in command.get_params(context)]
-    lines += _definitions("OPTIONS", [record for record in options if record])
+    options = [
+        (_panel_of(parameter), record)
+        for parameter in command.get_params(context)
+        if (record := parameter.get_help_record(context))
+    ]
+    lines += _section("OPTIONS", options)
     verbs = getattr(command, "commands", {})
-    lines += _definitions("VERBS", [(name, verbs[name].get_short_help_str(200)) for name in sorted(verbs)])
+    listed = [(_panel_of(verb), (name, verb.get_short_help_str(200))) for name, verb in verbs.items()]
+    lines += _section("VERBS", listed)
     if len(path) == 1:
-        lines += _definitions("EXIT STATUS", _EXIT_CODES)
+        lines += [".SH EXIT STATUS", *_definitions(_EXIT_CODES)]
     elif command.epilog:
         lines += [".PP", _text(command.epilog)]
     pages_nearby = ["-".join((*path, name)) for name in sorted(verbs)] or ["-".join(path[:-1])]
@@ -60,8 +65,25 @@ def _page(path: tuple[str, ...], command: Any) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _definitions(title: str, entries: Any) -> list[str]:
-    lines = [f".SH {title}"] if entries else []
+def _panel_of(part: Any) -> str:
+    """The panel of an option or a verb in the help; empty for the first one."""
+    return getattr(part, "rich_help_panel", None) or ""
+
+
+def _section(title: str, entries: Iterable[tuple[str, tuple[str, str]]]) -> list[str]:
+    """A section of terms and meanings, with a subsection for each panel of the help, in its order."""
+    panels: dict[str, list[tuple[str, str]]] = {"": []}
+    for panel, entry in entries:
+        panels.setdefault(panel, []).append(entry)
+    lines = []
+    for panel, held in panels.items():
+        if held:
+            lines += [*([f".SS {_text(panel)}"] if panel else []), *_definitions(held)]
+    return [f".SH {title}", *lines] if lines else []
+
+
+def _definitions(entries: Iterable[tuple[str, str]]) -> list[str]:
+    lines = []
     for term, meaning in entries:
         lines += [".TP", f"\\fB{_text(term)}\\fR", _text(" ".join(meaning.split()))]
     return lines

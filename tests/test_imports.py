@@ -7,7 +7,7 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "facerf_cli"
 LEVELS = (
-    ("__main__", "manpages"),
+    ("__main__", "manpages", "completions"),
     ("main",),
     ("cli",),
     ("evaluation", "training", "api"),

@@ -9,6 +9,7 @@ import typer
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
+    LIGHT,
     DryRunOption,
     JobsOption,
     OutputOption,
@@ -71,8 +72,8 @@ def convert_light(
         list[str],
         typer.Argument(
             metavar="LIGHT...",
-            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json), DPR's 9 or SfSNet's 27 "
-            "numbers (.txt); folders of them, or - to read a list of paths from standard input.",
+            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json), DPR's or SfSNet's numbers "
+            "(.txt); folders of them, or - for a list.",
             show_default=False,
         ),
     ],
@@ -81,22 +82,23 @@ def convert_light(
         list[str],
         typer.Option(
             metavar="FORM",
-            help="Write this form (repeatable): latlong (EXR), json (a rig's weights and spherical "
-            "harmonics), sh (spherical harmonics alone, JSON), dpr, sfsnet (text), blender, mitsuba (EXR, "
-            "oriented as these programs expect for a head that faces the viewer).",
+            help="Write this form: latlong, json, sh, dpr, sfsnet, blender or mitsuba. Repeatable.",
             show_default=False,
         ),
     ],
     from_axes: Annotated[
-        Axes, typer.Option(help="Read input maps in the orientation of this program.")
+        Axes,
+        typer.Option(help="Read input maps in the orientation of this program.", rich_help_panel=LIGHT),
     ] = "facerf",
     width: Annotated[
         int | None,
         typer.Option(
             min=16,
             max=_LIMIT_PX,
-            help="Width of maps in pixels; the height is half of it.",
+            metavar="PX",
+            help="Write maps of this width; the height is half of it.",
             show_default="the map's own, else 512",
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     order: Annotated[
@@ -104,8 +106,9 @@ def convert_light(
         typer.Option(
             min=0,
             max=_MOST_ORDER,
-            help="Order of the spherical harmonics in json and sh.",
+            help="Write spherical harmonics of this order in json and sh.",
             show_default="the input's own, else 2",
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     lights: Annotated[
@@ -114,24 +117,30 @@ def convert_light(
             metavar="N|FILE",
             help="Write json over this rig: a number, 'az,el;az,el;...', or a file of such lines.",
             show_default="the input's own, else 150",
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     signed: Annotated[
         bool,
         typer.Option(
             "--signed",
-            help="Keep the plain series of spherical harmonics, which is negative in places (default: the "
-            "non-negative light with the nearest coefficients).",
+            help="Keep the plain series of spherical harmonics, negative in places (default: the nearest "
+            "non-negative light).",
+            rich_help_panel=LIGHT,
         ),
     ] = False,
-    jobs: JobsOption = 1,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
 ) -> None:
     """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
 
-    Maps are OpenEXR lat-long, scene-linear; files name their convention where they can. Spherical harmonics
-    lose what is finer than their order; the weights of a rig are integrated from a map as `relight` does.
+    Forms: latlong (EXR); json (weights of a rig, and spherical harmonics); sh (spherical harmonics alone,
+    JSON); dpr and sfsnet (text); blender and mitsuba (EXR, oriented as these programs expect for a head that
+    faces the viewer). Maps are scene-linear; files name their convention where they can.
+
+    Spherical harmonics lose what is finer than their order; the weights of a rig are integrated from a map as
+    `relight` does.
     """
     if unknown := [form for form in to if form not in get_args(Form)]:
         raise UsageError(f"--to {unknown[0]}: no such form; give one of {', '.join(_ENDINGS)}")

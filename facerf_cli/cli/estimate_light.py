@@ -12,6 +12,9 @@ from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.options import (
+    FACE,
+    LIGHT,
+    METHOD,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -72,6 +75,7 @@ def estimate_light(
             "--lights",
             metavar="N|FILE",
             help="Solve for the light of a rig of N lights, or of a file of directions.",
+            rich_help_panel=LIGHT,
         ),
     ] = "150",
     non_negative: NonNegativeOption = True,
@@ -82,39 +86,60 @@ def estimate_light(
             metavar="imagenet|PATH",
             help="Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.",
             show_default="S_f, the shipped network trained to find the light",
+            rich_help_panel=METHOD,
         ),
     ] = None,
     reflectance: Annotated[
-        Kind, typer.Option(help="Choose the reflectance model; each baseline estimates its own light.")
+        Kind,
+        typer.Option(
+            help="Choose the reflectance model; each baseline estimates its own light.",
+            rich_help_panel=METHOD,
+        ),
     ] = "field",
     keep_eyes: Annotated[
-        bool, typer.Option("--keep-eyes", help="Use the eyes, too (the paper leaves them out).")
+        bool,
+        typer.Option(
+            "--keep-eyes", help="Use the eyes, too (the paper leaves them out).", rich_help_panel=FACE
+        ),
     ] = False,
     matte: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE|DIR|PATTERN",
-            help="Use only what a grey image, or its alpha, of the photo's size shows (for example to leave "
-            "out hair and glasses). The photo's own alpha is used in the same way.",
-            show_default=False,
+            help="Use only what a grey image, or its alpha, of the photo's size shows, such as skin alone.",
+            show_default="the photo's alpha",
+            rich_help_panel=FACE,
         ),
     ] = None,
     width: Annotated[
-        int, typer.Option(min=16, max=8192, help="Width of the map in pixels; the height is half of it.")
+        int,
+        typer.Option(
+            min=16,
+            max=8192,
+            metavar="PX",
+            help="Write a map of this width; the height is half of it.",
+            rich_help_panel=LIGHT,
+        ),
     ] = 512,
     sh_order: Annotated[
-        int, typer.Option(min=0, max=_MOST_ORDER, help="Order of the spherical harmonics in the JSON.")
+        int,
+        typer.Option(
+            min=0,
+            max=_MOST_ORDER,
+            help="Write spherical harmonics of this order in the JSON.",
+            rich_help_panel=LIGHT,
+        ),
     ] = 2,
     texture_size: TextureSizeOption = None,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = "changed",
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
 ) -> None:
     """Estimate the light of photos from the shading of their faces.
 

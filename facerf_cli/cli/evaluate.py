@@ -7,6 +7,9 @@ from typing import Annotated
 import typer
 
 from facerf_cli.cli.evaluation_options import (
+    DATA,
+    MEASURES,
+    METHODS,
     DatasetArgument,
     EvaluateOptions,
     EveryOption,
@@ -140,12 +143,15 @@ def transfer(
     ],
     options: EvaluateOptions,
     photos: Annotated[
-        bool, typer.Option("--photos", help="Read photos, two of each person or in folders.")
+        bool,
+        typer.Option("--photos", help="Read photos, two of each person or in folders.", rich_help_panel=DATA),
     ] = False,
     held_to_photo: Annotated[
         bool,
         typer.Option(
-            "--held-to-photo", help="Correct the field by the quotient of its photo, as `relight` does."
+            "--held-to-photo",
+            help="Correct the field by the quotient of its photo, as `relight` does.",
+            rich_help_panel=METHODS,
         ),
     ] = False,
     split: SplitOption = "test",
@@ -197,6 +203,7 @@ def geometry(
             metavar="FILE",
             help="Use a checkpoint of `facerf train --mean-face` for the mean face.",
             show_default="that of the fitted face",
+            rich_help_panel=METHODS,
         ),
     ] = None,
     split: SplitOption = "test",
@@ -254,6 +261,7 @@ def yale_b(
             help="Align images by rows subject,light,dy,dx: pixels down and right that move an image onto "
             "its subject's frontal one.",
             show_default="no alignment",
+            rich_help_panel=DATA,
         ),
     ] = None,
     subjects: Annotated[
@@ -263,6 +271,7 @@ def yale_b(
             metavar="NAME,...",
             help="Measure these subjects only, such as yaleB05,yaleB15. Repeatable.",
             show_default="all",
+            rich_help_panel=DATA,
         ),
     ] = None,
     geometry: GeometryOption = None,
@@ -317,6 +326,7 @@ def pairs(
             metavar="DIR",
             help="Compare inside masks: images with the truths' names, white inside.",
             show_default="the truths' alpha, else everything",
+            rich_help_panel=DATA,
         ),
     ] = None,
     facts: Annotated[
@@ -327,10 +337,16 @@ def pairs(
             help="Read a row for each image: name, person, and columns for the tables (text) or for the list "
             "of images (numbers).",
             show_default="a person is a truth's topmost folder",
+            rich_help_panel=DATA,
         ),
     ] = None,
     face_distance: Annotated[
-        bool, typer.Option("--face-distance", help="Detect the truths' faces and measure Face dis, too.")
+        bool,
+        typer.Option(
+            "--face-distance",
+            help="Detect the truths' faces and measure Face dis, too.",
+            rich_help_panel=MEASURES,
+        ),
     ] = False,
 ) -> int:
     """Measure folders of predictions against a folder of truths, image by image.

@@ -21,6 +21,9 @@ from facerf_cli.cli.options import (
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
 
+# Panels of a protocol's options in its help.
+DATA, METHODS, MEASURES = "Data", "Methods", "Measures"
+
 PredictionsOption = Annotated[
     list[Path] | None,
     typer.Option(
@@ -29,6 +32,7 @@ PredictionsOption = Annotated[
         help="Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name. "
         "Repeatable.",
         show_default="none",
+        rich_help_panel=METHODS,
     ),
 ]
 ReflectanceOption = Annotated[
@@ -39,6 +43,7 @@ ReflectanceOption = Annotated[
         help="Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and "
         "the others are compared with the first.",
         show_default="field; of yale-b portrait",
+        rich_help_panel=METHODS,
     ),
 ]
 AgainstOption = Annotated[
@@ -48,6 +53,7 @@ AgainstOption = Annotated[
         metavar="FILE",
         help="Measure another checkpoint of the field, named by its stem. Repeatable.",
         show_default="none",
+        rich_help_panel=METHODS,
     ),
 ]
 PicturesOption = Annotated[
@@ -55,14 +61,22 @@ PicturesOption = Annotated[
     typer.Option(
         "--pictures",
         help="Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.",
+        rich_help_panel=MEASURES,
     ),
 ]
 KeepEyesOption = Annotated[
-    bool, typer.Option("--keep-eyes", help="Compare open eyes, too (default: not, as in the paper).")
+    bool,
+    typer.Option(
+        "--keep-eyes",
+        help="Compare open eyes, too (default: not, as in the paper).",
+        rich_help_panel=MEASURES,
+    ),
 ]
 SpaceOption = Annotated[
     Literal["linear", "display"],
-    typer.Option("--space", help="Measure scene-linear values, or values encoded by sRGB."),
+    typer.Option(
+        "--space", help="Measure scene-linear values, or values encoded by sRGB.", rich_help_panel=MEASURES
+    ),
 ]
 LpipsOption = Annotated[
     Path | None,
@@ -71,6 +85,7 @@ LpipsOption = Annotated[
         metavar="FILE",
         help="Read the linear heads of LPIPS (v0.1, VGG) from a file.",
         show_default="where installed",
+        rich_help_panel=MEASURES,
     ),
 ]
 VggWeightsOption = Annotated[
@@ -80,11 +95,17 @@ VggWeightsOption = Annotated[
         metavar="imagenet|PATH",
         help="Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.",
         show_default="no LPIPS",
+        rich_help_panel=MEASURES,
     ),
 ]
 PresetOption = Annotated[
     Literal["paper"] | None,
-    typer.Option("--preset", help="Measure as many images as the paper did.", show_default="none"),
+    typer.Option(
+        "--preset",
+        help="Measure as many images as the paper did.",
+        show_default="none",
+        rich_help_panel=MEASURES,
+    ),
 ]
 
 
@@ -106,10 +127,21 @@ PhotosOrDatasetArgument = Annotated[
 ]
 SplitOption = Annotated[
     Literal["train", "validation", "test", "all"],
-    typer.Option("--split", help="Measure this split of DATASET; all if no network was trained on it."),
+    typer.Option(
+        "--split",
+        help="Measure this split of DATASET; all if no network was trained on it.",
+        rich_help_panel=DATA,
+    ),
 ]
 EveryOption = Annotated[
-    int, typer.Option("--every", min=1, metavar="N", help="Measure every Nth pair of DATASET's split only.")
+    int,
+    typer.Option(
+        "--every",
+        min=1,
+        metavar="N",
+        help="Measure every Nth pair of DATASET's split only.",
+        rich_help_panel=DATA,
+    ),
 ]
 JointFitOption = Annotated[
     bool,
@@ -117,6 +149,7 @@ JointFitOption = Annotated[
         "--joint-fit",
         help="Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once, "
         "instead of each image alone.",
+        rich_help_panel=DATA,
     ),
 ]
 
@@ -182,9 +215,9 @@ def _evaluate_options(
     lpips: LpipsOption = None,
     vgg_weights: VggWeightsOption = None,
     preset: PresetOption = None,
-    jobs: JobsOption = 1,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
 ) -> EvaluateOptions:
     """Collect the shared options; a command's signature ends with these parameters."""
     return EvaluateOptions(

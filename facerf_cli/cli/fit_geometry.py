@@ -62,9 +62,6 @@ def fit_geometry(
     context: typer.Context,
     inputs: InputsArgument,
     output: OutputOption,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
@@ -72,6 +69,9 @@ def fit_geometry(
     texture_size: TextureSizeOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = "changed",
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
 ) -> None:
     """Fit the face model to photos: mesh, texture, normals, and an overlay of the fit.
 

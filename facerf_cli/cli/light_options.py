@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.baselines import Kind
+from facerf_cli.cli.options import METHOD
 from facerf_cli.cli.photo_options import PhotoOptions, check_companion
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
@@ -16,12 +17,16 @@ NonNegativeOption = Annotated[
     bool,
     typer.Option(
         "--non-negative/--signed",
-        help="Solve for weights from 0 up, robust to highlights, hair and glasses; or for the paper's least "
-        "squares, whose weights may be negative.",
+        help="Solve for weights from 0 up, robust to hair and glasses; or for the paper's least squares, "
+        "with negative ones.",
+        rich_help_panel=METHOD,
     ),
 ]
 RefineOption = Annotated[
-    Refine, typer.Option(help="Refine the least squares by comparing features of the texture.")
+    Refine,
+    typer.Option(
+        help="Refine the least squares by comparing features of the texture.", rich_help_panel=METHOD
+    ),
 ]
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 

@@ -19,6 +19,10 @@ EPILOG = (
 )
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 
+# Panels of a verb's options in its help, in the order in which verbs list them. What must be given, --output
+# and --help have none: they stand first, under Options.
+LIGHT, IMAGE, FACE, METHOD, BATCH = "Light", "Image", "Face", "Method", "Batch"
+
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 
 
@@ -121,13 +125,20 @@ OverwriteOption = Annotated[
     Overwrite,
     typer.Option(
         help="Make again results that exist: never; those that were made from other inputs, options or "
-        "networks (changed); or always."
+        "networks (changed); or always.",
+        rich_help_panel=BATCH,
     ),
 ]
 DryRunOption = Annotated[
-    bool, typer.Option("--dry-run", help="List what would be read and written; write nothing.")
+    bool,
+    typer.Option(
+        "--dry-run", help="List what would be read and written; write nothing.", rich_help_panel=BATCH
+    ),
 ]
-JobsOption = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Process this many items at a time.")]
+JobsOption = Annotated[
+    int,
+    typer.Option("--jobs", "-j", min=1, help="Process this many items at a time.", rich_help_panel=BATCH),
+]
 ShardOption = Annotated[
     str | None,
     typer.Option(
@@ -135,6 +146,7 @@ ShardOption = Annotated[
         metavar="K/N",
         help="Process every Nth item only, from the Kth on; other machines take the rest.",
         show_default="all items",
+        rich_help_panel=BATCH,
     ),
 ]
 RayOption = Annotated[
@@ -142,9 +154,9 @@ RayOption = Annotated[
     typer.Option(
         "--ray",
         metavar="ADDRESS",
-        help="Run as tasks of Ray: HOST:PORT of a cluster's head, auto, or local for this machine; --jobs "
-        "tasks at a time, by default one per processor, with --device cuda one per GPU.",
+        help="Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).",
         show_default=False,
+        rich_help_panel=BATCH,
     ),
 ]
 InputColourspaceOption = Annotated[
@@ -152,20 +164,29 @@ InputColourspaceOption = Annotated[
     typer.Option(
         "--input-colourspace",
         metavar="NAME",
-        help="Read the input in this colour space instead of the file's: sRGB, linear (lin_rec709), ACEScg, "
-        "Rec.2020, lin_rec2020, 'Display P3', or any name of the OCIO configuration.",
+        help="Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or any name "
+        "of the OCIO configuration.",
         show_default="the file's",
+        rich_help_panel=IMAGE,
     ),
 ]
 NetworkAloneOption = Annotated[
     bool,
     typer.Option(
-        "--network-alone", help="Use the network's own field, without the correction by the photo's quotient."
+        "--network-alone",
+        help="Use the network's own field, without the correction by the photo's quotient.",
+        rich_help_panel=METHOD,
     ),
 ]
 MemoryOption = Annotated[
     float,
-    typer.Option("--memory", metavar="GB", min=0.1, help="Limit the memory of the prediction, roughly."),
+    typer.Option(
+        "--memory",
+        metavar="GB",
+        min=0.1,
+        help="Limit the memory of the prediction, roughly.",
+        rich_help_panel=BATCH,
+    ),
 ]
 FaceModelOption = Annotated[
     str,
@@ -173,8 +194,15 @@ FaceModelOption = Annotated[
         "--face-model",
         metavar="NAME|PATH",
         help="Fit this morphable model: builtin, or a .npz of `face-model import`.",
+        rich_help_panel=FACE,
     ),
 ]
+
+
+def unwrapped(docstring: str) -> str:
+    """A docstring with a line for each paragraph, which the help breaks at the terminal's width."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
+
 
 _AFTER, _ALSO = "jobs", "dry_run"  # by these a verb that walks folders is known
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.cli.naming import OF_PHOTOS, NamePattern
-from facerf_cli.cli.options import Settings
+from facerf_cli.cli.options import FACE, METHOD, Settings
 from facerf_cli.errors import UsageError
 
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
@@ -19,6 +19,7 @@ FaceOption = Annotated[
         "--face",
         metavar="largest|all|INDEX",
         help="Choose the face of a photo with several; INDEX counts from the left, from 0.",
+        rich_help_panel=FACE,
     ),
 ]
 LandmarksOption = Annotated[
@@ -29,6 +30,7 @@ LandmarksOption = Annotated[
         help="Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a pattern "
         "(points/{stem}.pts).",
         show_default="detect them",
+        rich_help_panel=FACE,
     ),
 ]
 LandmarksFrom = Literal["facerf", "dlib"]
@@ -38,6 +40,7 @@ LandmarksFromOption = Annotated[
         "--landmarks-from",
         help="Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence excludes "
         "commercial use).",
+        rich_help_panel=FACE,
     ),
 ]
 Geometry = Literal["landmarks", "network"]
@@ -46,7 +49,8 @@ GeometryOption = Annotated[
     typer.Option(
         "--geometry",
         help="Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
-        show_default="as the checkpoint was trained: landmarks; network after `train --stage joint`",
+        show_default="as the checkpoint was trained",
+        rich_help_panel=FACE,
     ),
 ]
 TextureSizeOption = Annotated[
@@ -56,6 +60,7 @@ TextureSizeOption = Annotated[
         metavar="T",
         help="Side of the UV texture; a multiple of 256.",
         show_default="the checkpoint's; 256 for the shipped one",
+        rich_help_panel=METHOD,
     ),
 ]
 

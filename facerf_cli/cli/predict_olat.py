@@ -9,6 +9,9 @@ import typer
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
+    IMAGE,
+    LIGHT,
+    METHOD,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -74,12 +77,16 @@ def predict_olat(
         typer.Option(
             metavar="N|FILE|'AZ,EL;...'",
             help="Predict a uniform rig of N lights, or directions in degrees: a text file, or a list.",
+            rich_help_panel=LIGHT,
         ),
     ] = "150",
     pose: Annotated[
         str | None,
         typer.Option(
-            metavar="YAW,PITCH,ROLL", help="Turn the head to a pose, in degrees.", show_default="the photo's"
+            metavar="YAW,PITCH,ROLL",
+            help="Turn the head to a pose, in degrees.",
+            show_default="the photo's",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     frame: Annotated[
@@ -88,6 +95,7 @@ def predict_olat(
             help="Predict the whole person in the photo's frame; the face alone in that of its crop; or UV "
             "textures, which other poses can be rendered from.",
             show_default="photo; face with --pose",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     size: Annotated[
@@ -97,21 +105,24 @@ def predict_olat(
             max=_LARGEST_PX,
             metavar="PX",
             help="Scale larger photos down to this longer side, with --frame photo.",
+            rich_help_panel=IMAGE,
         ),
     ] = 1024,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
-    memory: MemoryOption = 2.0,
-    precision: Annotated[Precision, typer.Option(help="Compute the network in this precision.")] = "float32",
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
+    precision: Annotated[
+        Precision, typer.Option(help="Compute the network in this precision.", rich_help_panel=METHOD)
+    ] = "float32",
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = "changed",
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
+    memory: MemoryOption = 2.0,
 ) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 

@@ -17,6 +17,7 @@ from facerf_cli.cli.options import (
 )
 from facerf_cli.errors import UsageError
 
+_CAPTURE, _CORRECTION, _DATASET = "Capture", "Checks and corrections", "Dataset"
 Checks = Literal["on", "off", "only"]
 _DESCRIBES = ("capture", "output", "describe", "pattern", "dry_run")  # parameters that --describe uses
 
@@ -67,6 +68,7 @@ def prepare_dataset(
             "--describe",
             help="Write a first draft of stage.json from file names and headers, list what to fill in, and "
             "prepare nothing.",
+            rich_help_panel=_CAPTURE,
         ),
     ] = False,
     pattern: Annotated[
@@ -74,8 +76,9 @@ def prepare_dataset(
         typer.Option(
             metavar="PATTERN",
             help="With --describe, find the images by this path below CAPTURE, such as "
-            "'{subject}/{camera}/{light}.exr'; without {subject} or {camera} there is one.",
+            "'{subject}/{camera}/{light}.exr'.",
             show_default="by folder depth",
+            rich_help_panel=_CAPTURE,
         ),
     ] = "",
     layout: Annotated[
@@ -84,16 +87,24 @@ def prepare_dataset(
             metavar="NAME",
             help="Read this layout of a capture: stage (with stage.json), or extended-yale-b (that database, "
             "cropped, as distributed).",
+            rich_help_panel=_CAPTURE,
         ),
     ] = "stage",
     subtract_ambient: Annotated[
         bool,
         typer.Option(
-            "--subtract-ambient", help="Subtract each camera's image without lights, where there is one."
+            "--subtract-ambient",
+            help="Subtract each camera's image without lights, where there is one.",
+            rich_help_panel=_CORRECTION,
         ),
     ] = False,
     align: Annotated[
-        bool, typer.Option("--align", help="Shift frames in which the head has moved back to its place.")
+        bool,
+        typer.Option(
+            "--align",
+            help="Shift frames in which the head has moved back to its place.",
+            rich_help_panel=_CORRECTION,
+        ),
     ] = False,
     colour_chart: Annotated[
         str,
@@ -102,6 +113,7 @@ def prepare_dataset(
             help="Correct the colours by this image of a ColorChecker Classic under the stage's lights; with "
             "{camera} in its name, by an image per camera.",
             show_default=False,
+            rich_help_panel=_CORRECTION,
         ),
     ] = "",
     chart_corners: Annotated[
@@ -110,6 +122,7 @@ def prepare_dataset(
             metavar="'X,Y X,Y X,Y X,Y'",
             help="Corners of the chart's 24 patches in pixels, in order around them.",
             show_default="search for the chart",
+            rich_help_panel=_CORRECTION,
         ),
     ] = "",
     checks: Annotated[
@@ -117,11 +130,16 @@ def prepare_dataset(
         typer.Option(
             help="Check the frames first: broken frames are left out, errors stop a subject. only: list the "
             "findings, and prepare nothing.",
+            rich_help_panel=_CORRECTION,
         ),
     ] = "on",
     strict: Annotated[
         bool,
-        typer.Option("--strict", help="Stop a subject for any finding, missing frame or undetected face."),
+        typer.Option(
+            "--strict",
+            help="Stop a subject for any finding, missing frame or undetected face.",
+            rich_help_panel=_CORRECTION,
+        ),
     ] = False,
     split: Annotated[
         str,
@@ -129,10 +147,14 @@ def prepare_dataset(
             metavar="T/V/T",
             help="Split the subjects into training, validation and test: counts (300/10/40) or shares, drawn "
             "by --seed.",
+            rich_help_panel=_DATASET,
         ),
     ] = "0.8/0.1/0.1",
     crop: Annotated[
-        int, typer.Option(metavar="PX", help="Side of the crops in pixels; a multiple of 8.")
+        int,
+        typer.Option(
+            metavar="PX", help="Write crops of this side, a multiple of 8.", rich_help_panel=_DATASET
+        ),
     ] = 256,
     face_model: FaceModelOption = "builtin",
     overwrite: OverwriteOption = "changed",

@@ -17,6 +17,10 @@ from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.options import (
+    BATCH,
+    IMAGE,
+    LIGHT,
+    METHOD,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -163,6 +167,7 @@ def relight(
             "estimate-light or convert-light (.json); or the first N maps that facerf envmap draws from "
             "--seed. Repeatable; .exr and .hdr files that follow it directly are maps, too.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     light: Annotated[
@@ -177,6 +182,7 @@ def relight(
             "rembrandt, rim, split. Repeatable. Lights with names (key=40,20 or name=key;...) shine "
             "together in one image, whose EXR has a layer for each.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     light_from: Annotated[
@@ -187,6 +193,7 @@ def relight(
             help="Relight under the light of another photo, estimated from its largest face as `facerf "
             "estimate-light` does by default (with this --reflectance). Repeatable.",
             show_default=False,
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     lights: Annotated[
@@ -195,6 +202,7 @@ def relight(
             "--lights",
             metavar="N|FILE",
             help="Approximate maps by a rig of N lights, or by a file of directions.",
+            rich_help_panel=LIGHT,
         ),
     ] = "150",
     rotate: Annotated[
@@ -204,6 +212,7 @@ def relight(
             metavar="DEG|FROM:TO:N",
             help="Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.",
             show_default="as they are",
+            rich_help_panel=LIGHT,
         ),
     ] = None,
     pose: Annotated[
@@ -212,13 +221,15 @@ def relight(
             metavar="YAW,PITCH,ROLL",
             help="Turn the head to a pose, in degrees; shows the face alone.",
             show_default="the photo's",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     reflectance: Annotated[
         RelightKind,
         typer.Option(
             help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
-            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md)."
+            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md).",
+            rich_help_panel=METHOD,
         ),
     ] = "portrait",
     exposure: Annotated[
@@ -227,6 +238,7 @@ def relight(
             metavar="auto|face|EV",
             help="Expose PNG and JPEG so that the face is as bright as in the photo (auto) or well lit "
             "(face); or by a number of EV.",
+            rich_help_panel=IMAGE,
         ),
     ] = "auto",
     exposure_group: Annotated[
@@ -246,6 +258,7 @@ def relight(
         typer.Option(
             help="Show the photo with its face relit, or the rendered face alone, with alpha.",
             show_default="photo; face with --pose",
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     background: Annotated[
@@ -254,6 +267,7 @@ def relight(
             metavar="photo|envmap|none|FILE|COLOUR",
             help="Show behind the person the photo's background, as it was; the map, seen by the photo's "
             "camera; nothing (alpha); an image; or a colour, #RRGGBB or linear R,G,B.",
+            rich_help_panel=IMAGE,
         ),
     ] = "photo",
     background_blur: Annotated[
@@ -263,6 +277,7 @@ def relight(
             min=0.0,
             max=50.0,
             help="Blur the map behind the person as a lens does, in percent of the longer side.",
+            rich_help_panel=IMAGE,
         ),
     ] = 1.0,
     aov: Annotated[
@@ -272,6 +287,7 @@ def relight(
             help="Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the "
             "face alone face (its soft mask) and uv. The matte, person.A, is always there.",
             show_default="none",
+            rich_help_panel=IMAGE,
         ),
     ] = "",
     matte: Annotated[
@@ -290,15 +306,22 @@ def relight(
             metavar="FILE|DIR|PATTERN",
             help="Put an OLAT stack of predict-olat back on its photo, at the photo's resolution.",
             show_default=False,
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     ball: Annotated[
-        bool, typer.Option("--ball", help="Write a mirror ball and a diffuse ball under each map, too.")
+        bool,
+        typer.Option(
+            "--ball",
+            help="Write a mirror ball and a diffuse ball under each map, too.",
+            rich_help_panel=IMAGE,
+        ),
     ] = False,
     envmap_sampling: Annotated[
         Sampling,
         typer.Option(
-            help="Give each light the map's integral over its cell, or, as in the paper, one pixel."
+            help="Give each light the map's integral over its cell, or, as in the paper, one pixel.",
+            rich_help_panel=LIGHT,
         ),
     ] = "cell",
     network_alone: NetworkAloneOption = False,
@@ -309,18 +332,19 @@ def relight(
             metavar="PATTERN",
             help="Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.",
             show_default="{dir}/{stem}_{light}",
+            rich_help_panel=BATCH,
         ),
     ] = None,
-    memory: MemoryOption = 2.0,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    overwrite: OverwriteOption = "changed",
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
+    memory: MemoryOption = 2.0,
 ) -> None:
     """Relight photos under environment maps and single lights.
 

@@ -7,8 +7,10 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import DryRunOption, Overwrite, OverwriteOption, Settings, settings_of
+from facerf_cli.cli.options import BATCH, DryRunOption, Overwrite, OverwriteOption, Settings, settings_of
 from facerf_cli.errors import UsageError
+
+_PAIRS = "Pairs"
 
 
 @dataclass(frozen=True)
@@ -45,20 +47,36 @@ def relight_dataset(
     per_subject: Annotated[
         int,
         typer.Option(
-            "--per-subject", min=1, max=100_000, metavar="N", help="Make so many images of each subject."
+            "--per-subject",
+            min=1,
+            max=100_000,
+            metavar="N",
+            help="Make so many images of each subject.",
+            rich_help_panel=_PAIRS,
         ),
     ] = 1000,
     lazy: Annotated[
-        bool, typer.Option("--lazy", help="Write the recipes alone; training relights when it needs them.")
+        bool,
+        typer.Option(
+            "--lazy",
+            help="Write the recipes alone; training relights when it needs them.",
+            rich_help_panel=_PAIRS,
+        ),
     ] = False,
-    memory: Annotated[
-        float, typer.Option(metavar="GB", min=0.1, help="Limit the memory of each job, roughly.")
-    ] = 2.0,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, help="Relight this many subjects at a time.")
+        int,
+        typer.Option(
+            "--jobs", "-j", min=1, help="Relight this many subjects at a time.", rich_help_panel=BATCH
+        ),
     ] = 1,
+    memory: Annotated[
+        float,
+        typer.Option(
+            metavar="GB", min=0.1, help="Limit the memory of each job, roughly.", rich_help_panel=BATCH
+        ),
+    ] = 2.0,
 ) -> None:
     """Relight a prepared dataset under environment maps, into the pairs of `facerf train --dataset`.
 

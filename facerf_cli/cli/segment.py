@@ -44,13 +44,13 @@ def segment(
     context: typer.Context,
     inputs: InputsArgument,
     output: OutputOption,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
+    overwrite: OverwriteOption = "changed",
+    dry_run: DryRunOption = False,
+    jobs: JobsOption = 1,
 ) -> None:
     """Cut people out of photos: matte, hair, skin, garment and other classes, and landmarks.
 

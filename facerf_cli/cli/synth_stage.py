@@ -6,9 +6,18 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.cli.batch import BatchOptions
-from facerf_cli.cli.options import DryRunOption, OutputOption, OverwriteOption, Settings, settings_of
+from facerf_cli.cli.options import (
+    BATCH,
+    IMAGE,
+    DryRunOption,
+    OutputOption,
+    OverwriteOption,
+    Settings,
+    settings_of,
+)
 from facerf_cli.errors import UsageError
 
+_STAGE = "People and stage"
 Renderer = Literal["bake", "mitsuba"]
 Frame = Literal["head", "bust"]
 
@@ -31,38 +40,68 @@ class SynthStage:
 def synth_stage(
     context: typer.Context,
     output: OutputOption,
-    subjects: Annotated[int, typer.Option(min=1, max=9999, help="Photograph so many people.")] = 10,
-    size: Annotated[
-        int, typer.Option(min=64, max=1024, metavar="PX", help="Write square images of this side.")
-    ] = 256,
+    subjects: Annotated[
+        int,
+        typer.Option(min=1, max=9999, metavar="N", help="Photograph so many people.", rich_help_panel=_STAGE),
+    ] = 10,
     face_model: Annotated[
         str,
         typer.Option(
             metavar="NAME|PATH",
             help="Draw people from this face model: builtin, or a .npz of `face-model import`.",
+            rich_help_panel=_STAGE,
         ),
     ] = "builtin",
+    lights: Annotated[
+        int,
+        typer.Option(
+            min=4,
+            max=1000,
+            metavar="N",
+            help="Use so many lights, uniform on the sphere.",
+            rich_help_panel=_STAGE,
+        ),
+    ] = 150,
+    size: Annotated[
+        int,
+        typer.Option(
+            min=64,
+            max=1024,
+            metavar="PX",
+            help="Write square images of this side.",
+            rich_help_panel=IMAGE,
+        ),
+    ] = 256,
+    frame: Annotated[
+        Frame,
+        typer.Option(
+            help="Show the head down to the collar, or a bust down to the chest.", rich_help_panel=IMAGE
+        ),
+    ] = "head",
     renderer: Annotated[
         Renderer,
         typer.Option(
             help="Render with light transport baked once a person (bake), or by path tracing, slow and "
-            "accurate (mitsuba)."
+            "accurate (mitsuba).",
+            rich_help_panel=IMAGE,
         ),
     ] = "bake",
-    lights: Annotated[
-        int, typer.Option(min=4, max=1000, help="Use so many lights, uniform on the sphere.")
-    ] = 150,
-    frame: Annotated[
-        Frame, typer.Option(help="Show the head down to the collar, or a bust down to the chest.")
-    ] = "head",
     transport: Annotated[
-        bool, typer.Option("--transport", help="Keep the baked transport in transport/SUBJECT.safetensors.")
+        bool,
+        typer.Option(
+            "--transport",
+            help="Keep the baked transport in transport/SUBJECT.safetensors.",
+            rich_help_panel=IMAGE,
+        ),
     ] = False,
-    jobs: Annotated[
-        int, typer.Option("--jobs", "-j", min=1, help="Photograph this many people at a time.")
-    ] = 1,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
+    jobs: Annotated[
+        int,
+        typer.Option(
+            "--jobs", "-j", min=1, help="Photograph this many people at a time.", rich_help_panel=BATCH
+        ),
+    ] = 1,
 ) -> None:
     """Photograph synthetic people in a light stage: one light at a time, eight cameras, one exposure.
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -87,8 +87,8 @@ def train(
     preset: Annotated[
         Preset,
         _run(
-            help="Use the networks, losses and optimizer of a preset. default: those of the shipped "
-            "checkpoint; paper: those of the paper; tiny: small networks, for trials."
+            help="Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or "
+            "small ones for trials (tiny)."
         ),
     ] = "default",
     form: Annotated[
@@ -103,11 +103,8 @@ def train(
     stage: Annotated[
         Stage | None,
         _run(
-            help="Train the networks of a stage. reflectance: the Reflectance Network, on textures; "
-            "geometry: the Geometry Network, on rendered heads; joint: both, through the rasterizer; "
-            "light-features, appearance-features: the networks of those options; diffuse-sh: the network "
-            "of that baseline; parsing and portrait: the Parsing Network and the Portrait Network, on whole "
-            "synthetic people.",
+            metavar="STAGE",
+            help=f"Train the networks of a stage: {', '.join(get_args(Stage))}.",
             show_default="joint with --preset paper, else reflectance",
         ),
     ] = None,
@@ -266,6 +263,11 @@ def train(
     ] = False,
 ) -> None:
     """Train the networks on synthetic heads, without a light stage, or on a prepared dataset.
+
+    Stages: reflectance, the Reflectance Network on textures; geometry, the Geometry Network on rendered
+    heads; joint, both through the rasterizer; parsing and portrait, the networks of those names on whole
+    synthetic people; light-features and appearance-features, the networks of those options; diffuse-sh, the
+    network of that baseline.
 
     Synthetic heads are drawn from a face model, and their light transport is baked once; each step draws new
     skins, lights and cameras. A dataset is unwrapped once into DATASET/textures-PX. Training uses its split

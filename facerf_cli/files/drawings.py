@@ -1,10 +1,11 @@
-"""Overviews for people: contact sheets of images, and the frame of an HTML page."""
+"""Overviews for people: contact sheets of images, labels, and the frame of an HTML page."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from html import escape
 
 import numpy as np
+from PIL import Image, ImageDraw
 
 _GAP_PX = 2  # black, between tiles
 _MARK_SIDE, _SMALLEST_MARK_PX = 0.2, 9  # side of a light's mark, in heights of a tile
@@ -19,6 +20,16 @@ def contact_sheet(tiles: np.ndarray, columns: int | None = None) -> np.ndarray:
     padded[:count, :height, :width] = tiles
     sheet = padded.reshape(rows, columns, *padded.shape[1:]).transpose(0, 2, 1, 3, 4)
     return sheet.reshape(rows * padded.shape[1], columns * padded.shape[2], 3)[:-_GAP_PX, :-_GAP_PX]
+
+
+def labels(words: Sequence[str], tile_px: int, height_px: int) -> np.ndarray:
+    """A black strip [height, N * tile, 3], linear, with a word in grey for each of N tiles in a row."""
+    strip = Image.new("L", (tile_px * len(words), height_px))
+    draw = ImageDraw.Draw(strip)
+    for column, word in enumerate(words):
+        draw.text((column * tile_px + 6, height_px // 2), word, fill=200, anchor="lm")
+    grey = np.asarray(strip, np.float32)[..., None] / 255
+    return np.repeat(grey, 3, -1)
 
 
 def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> None:

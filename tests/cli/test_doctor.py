@@ -1,15 +1,19 @@
 """`facerf doctor` shows the installation, and fails if a part is missing."""
 
 import json
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 from safetensors.numpy import save_file
 
 from facerf_cli import __version__
-from facerf_cli.cli.doctor import MISSING
+from facerf_cli.cli.doctor import EXTRAS, MISSING
 from facerf_cli.cli.items import doctor_facts as doctor
 from facerf_cli.main import main
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -27,9 +31,10 @@ def test_one_screen_with_versions_licences_and_configuration(
     out = capsys.readouterr().out
     assert len(out.splitlines()) <= 30 and max(map(len, out.splitlines())) <= 100
     words = " ".join(out.split())
-    assert f"version {__version__}" in words and "torch uses cpu" in words and "ocio://default" in words
-    assert "excludes commercial use" in words and "mine, MIT" in words and "240 heads" in words
-    assert "pytest" not in words  # developers' tools
+    assert f"facerf {__version__}, Python" in words and "device cpu" in words and "ocio://default" in words
+    assert "Boost Software License" in words and "mine: MIT; 240 heads" in words
+    assert "pytest" not in words and "nbclient" not in words  # developers' tools
+    assert "{" not in words and "None" not in words
 
 
 def test_the_screen_leaves_nested_provenance_to_json(
@@ -49,6 +54,50 @@ def test_the_same_as_json(checkpoint: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(["doctor", "--json", "--checkpoint", str(checkpoint)]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["assets"]["checkpoint"]["licence"] == "MIT" and "torch" in facts["packages"]
+
+
+@pytest.fixture
+def lacking(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Packages that seem not to be installed, in what seems to be this version's metadata."""
+    absent: set[str] = set()
+
+    def version(package: str) -> str:
+        if package in absent:
+            raise metadata.PackageNotFoundError(package)
+        return "1.2"
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"].items()
+    listed = [*project["dependencies"]]
+    listed += [f'{line}; extra == "{name}"' for name, lines in extras for line in lines]
+    monkeypatch.setattr(metadata, "requires", lambda name: listed)
+    monkeypatch.setattr(metadata, "version", version)
+    return absent
+
+
+def test_an_extra_that_is_not_there_is_named_with_its_command(
+    lacking: set[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lacking |= {"mitsuba", "ruff"}
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert "synth        not installed; pip install 'facerf[synth]' adds `synth-stage --renderer" in out
+    assert "ray          ray 1.2, for `--ray`, on clusters" in out and "ruff" not in out
+    assert len(out.splitlines()) <= 30
+
+
+def test_a_package_that_is_needed_is_named_with_its_command(
+    lacking: set[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    lacking.add("torch")
+    assert main(["doctor"]) == 1
+    words = " ".join(capsys.readouterr().out.split())
+    assert "torch MISSING" in words and "to add what is missing: pip install 'torch>=2.5'" in words
+
+
+def test_every_extra_for_users_has_its_use() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(EXTRAS) == set(extras) - {"dev"}
 
 
 def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

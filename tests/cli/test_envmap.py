@@ -3,7 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.images import read_image
+from facerf_cli.cli.items.envmap_sheet import write_sheet
+from facerf_cli.cli.lights import collect_setups
+from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
 from facerf_cli.synth.sky.skies import draw_sky
 
@@ -24,12 +26,52 @@ def test_writes_seeded_maps_and_skips_finished_ones(
     assert main(line) == 0
     assert capsys.readouterr().out == "" and written[0].stat().st_mtime_ns == before
     assert main([*line, "--overwrite", "always"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert len(capsys.readouterr().out.splitlines()) == 4
+
+
+def test_the_contact_sheet_has_a_tile_for_each_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["envmap", "-o", str(tmp_path), "--count", "4", "--size", "32", "--kind", "overcast"]
+    assert main(line) == 0
+    sheet = tmp_path / "envmaps.png"
+    pixels = read_image(sheet).pixels
+    tiles = [tile for row in np.array_split(pixels, 2) for tile in np.array_split(row, 2, 1)]
+    assert all(0.05 < tile.mean() < 0.9 for tile in tiles)  # no tile is black, none is clipped
+    sheet.unlink()
+    capsys.readouterr()
+    assert main(line) == 0  # only the sheet is made again
+    assert capsys.readouterr().out.splitlines() == [str(sheet)]
+    np.testing.assert_array_equal(read_image(sheet).pixels, pixels)
+
+
+def test_a_tile_shows_the_ball_lit_from_where_the_map_is_bright(tmp_path: Path) -> None:
+    pixels = np.zeros((16, 32, 3), np.float32)
+    pixels[6:10, 6:10] = 0.02  # dim, at u = 0.25: the image's right
+    write_exr(tmp_path / "right.exr", pixels)
+    write_sheet([tmp_path / "right.exr"], tmp_path / "sheet.png")
+    sheet = read_image(tmp_path / "sheet.png").pixels
+    height, width = 96, 192
+    assert sheet.shape == (height + 16, width + height, 3)
+    bright = sheet[:height, :width].mean(-1) > 0.5  # of a map exposed for display
+    np.testing.assert_array_equal(np.argwhere(bright).min(0), (36, 36))
+    np.testing.assert_array_equal(np.argwhere(bright).max(0), (59, 59))
+    left, right = np.split(sheet[:height, width:].mean(-1), 2, 1)
+    assert right.mean() > 3 * left.mean() and (right > 0.1).mean() > 0.5  # shaded, not a reflection
+    assert sheet[height:].max() > 0.2  # the name
+
+
+def test_a_folder_of_maps_is_read_without_its_sheet(tmp_path: Path) -> None:
+    maps = tmp_path / "maps"
+    assert main(["envmap", "-o", str(maps), "--count", "2", "--size", "32"]) == 0
+    setups = collect_setups([str(maps)], None, [], tmp_path / "out", 0, ())
+    assert [setup.envmap for setup in setups] == sorted(maps.glob("*.exr")) and len(setups) == 2
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["envmap", "-o", str(tmp_path / "new"), "--kind", "sun", "--dry-run", "--count", "2"]) == 0
-    assert capsys.readouterr().out.splitlines() == [f"{tmp_path}/new/0000{i}_sun.exr" for i in range(2)]
+    maps = [f"{tmp_path}/new/0000{i}_sun.exr" for i in range(2)]
+    assert capsys.readouterr().out.splitlines() == [*maps, f"{tmp_path}/new/envmaps.png"]
     assert not (tmp_path / "new").exists()
 
 

@@ -1,7 +1,6 @@
 """The device, assets, colour configuration and cache that `facerf doctor` shows."""
 
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +32,7 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
             "parsing": _of_people(parse.SHIPPED),
             "portrait": _of_people(portrait_field.SHIPPED),
             "detector": {"licence": DETECTOR_LICENCE},
-            "extra dlib": _extra_models(),
+            "dlib": _extra_models(),
         },
         "colour": _colour_configuration(),
         "cache": {"folder": platformdirs.user_cache_dir("facerf")},
@@ -42,10 +41,11 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
 
 def _device(settings: Settings) -> dict[str, Any]:
     device = torch_device(settings)
-    name = torch.cuda.get_device_name(device) if device.type == "cuda" else platform.processor() or "cpu"
+    built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"this torch is {built}"
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return {
-        "torch uses": f"{device} ({name})",
+        "uses": f"{device} ({name})",
         "threads": torch.get_num_threads(),
         "memory": f"{memory:.0f} GiB",
         "seed": settings.seed,
@@ -81,12 +81,12 @@ def _extra_models() -> dict[str, str]:
     """The models of the extra `dlib`, which may not be used commercially."""
     try:
         return {
-            "points": PREDICTOR_LICENCE,
+            "licence": PREDICTOR_LICENCE,
             "size": _size(predictor_path()),
             "recognition": RECOGNITION_LICENCE,
         }
     except FacerfError:
-        return {"points": "not installed (pip install 'facerf[dlib]'; its licence excludes commercial use)"}
+        return {"name": "not installed (an extra, see above)"}
 
 
 def _colour_configuration() -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import torch
-from PIL import Image, ImageDraw
 from torch import Tensor
 
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
@@ -11,6 +10,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import render_face, see_face
+from facerf_cli.files.drawings import labels
 from facerf_cli.light.envmap import ball
 from facerf_cli.network.inputs import resize
 
@@ -38,7 +38,7 @@ def draw_estimate(head: Head, model: MorphableModel, explained: Tensor, envmap: 
     margin = (TILE_PX - _BALL_PX) // 2
     balls = np.pad(both.clip(0, 1), ((0, 0), (margin, margin), (margin, margin), (0, 0)))
     tiles = np.concatenate([*faces, *balls], 1)
-    return np.concatenate([_labels(tiles.shape[1]), tiles])
+    return np.concatenate([labels(_LABELS, TILE_PX, _LABEL_PX), tiles])
 
 
 def _explained_in_crop(head: Head, model: MorphableModel, explained: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -58,13 +58,3 @@ def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.n
     bright, dark = error.clip(0, 0.5), (-error).clip(0, 0.5)
     shown = np.stack([0.5 + bright - dark, 0.5 - bright - dark, 0.5 - bright + dark], -1)
     return np.asarray(srgb_to_linear(shown.astype(np.float32)))
-
-
-def _labels(width_px: int) -> np.ndarray:
-    """A strip [h, W, 3], linear, with a word over each tile."""
-    strip = Image.new("L", (width_px, _LABEL_PX))
-    draw = ImageDraw.Draw(strip)
-    for column, label in enumerate(_LABELS):
-        draw.text((column * TILE_PX + 6, 4), label, fill=200)
-    grey = np.asarray(strip, np.float32)[..., None] / 255
-    return np.repeat(grey, 3, -1)

@@ -1,0 +1,66 @@
+"""The help: verbs in the order of a day, options in panels, texts of a line or two at any width."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import typer.main
+
+from facerf_cli import manpages
+from facerf_cli.main import app, main
+
+# Options whose value is a small language, which their help explains.
+LANGUAGES = {"envmap", "light", "light_from", "reflectance", "aov", "background"}
+MOST, MOST_OF_LANGUAGE = 140, 260  # characters: two lines of help, or four
+FEW = 8  # options that need no panels
+
+
+def commands() -> Iterator[tuple[str, Any]]:
+    """Every verb, and every protocol of evaluate and face-model, by name."""
+    for name, command in typer.main.get_command(app).commands.items():  # type: ignore[attr-defined]
+        yield from getattr(command, "commands", {name: command}).items()
+
+
+COMMANDS = dict(commands())
+
+
+def test_the_order_is_that_of_a_day(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
+    first = [line.split()[0] for line in lines if line]
+    order = ["Photos", "relight", "estimate-light", "predict-olat", "segment", "fit-geometry"]
+    order += ["Light", "convert-light", "envmap", "Data,", "synth-stage", "prepare-dataset"]
+    order += ["relight-dataset", "train", "evaluate", "Installation", "doctor", "face-model"]
+    assert [word for word in first if word in order] == order
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_texts_are_short(name: str) -> None:
+    long = [
+        option.name
+        for option in COMMANDS[name].params
+        if len(option.help or "") > (MOST_OF_LANGUAGE if option.name in LANGUAGES else MOST)
+    ]
+    assert not long
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_options_of_a_long_help_stand_in_panels(name: str) -> None:
+    options = [option for option in COMMANDS[name].params if option.param_type_name == "option"]
+    bare = {option.name for option in options if not option.rich_help_panel and not option.required}
+    assert len(options) <= FEW or bare <= {"output"}
+    panels = list(dict.fromkeys(option.rich_help_panel for option in options if option.rich_help_panel))
+    assert "Batch" not in panels[:-1]
+
+
+def test_paragraphs_fill_the_width() -> None:
+    help_text = COMMANDS["estimate-light"].help
+    assert "\n" not in help_text.replace("\n\n", "") and help_text.count("\n\n") == 2
+
+
+def test_man_pages_have_the_panels_as_subsections() -> None:
+    page = manpages.pages()["facerf-estimate-light.1"]
+    panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
+    assert panels == ["Light", "Method", "Face", "Image", "Batch"]
+    top = manpages.pages()["facerf.1"]
+    assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
