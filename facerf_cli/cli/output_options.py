@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from facerf_cli.cli.options import IMAGE
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 
@@ -23,6 +24,7 @@ FormatOption = Annotated[
         help="Write each image as some of exr (half floats, with layers) and tiff (32-bit floats), both "
         "scene-linear, and png, png16 (16 bits) and jpg, exposed for a display.",
         show_default="exr,png; with -o - png",
+        rich_help_panel=IMAGE,
     ),
 ]
 ColourspaceOption = Annotated[
@@ -33,11 +35,16 @@ ColourspaceOption = Annotated[
         help="Write EXR and TIFF in this colour space: ACEScg, lin_rec2020, or any name of the OCIO "
         "configuration.",
         show_default="linear Rec.709",
+        rich_help_panel=IMAGE,
     ),
 ]
 CompressionOption = Annotated[
     Compression,
-    typer.Option("--compression", help="Compress EXR files; zip, zips, piz and rle lose nothing."),
+    typer.Option(
+        "--compression",
+        help="Compress EXR files; zip, zips, piz and rle lose nothing.",
+        rich_help_panel=IMAGE,
+    ),
 ]
 ViewOption = Annotated[
     str,
@@ -46,6 +53,7 @@ ViewOption = Annotated[
         metavar="soft|none|aces|NAME",
         help="Show PNG and JPEG by the sRGB curve with a soft shoulder above 0.8; clipped at 1; by the SDR "
         "view of ACES 2; or by a view of the OCIO configuration.",
+        rich_help_panel=IMAGE,
     ),
 ]
 OcioOption = Annotated[
@@ -55,6 +63,7 @@ OcioOption = Annotated[
         metavar="FILE",
         help="Look up colour spaces and views in this OpenColorIO configuration.",
         show_default="$OCIO, or the built-in one",
+        rich_help_panel=IMAGE,
     ),
 ]
 

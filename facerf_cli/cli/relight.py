@@ -245,7 +245,8 @@ def relight(
         ExposureGroup,
         typer.Option(
             help="Choose an exposure for each photo, or from the first one for a whole folder or sequence "
-            "of frames."
+            "of frames.",
+            rich_help_panel=IMAGE,
         ),
     ] = "photo",
     view: ViewOption = OutputOptions.view,
@@ -297,6 +298,7 @@ def relight(
             help="Change only what a grey image, or its alpha, of the photo's size shows; of each photo its "
             "own from a folder, or by a pattern (mattes/{stem}.png).",
             show_default=False,
+            rich_help_panel=IMAGE,
         ),
     ] = None,
     photo_of_stack: Annotated[
