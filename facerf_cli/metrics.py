@@ -9,7 +9,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from skimage.metrics import structural_similarity
 
 from facerf_cli.colour import lab_d65, luminance
 
@@ -17,10 +17,7 @@ PSNR_HIGHEST_DB = 100.0  # reported for equal images, whose PSNR is infinite
 _SMALLEST = 1e-12  # of a denominator; avoids 0 / 0 for a black prediction
 
 # SSIM as Wang et al. (2004) define it, for a data range of 1.
-_SSIM_SIGMA_PX = 1.5
-_SSIM_TRUNCATE = 3.5  # standard deviations: a window of 11 pixels
-_SSIM_REACH_PX = 5
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+_SSIM_REACH_PX = 5  # of its window
 
 # Skin tones by the lowest ITA in degrees of each class (Del Bino and Bernerd, 2013).
 TONES = {
@@ -115,7 +112,10 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     shape = (*weight.shape, -1)
     p = np.clip(scale * prediction[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
     t = np.clip(truth[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
-    similar = _ssim_map(p, t).mean(-1)
+    _, similar = structural_similarity(
+        p, t, data_range=1, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
+    )
+    similar = similar.mean(-1)
     return float((weight * similar).sum() / weight.sum())
 
 
@@ -189,18 +189,6 @@ def _box(mask: np.ndarray, margin_px: int) -> tuple[slice, slice]:
         return slice(max(0, at[0] - margin_px), at[-1] + 1 + margin_px)
 
     return span(mask.sum(1)), span(mask.sum(0))
-
-
-def _ssim_map(p: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the structural similarity [H, W, C] of images [H, W, C] at each pixel; Wang et al., eq. 13."""
-    maps = np.stack([p, t, p * p, t * t, p * t])
-    mean_p, mean_t, square_p, square_t, product = gaussian_filter(
-        maps, _SSIM_SIGMA_PX, truncate=_SSIM_TRUNCATE, axes=(1, 2)
-    )
-    variance_p, variance_t = square_p - mean_p**2, square_t - mean_t**2
-    covariance = product - mean_p * mean_t
-    similar = (2 * mean_p * mean_t + _SSIM_C1) * (2 * covariance + _SSIM_C2)
-    return similar / ((mean_p**2 + mean_t**2 + _SSIM_C1) * (variance_p + variance_t + _SSIM_C2))
 
 
 @dataclass(frozen=True)

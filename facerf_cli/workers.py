@@ -1,4 +1,7 @@
-"""Process items one after another, in processes of this machine (`--jobs`), or as tasks of Ray (`--ray`)."""
+"""Process items one after another, in processes of this machine (`--jobs`), or as tasks of Ray (`--ray`).
+
+A process that is killed costs its own item; in joblib's and the standard library's pools all that run.
+"""
 
 import logging
 import os

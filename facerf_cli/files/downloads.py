@@ -1,4 +1,7 @@
-"""Downloads of published files into the user's cache: resumed after a broken connection, then verified."""
+"""Downloads of published files into the user's cache: resumed after a broken connection, then verified.
+
+By hand, since no small library resumes, bounds the size and locks against a second process.
+"""
 
 import hashlib
 import http.client

@@ -35,9 +35,9 @@ _FEWEST_DIRECTIONS, _DIRECTIONS_PER_COEFFICIENT = 2048, 10  # of its quadrature
 def sh_basis(directions: Tensor, order: int) -> Tensor:
     """Y_lm [..., (order + 1)^2] in unit directions [..., 3], in their precision; differentiable.
 
-    They are polynomials in x, y, z, which are regular at the poles: the associated Legendre functions over
-    sin^m theta by their recurrence in l (Sloan, *Stupid Spherical Harmonics Tricks*, 2008, appendix A1),
-    times the real and imaginary part of (x + i y)^m.
+    scipy's sph_harm_y has no gradient and no GPU. These are polynomials in x, y, z, which are regular at
+    the poles: the associated Legendre functions over sin^m theta by their recurrence in l (Sloan, *Stupid
+    Spherical Harmonics Tricks*, 2008, appendix A1), times the real and imaginary part of (x + i y)^m.
     """
     if not 0 <= order <= MOST_ORDER:
         raise InputError(

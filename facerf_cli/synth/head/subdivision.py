@@ -1,4 +1,8 @@
-"""Loop's subdivision of a triangle mesh (*Smooth Subdivision Surfaces Based on Triangles*, 1987)."""
+"""Loop's subdivision of a triangle mesh (*Smooth Subdivision Surfaces Based on Triangles*, 1987).
+
+As a matrix from old to new vertices, which serves all shapes, colours and labels of a mesh at once; trimesh's
+`subdivide_loop` gives the vertices of one shape.
+"""
 
 import math
 
