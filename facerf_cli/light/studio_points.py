@@ -26,6 +26,8 @@ def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     """Unit directions [n, 3] of a far light and its share [n] in each; a surface that faces it receives 1."""
     assert light.azel_deg is not None
     middle = azel_to_direction(*light.azel_deg)
+    if light.size_deg == 0:  # to the last bit
+        return middle[None], torch.ones(1)
     wide = 2 * math.tan(math.radians(light.size_deg / 2))
     directions = F.normalize(middle + wide * _grid(middle, light.size_deg), dim=1)
     return directions, torch.ones(len(directions)) / (directions @ middle).sum()

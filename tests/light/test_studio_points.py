@@ -63,7 +63,7 @@ def test_a_soft_far_light_is_as_strong_as_a_hard_one(size_deg: float) -> None:
     torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)))
     torch.testing.assert_close(torch.nn.functional.normalize(shares @ directions, dim=0), middle)
     widest = math.degrees(math.acos(min(1.0, float((directions @ middle).min()))))
-    assert size_deg / 3 <= widest <= 0.75 * size_deg  # of a square: toward its corners
+    assert size_deg / 3 <= widest <= 0.75 * size_deg + 0.1  # of a square: toward its corners
 
 
 def test_stops_double_and_colours_multiply() -> None:
