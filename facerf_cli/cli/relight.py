@@ -386,6 +386,7 @@ def relight(
     check_companion(photo_of_stack, "--photo")
     if aov and "exr" not in formats:
         raise UsageError("--aov: only EXR has layers; add exr to --format")
+    shown: Composite = composite or ("photo" if pose is None else "face")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))
     work = Relight(
@@ -394,7 +395,7 @@ def relight(
         rig=lights,
         sampling=envmap_sampling,
         pose=pose,
-        composite=composite or ("photo" if pose is None else "face"),
+        composite=shown,
         background=behind,
         background_blur=background_blur / 100,
         aov=parse_aov(aov),
@@ -403,7 +404,7 @@ def relight(
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
         output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
-        reflectance=reflectance,
+        reflectance="field" if shown == "face" and reflectance == "portrait" else reflectance,
         network_alone=network_alone,
         name=pattern,
         exposure_group=exposure_group,

@@ -394,3 +394,22 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
     assert relight(given, tmp_path / "a", *near, photo=stack) == 1
     assert "a stack holds far lights" in capsys.readouterr().err
     assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0
+
+
+def test_a_group_shares_the_exposure_of_its_first_photo(given: Path, tmp_path: Path) -> None:
+    """A darker frame, which by itself would be made as bright as the first."""
+    photo = read_image(PHOTO).pixels
+    frames = tmp_path / "plate"
+    for number, pixels in enumerate((photo, 0.4 * photo)):
+        write_exr(frames / f"shot.{number:04d}.exr", pixels)
+    line = ["relight", str(frames), "--light", "60,10", "--landmarks", str(given / "astronaut.json")]
+    fixed = ["--reflectance", "field", "--composite", "face", "--format", "png", "--exposure", "face"]
+    exposures = {}
+    for group in ("photo", "sequence"):
+        output = tmp_path / group
+        assert main([*line, *fixed, "--exposure-group", group, "-o", str(output)]) == 0
+        rows = map(json.loads, (output / "report.jsonl").read_text().splitlines())
+        exposures[group] = {row["item"]: next(iter(row["exposure_ev"].values())) for row in rows}
+    first, second = "shot.0000", "shot.0001"
+    assert exposures["photo"][second] > exposures["photo"][first] + 1
+    assert exposures["sequence"][first] == exposures["sequence"][second] == exposures["photo"][first]
