@@ -14,6 +14,7 @@ _SURE, _UNSURE = 0.6, 0.35  # least scores of the words
 _SMALL_PX, _LARGE_PX = 40.0, 160.0  # extents of a face that is too small, and large enough
 _NARROW, _FRONTAL = 0.15, 0.4  # distance of the eyes over the face's extent, in profile and from the front
 _OFF = 0.05  # expected error of the landmarks, in extents, at which they are worthless
+SUPPORTED_YAW_DEG, _LOST_YAW_DEG = 45.0, 75.0  # turn of a head that the fit supports, and that it loses
 _COVERING = ("glasses", "hand", "headwear")
 
 
@@ -39,8 +40,11 @@ class Confidence:
         return min(self.factors, key=lambda name: self.factors[name])
 
 
-def confidence_in(face: FoundFace | FoundBox) -> Confidence:
-    """Rate a face: how sure its landmarks are, its size, its turn and what covers it."""
+def confidence_in(face: FoundFace | FoundBox, yaw_deg: float = 0.0) -> Confidence:
+    """Rate a face: how sure its landmarks are, its size, its turn and what covers it.
+
+    `yaw_deg` is the turn of the head that was fitted to it.
+    """
     seen, extent_px = face.seen, face.seen.extent_px
     left, right = seen.landmarks_px[list(OUTER_EYE_CORNERS)]
     eyes = float(np.linalg.norm(right - left)) / max(extent_px, 1e-6)
@@ -53,6 +57,7 @@ def confidence_in(face: FoundFace | FoundBox) -> Confidence:
             "small": _ramp(extent_px, _SMALL_PX, _LARGE_PX),
             "profile": _ramp(eyes, _NARROW, _FRONTAL),
             "covered": _ramp(covered, 0.6, 0.1),
+            "turned": _ramp(abs(yaw_deg), _LOST_YAW_DEG, SUPPORTED_YAW_DEG),
         }
     )
 

@@ -50,6 +50,12 @@ def test_what_makes_a_photo_hard_is_named(reason: str, hard: FoundFace) -> None:
     assert confidence.word == "doubtful" and confidence.reason == reason
 
 
+def test_a_head_that_is_turned_too_far_is_doubtful() -> None:
+    assert confidence_in(face(), -45.0).score == confidence_in(face()).score
+    turned = confidence_in(face(), -72.0)
+    assert turned.word == "doubtful" and turned.reason == "turned"
+
+
 def test_the_words_follow_the_score() -> None:
     words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
     assert words == ["sure", "unsure", "doubtful"]

@@ -27,7 +27,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.logs import LOGGER_NAME, Provenance
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.confidence import confidence_in
+from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
@@ -51,7 +51,7 @@ class FittedFace:
     def facts(self) -> dict[str, Any]:
         """The face's entries in the report."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found)}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found, pose_deg[0])}
 
 
 def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
@@ -111,11 +111,11 @@ def facts_of_found(faces: Sequence[FaceBox]) -> dict[str, Any]:
     return facts[0] if len(facts) == 1 else {"faces": facts}
 
 
-def confidence_facts(face: FaceBox) -> dict[str, Any]:
+def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
     """A face's confidence for the report; nothing where it was given, or found by dlib."""
     if not isinstance(face, FoundFace | FoundBox):
         return {}
-    confidence = confidence_in(face)
+    confidence = confidence_in(face, yaw_deg)
     factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
     return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
@@ -180,6 +180,15 @@ def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOption
             "`facerf fit-geometry`, or give --landmarks",
             item.input_path,
             100 * head.fit.error_iod,
+        )
+    yaw_deg = rotation_to_pose(head.fit.rotation)[0]
+    if abs(yaw_deg) > SUPPORTED_YAW_DEG:
+        log.warning(
+            "%s: the head is turned by %.0f degrees, and %.0f are supported; look at it with "
+            "`facerf fit-geometry`",
+            item.input_path,
+            abs(yaw_deg),
+            SUPPORTED_YAW_DEG,
         )
     return head
 
