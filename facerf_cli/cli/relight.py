@@ -38,6 +38,7 @@ from facerf_cli.cli.output_options import (
     check_stdout,
     config_of,
     parse_formats,
+    refuse_unused,
 )
 from facerf_cli.cli.photo_options import (
     FaceOption,
@@ -260,6 +261,7 @@ def relight(
     """
     settings = settings_of(context)
     formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
+    refuse_unused(context, formats)
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
@@ -283,8 +285,6 @@ def relight(
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     if matte is not None and not matte.is_file():
         raise UsageError(f"--matte {matte}: no such file; give one that exists")
-    if aov and "exr" not in formats:
-        raise UsageError("--aov: only EXR has layers; add exr to --format")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))
     work = Relight(
