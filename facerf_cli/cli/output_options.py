@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.options import IMAGE
+from facerf_cli.cli.options import IMAGE, refuse_given
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 
@@ -15,6 +15,14 @@ Format = Literal["exr", "png", "png16", "tiff", "jpg"]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
 SUFFIXES: dict[Format, str] = {"exr": ".exr", "png": ".png", "png16": ".png", "tiff": ".tif", "jpg": ".jpg"}
 STDOUT = Path("-")
+_DISPLAYED: tuple[Format, ...] = ("png", "png16", "jpg")
+# Options that do nothing without some of these formats.
+_NEEDS: dict[str, tuple[Format, ...]] = {
+    "aov": ("exr",),
+    "compression": ("exr",),
+    "output_colourspace": ("exr", "tiff"),
+    "view": _DISPLAYED,
+}
 
 FormatOption = Annotated[
     str,
@@ -83,6 +91,11 @@ class OutputOptions:
         """Suffixes of the files of each image."""
         return tuple(SUFFIXES[name] for name in self.formats)
 
+    @property
+    def shown_suffix(self) -> str | None:
+        """The suffix of the first format that is exposed for a display."""
+        return next((SUFFIXES[name] for name in self.formats if name in _DISPLAYED), None)
+
 
 def parse_formats(text: str) -> tuple[Format, ...]:
     """Parse `--format`; raises UsageError for an unknown format, or two with the same file name."""
@@ -95,6 +108,13 @@ def parse_formats(text: str) -> tuple[Format, ...]:
     if "png" in formats and "png16" in formats:
         raise UsageError("--format: png and png16 would both be NAME.png; give one of them")
     return formats
+
+
+def refuse_unused(context: typer.Context, formats: tuple[Format, ...]) -> None:
+    """Raise UsageError for an option that none of the formats has a use for."""
+    for name, needed in _NEEDS.items():
+        if not set(needed) & set(formats):
+            refuse_given(context, (name,), f"is for {', '.join(needed)}; add that to --format")
 
 
 def config_of(path: Path | None) -> str:

@@ -44,6 +44,7 @@ from facerf_cli.cli.output_options import (
     check_stdout,
     config_of,
     parse_formats,
+    refuse_unused,
 )
 from facerf_cli.cli.photo_options import (
     FaceOption,
@@ -361,6 +362,7 @@ def relight(
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
     formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
+    refuse_unused(context, formats)
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
     parse_pose(pose)
@@ -384,8 +386,6 @@ def relight(
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
     check_companion(matte, "--matte")
     check_companion(photo_of_stack, "--photo")
-    if aov and "exr" not in formats:
-        raise UsageError("--aov: only EXR has layers; add exr to --format")
     shown: Composite = composite or ("photo" if pose is None else "face")
     of_light: Kind = "field" if reflectance == "portrait" else reflectance
     lit = photo_lights(light_from or (), output, LightOptions(for_other_photos(photo), of_light))

@@ -123,7 +123,10 @@ def test_a_terminal_gets_no_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
         (("--output-colourspace", "sRGB"), "--output-colourspace sRGB: EXR and TIFF are linear"),
         (("--ocio", "missing.ocio"), "--ocio missing.ocio: no such file; give"),
         (("--format", "gif"), "--format 'gif': no such format; give some of exr, png, png16, tiff, jpg"),
-        (("--format", "png", "--aov", "normal"), "--aov: only EXR has layers; add exr to --format"),
+        (("--format", "png", "--aov", "normal"), "--aov is for exr; add that to --format"),
+        (("--format", "jpg", "--output-colourspace", "ACEScg"), "--output-colourspace is for exr, tiff; add"),
+        (("--format", "exr,tiff", "--view", "none"), "--view is for png, png16, jpg; add that to --format"),
+        (("--format", "tiff", "--compression", "zip"), "--compression is for exr; add that to --format"),
     ],
 )
 def test_wrong_options_are_one_line(

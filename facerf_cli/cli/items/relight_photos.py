@@ -299,14 +299,10 @@ def _write_setups(
             if setup.names:
                 each = map(shown.composer.light_layer, shown.apart(setup))
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
-            write_output(
-                path,
-                _output(image, layers, shown.alpha, work),
-                ev,
-                work.output,
-                {**metadata, "facerf:exposure_ev": ev},
-            )
-            log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.suffixes[-1]), ev)
+            written = _output(image, layers, shown.alpha, work)
+            write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
+            if work.output.shown_suffix:
+                log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.shown_suffix), ev)
             yield path, ev
 
 
