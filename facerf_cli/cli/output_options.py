@@ -29,8 +29,8 @@ FormatOption = Annotated[
     typer.Option(
         "--format",
         metavar="NAME,...",
-        help="Write each image as some of exr (half floats, with layers) and tiff (32-bit floats), both "
-        "scene-linear, and png, png16 (16 bits) and jpg, exposed for a display.",
+        help="Write each image as exr (half floats, layers), tiff (floats), png, png16 (16 bits), jpg; "
+        "these three exposed for a display.",
         show_default="exr,png; with -o - png",
         rich_help_panel=IMAGE,
     ),
@@ -59,8 +59,8 @@ ViewOption = Annotated[
     typer.Option(
         "--view",
         metavar="soft|none|aces|NAME",
-        help="Show PNG and JPEG by the sRGB curve with a soft shoulder above 0.8; clipped at 1; by the SDR "
-        "view of ACES 2; or by a view of the OCIO configuration.",
+        help="Show PNG and JPEG by the sRGB curve with a soft shoulder, clipped at 1, by ACES 2, or by a "
+        "view of the OCIO configuration.",
         rich_help_panel=IMAGE,
     ),
 ]

@@ -175,13 +175,10 @@ def relight(
         list[str] | None,
         typer.Option(
             "--light",
-            metavar="[NAME=]AZ,EL[,R,G,B][;...]|KEY=VALUE;...|RIG.toml|PRESET",
-            help="Relight under a single light from an azimuth and elevation in degrees (AZ > 0: from the "
-            "image's right), or under several at once, separated by ;. Or under a light by its keys: "
-            "at=X,Y,Z (metres from the face) or from=AZ,EL, with rgb, kelvin, stops, size, size_deg, spot; "
-            "az=FROM:TO:N renders frames. Or under a rig file or a preset: beauty, butterfly, loop, "
-            "rembrandt, rim, split. Repeatable. Lights with names (key=40,20 or name=key;...) shine "
-            "together in one image, whose EXR has a layer for each.",
+            metavar="LIGHT",
+            help="Relight under AZ,EL[,R,G,B] in degrees (AZ > 0: from the image's right), several by ;, "
+            "a light by its keys (at=, from=, size=, kelvin=, ...), a rig file or a preset "
+            "(rembrandt). NAME= makes a layer. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -296,8 +293,8 @@ def relight(
         Path | None,
         typer.Option(
             metavar="FILE|DIR|PATTERN",
-            help="Change only what a grey image, or its alpha, of the photo's size shows; of each photo its "
-            "own from a folder, or by a pattern (mattes/{stem}.png).",
+            help="Change only what a grey image, or its alpha, of the photo's size shows "
+            "(mattes/{stem}.png: of each its own).",
             show_default=False,
             rich_help_panel=IMAGE,
         ),
@@ -329,6 +326,12 @@ def relight(
     ] = "cell",
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
+    face: FaceOption = "largest",
+    landmarks: LandmarksOption = None,
+    geometry: GeometryOption = None,
+    landmarks_from: LandmarksFromOption = "facerf",
+    input_colourspace: InputColourspaceOption = None,
+    face_model: FaceModelOption = "builtin",
     name: Annotated[
         str | None,
         typer.Option(
@@ -338,12 +341,6 @@ def relight(
             rich_help_panel=BATCH,
         ),
     ] = None,
-    face: FaceOption = "largest",
-    landmarks: LandmarksOption = None,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    input_colourspace: InputColourspaceOption = None,
-    face_model: FaceModelOption = "builtin",
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,

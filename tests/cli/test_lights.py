@@ -10,11 +10,7 @@ import torch
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
-<<<<<<< HEAD
 from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations
-=======
-from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations, split_frame
->>>>>>> 2953569227c612ef9be3fea37583edaa96de1c91
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
@@ -191,17 +187,8 @@ def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
 def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None) -> None:
     """Write the balls of the setups with a map, named as `relight --ball` names them."""
     maps = [setup for setup in setups if setup.envmap is not None]
-<<<<<<< HEAD
-    write_balls(
-        maps,
-        [output / "balls" / f"{setup.name}{setup.frame}.exr" for setup in maps],
-        exposure_ev,
-        OutputOptions(),
-    )
-=======
     paths = [output / "balls" / f"{setup.name}{setup.frame}.exr" for setup in maps]
     write_balls(maps, paths, exposure_ev, OutputOptions())
->>>>>>> 2953569227c612ef9be3fea37583edaa96de1c91
 
 
 def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
