@@ -184,10 +184,7 @@ def test_a_psd_has_its_profile(tmp_path: Path) -> None:
     )
 
 
-def test_floats_without_a_stated_space_are_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "facerf")
     values = LEVELS / np.float32(255)
     for name, attributes, lines in (
