@@ -1,7 +1,6 @@
 """ICC profiles, against littleCMS in Pillow."""
 
 import io
-import logging
 from pathlib import Path
 
 import numpy as np
@@ -107,9 +106,8 @@ def test_broken_profiles_are_no_space() -> None:
 
 
 def test_a_profile_of_tables_is_one_line_that_says_what_is_assumed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
     tables = icc_profiles.DISPLAY_P3.replace(b"rTRC", b"A2B0").replace(*(
         name.encode("utf-16-be") for name in ("Display P3", "Scanner 77")
     ))  # fmt: skip

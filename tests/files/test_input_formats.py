@@ -4,6 +4,7 @@ import logging
 import shutil
 import struct
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -184,10 +185,16 @@ def test_a_psd_has_its_profile(tmp_path: Path) -> None:
     )
 
 
-def test_floats_without_a_stated_space_are_one_line(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+def test_the_colour_code_of_a_png(tmp_path: Path) -> None:
+    """A cICP chunk: primaries of P3 (12), the curve of sRGB (13)."""
+    data = save_by_oiio(tmp_path / "a.png", LEVELS).read_bytes()
+    body = b"cICP" + bytes([12, 13, 0, 1])
+    chunk = struct.pack(">I", 4) + body + struct.pack(">I", zlib.crc32(body))
+    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
+    assert read_image(tmp_path / "a.png").colourspace_name == "Display P3"
+
+
+def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "facerf")
     values = LEVELS / np.float32(255)
     for name, attributes, lines in (
