@@ -1,0 +1,105 @@
+"""Exposure of six skins: how bright a face is shown, relit, beside how bright it is in its photo.
+
+    python benchmarks/skin_tones.py --bank DIR [--drawn 24]
+
+One person of a bank of portraits (`facerf train --stage portrait`) in six appearances, from the darkest to
+the lightest skin of those that are drawn, is photographed in one natural light by one exposure, and relit
+to a lamp at the side and to another natural light. Printed: the true albedo of the skin, and the luminance
+that half and a tenth of the face exceed, in the photo and as shown by `--exposure auto` and `face`. Faces
+keep their order, and the ratios of their tones, where shown over photo is alike for all; its spread is the
+figure.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from _common import arguments, required
+
+from facerf_cli.colour import ExposureRule, luminance
+from facerf_cli.composite import Target
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.models import Models, load_models
+from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
+from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
+from facerf_cli.synth.texture_samples import draw_light
+from facerf_cli.synth.transport_bank import StoredView, load_view
+from facerf_cli.training.objective import seeded
+
+SEED, SKINS, LOOK_PX = 17, 6, 128
+LAMP_AZEL_DEG = (60.0, 20.0)
+GAIN = 2.0  # of the photos: white that faces all of the light is this bright
+PERCENTILES = (50, 90)
+RULES: tuple[ExposureRule, ...] = ("auto", "face")
+
+
+def main() -> None:
+    """Print the table."""
+    parser = arguments(__doc__)
+    parser.add_argument("--bank", type=Path)
+    parser.add_argument("--drawn", type=int, default=24)
+    options = parser.parse_args()
+    bank = required(options.bank, "a bank of portraits", "--bank")
+    view = load_view(min(bank.glob("[0-9]*_0.safetensors")))
+    models = load_models(None, "builtin", torch.device("cpu"))
+    looks = [
+        materials_of(view.portrait, draw_appearance(LOOK_PX, seeded(SEED, number)))
+        for number in range(options.drawn)
+    ]
+    looks.sort(key=lambda look: albedo_of_skin(view, look))
+    with torch.no_grad():
+        rows = [measured(models, view, looks[round(k)]) for k in np.linspace(0, len(looks) - 1, SKINS)]
+    print(
+        "skin albedo; half and a tenth of the face exceed, in the photo; as shown: " + ", ".join(rows[0][2])
+    )
+    for albedo, plate, shown in rows:
+        print(
+            f"{albedo:.3f}  {plate.round(3)}  " + "  ".join(str(values.round(3)) for values in shown.values())
+        )
+    for name in rows[0][2]:
+        ratios = np.array([shown[name] / plate for _, plate, shown in rows])
+        spread = 100 * (ratios.max(0) / ratios.min(0) - 1)
+        print(f"{name}: shown over photo {ratios.mean(0).round(2)}, spread {spread.round(1)} %")
+
+
+def skin_of(view: StoredView) -> np.ndarray:
+    """True where the person's skin is seen [S, S]."""
+    return np.asarray(view.portrait.classes.numpy()[..., class_index("skin")] > 127)
+
+
+def albedo_of_skin(view: StoredView, look: MaterialPoints) -> float:
+    """Mean luminance of the skin's true albedo."""
+    albedo = albedo_of(view.portrait, look)[0].permute(1, 2, 0).numpy()
+    return float(luminance(albedo)[skin_of(view)].mean())
+
+
+def measured(
+    models: Models, view: StoredView, look: MaterialPoints
+) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
+    """Albedo of the skin, and the face's luminances in the photo and as shown."""
+    rig, skin = view.portrait.directions, skin_of(view)
+    natural = torch.stack([draw_light(rig, seeded(SEED, number)) for number in range(2)])
+    lamp = torch.zeros_like(natural[:1])
+    lamp[0, (rig @ azel_to_direction(*torch.tensor(LAMP_AZEL_DEG)).float()).argmax()] = 1
+    source = images_under(view.portrait, look, natural[:1])[0]
+    wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
+    gain = GAIN / float(natural[0].sum(0).mean())
+    photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
+    head = head_of(models, photo, find_for("landmarks", photo, "the photo")[0])
+    reflectance = reflectance_of(models, head, "portrait", photo=photo)
+    composition = composition_of(models, photo, head, reflectance, Target(background="none"))
+    shown = {}
+    lit = relit_by(composition, head, reflectance, rig, torch.cat([lamp, natural[1:]]))
+    for light, relit in zip(("lamp", "daylight"), lit, strict=True):
+        face = np.percentile(luminance(composition.image(relit).pixels)[skin], PERCENTILES)
+        for rule in RULES:
+            shown[f"{light} {rule}"] = face * 2 ** composition.exposure_ev(relit, rule)
+    plate = np.percentile(luminance(photo)[skin], PERCENTILES)
+    return albedo_of_skin(view, look), plate, shown
+
+
+if __name__ == "__main__":
+    main()
