@@ -112,10 +112,12 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     shape = (*weight.shape, -1)
     p = np.clip(scale * prediction[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
     t = np.clip(truth[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
+    reach = _SSIM_REACH_PX  # the library refuses images that are smaller than its window
+    p, t = (np.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric") for image in (p, t))
     _, similar = structural_similarity(
         p, t, data_range=1, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
     )
-    similar = similar.mean(-1)
+    similar = similar[reach:-reach, reach:-reach].mean(-1)
     return float((weight * similar).sum() / weight.sum())
 
 

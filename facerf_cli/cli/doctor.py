@@ -16,11 +16,12 @@ MISSING = "MISSING"
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 # Extras of the package (pyproject.toml) for users, and the use of each.
 EXTRAS = {
-    "synth": "`synth-stage --renderer mitsuba`",
+    "synth": "`--renderer mitsuba`",
     "chart": "`prepare-dataset --colour-chart`",
     "face-models": "Basel's models in `face-model import`",
     "tensorboard": "the curves of `train`",
     "ray": "`--ray`, on clusters",
+    "heic": "HEIC photos of phones",
     "dlib": "`--landmarks-from dlib`, not for commercial use",
 }
 _WIDTH, _HEAD = 100, 13  # columns of the screen, and of a section's or part's name

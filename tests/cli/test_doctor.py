@@ -81,7 +81,7 @@ def test_an_extra_that_is_not_there_is_named_with_its_command(
     lacking |= {"mitsuba", "ruff"}
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
-    assert "synth        not installed; pip install 'facerf[synth]' adds `synth-stage --renderer" in out
+    assert "synth        not installed; pip install 'facerf[synth]' adds `--renderer" in out
     assert "ray          ray 1.2, for `--ray`, on clusters" in out and "ruff" not in out
     assert len(out.splitlines()) <= 30
 
