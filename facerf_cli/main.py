@@ -33,11 +33,13 @@ from facerf_cli.cli.relight_dataset import relight_dataset
 from facerf_cli.cli.segment import segment
 from facerf_cli.cli.synth_stage import synth_stage
 from facerf_cli.cli.train import train
+from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
 
 VERBS: tuple[Callable[..., Any], ...] = (
     relight,
+    view,
     estimate_light,
     convert_light,
     predict_olat,
