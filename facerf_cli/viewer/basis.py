@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
-from facerf_cli.colour import auto_exposure_ev
+from facerf_cli.colour import AUTO_EXPOSURE_PERCENTILE, FACE_PERCENTILE, auto_exposure_ev, luminance
 from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
@@ -111,7 +111,8 @@ def light_basis(
     spread = np.sqrt(np.einsum("lhwc,lhwc->hw", images, images) / (3 * len(images)))
     spread = np.maximum(_continued(spread[..., None], seen), 1e-3)
     images /= spread
-    maps, coefficients = factored(images, seen[..., None] * np.sqrt(detail_small * spread), settings.rank)
+    weights = seen[..., None] * np.sqrt(detail_small * spread)
+    maps, coefficients = factored(images, weights, brightness_of(samples), settings.rank)
     maps = np.stack([_continued(one, seen) for one in maps])
     wide = np.ones((*matte.shape, 1), np.float32)
     box.of(wide)[:] = resized(spread, box.height, box.width)
@@ -130,19 +131,33 @@ def light_basis(
     )
 
 
-def factored(images: np.ndarray, weights: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
+def factored(
+    images: np.ndarray, weights: np.ndarray, brightness: np.ndarray, rank: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Maps [K, ...] and coefficients [L, K] whose products come nearest to images [L, ...] under weights.
 
-    By the eigenvectors of the images' Gram matrix: there are far fewer lights than pixels.
+    An image counts in proportion to its `brightness` [L]: one of a light from behind is shown at an exposure
+    that makes it as bright as the others. The images are divided by it in place. By the eigenvectors of the
+    images' Gram matrix: there are far fewer lights than pixels.
     """
+    images /= brightness.reshape(-1, *[1] * (images.ndim - 1))
     flat = images.reshape(len(images), -1)
+    weight = np.broadcast_to(weights, images.shape[1:]).reshape(-1)
     gram = np.zeros((len(flat), len(flat)))
     for columns in np.array_split(np.arange(flat.shape[1]), max(1, flat.size // (1 << 25))):
-        part = flat[:, columns] * weights.reshape(-1)[columns]
+        part = flat[:, columns] * weight[columns]
         gram += part @ part.T
     _, vectors = np.linalg.eigh(gram)
-    coefficients = np.ascontiguousarray(vectors[:, ::-1][:, :rank], np.float32)
-    return (coefficients.T @ flat).reshape(-1, *images.shape[1:]), coefficients
+    chosen = np.ascontiguousarray(vectors[:, ::-1][:, :rank], np.float32)
+    return (chosen.T @ flat).reshape(-1, *images.shape[1:]), chosen * brightness[:, None]
+
+
+def brightness_of(samples: ExposureSamples) -> np.ndarray:
+    """Radiance [L] that the exposure of each light's image makes bright: about 1 over its gain."""
+    skin, person = (luminance(points) for points in (samples.skin, samples.person))
+    face = np.percentile(skin, FACE_PERCENTILE, axis=1) if skin.size else np.zeros(len(skin))
+    most = np.percentile(person, AUTO_EXPOSURE_PERCENTILE, axis=1) / 4
+    return np.asarray(np.maximum(np.maximum(face, most), 1e-6), np.float32)
 
 
 def _under_rig(

@@ -15,9 +15,11 @@ function wordsOf(base64) {
   return new Uint16Array(bytesOf(base64).buffer);
 }
 
-function imageOf(base64, type) {
-  const blob = new Blob([bytesOf(base64)], { type });
-  return createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
+async function imageOf(base64, type) {
+  const image = new Image();
+  image.src = `data:${type};base64,${base64}`;
+  await image.decode();
+  return image;
 }
 
 // A half float's value, from its 16 bits.
@@ -35,11 +37,11 @@ function halvesOf(words) {
 }
 
 // The bytes [R, G, B, A, ...] of an image.
-function pixelsOf(bitmap) {
+function pixelsOf(image) {
   const canvas = document.createElement("canvas");
-  canvas.width = bitmap.width;
-  canvas.height = bitmap.height;
+  canvas.width = image.width;
+  canvas.height = image.height;
   const context = canvas.getContext("2d", { willReadFrequently: true });
-  context.drawImage(bitmap, 0, 0);
-  return context.getImageData(0, 0, bitmap.width, bitmap.height).data;
+  context.drawImage(image, 0, 0);
+  return context.getImageData(0, 0, image.width, image.height).data;
 }

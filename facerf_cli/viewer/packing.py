@@ -17,7 +17,7 @@ from facerf_cli.colour import (
     luminance,
 )
 from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
-from facerf_cli.viewer.basis import ExposureSamples, LightBasis
+from facerf_cli.viewer.basis import ExposureSamples, LightBasis, brightness_of
 
 _PHOTO_QUALITY, _MAP_QUALITY, _STRIP_QUALITY = 93, 88, 82
 _TILE = 8  # a JPEG's blocks: tiles of the atlas begin on them
@@ -92,8 +92,11 @@ def _head(basis: LightBasis) -> list[float]:
 def _exposure(samples: ExposureSamples, coefficients: np.ndarray) -> dict[str, Any]:
     """Factors [K, n, 3] of the samples as bytes, and what `colour.anchored_exposure_ev` compares them with."""
 
+    brightness = brightness_of(samples)[:, None]  # by which `factored` weighs the lights
+    inverse = (coefficients / brightness).T / brightness.T
+
     def factors(points: np.ndarray) -> dict[str, Any]:
-        factor = np.einsum("lk,lnc->knc", coefficients, points)
+        factor = np.einsum("kl,lnc->knc", inverse, points)
         scales = np.maximum(np.abs(factor).reshape(len(factor), -1).max(1, initial=0), 1e-9)
         data = np.round(factor / scales[:, None, None] * _STEPS).astype(np.int8)
         return {"count": points.shape[1], "scales": scales.tolist(), "factors": _bytes(data.tobytes())}
