@@ -28,12 +28,14 @@ from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.texture import inpaint
-from facerf_cli.viewer.frame import Box, resized, small_composition
+from facerf_cli.viewer.frame import PersonBox, resized, small_composition
 
 _LIGHTS_AT_ONCE = 16
 _DARK = 1e-3  # floor of the detail, as a share of its mean: ratios over black are noise
 _MOST_RATIO = 50.0
-_SAMPLES = 512  # pixels of the skin, and as many of the person, by which a page chooses its exposure
+_SKIN_SAMPLES, _PERSON_SAMPLES = 1024, 512  # pixels by which a page chooses its exposure
+_LEAST_BRIGHTNESS, _EVENNESS = 0.03, 0.4  # of a light: floor, as a share of the median; exponent
+_LEAST_SPREAD = 0.05  # of a pixel, as a share of the mean
 _SURE = 0.5  # share from which on a pixel is the person's
 
 
@@ -42,7 +44,7 @@ class BasisSettings:
     """Lights of the rig, singular values that are kept, and pixels along the maps' longer side."""
 
     lights: int = 800
-    rank: int = 96
+    rank: int = 192
     maps_px: int = 256
 
 
@@ -68,7 +70,7 @@ class LightBasis:
     background: np.ndarray  # [H, W, 3] the photo where the person is not, multiplied by that share
     matte: np.ndarray  # [H, W]
     detail: np.ndarray  # [H, W, 3]
-    box: Box  # of the photo, which the maps cover
+    box: PersonBox  # of the photo, which the maps cover
     crop: Crop  # of the photo, around the face
     maps: np.ndarray  # [K, h, w, 3]
     directions: np.ndarray  # [L, 3]
@@ -99,20 +101,20 @@ def light_basis(
     matte = whole.image(none).alpha
     assert matte is not None
     kept = composition_of(models, photo, head, field, Target(matte=matte))
-    box = Box.around(matte)
+    box = PersonBox.around(matte)
     small = small_composition(models, photo, head, field, matte, box, settings.maps_px)
     images, samples, ambient = _under_rig(small, head, field, rig)
     ambient_small = small.image(ambient)
     detail_small, seen = ambient_small.pixels, ambient_small.alpha
     assert seen is not None
-    floor = _DARK * max(float(detail_small.mean()), 1e-9)
-    images /= np.maximum(detail_small, floor)
+    brightness = brightness_of(samples)
+    images /= np.maximum(detail_small, _DARK * max(float(detail_small.mean()), 1e-9))
     images.clip(-_MOST_RATIO, _MOST_RATIO, out=images)
-    spread = np.sqrt(np.einsum("lhwc,lhwc->hw", images, images) / (3 * len(images)))
-    spread = np.maximum(_continued(spread[..., None], seen), 1e-3)
+    images /= brightness[:, None, None, None]
+    spread = _spread(images, seen)
     images /= spread
     weights = seen[..., None] * np.sqrt(detail_small * spread)
-    maps, coefficients = factored(images, weights, brightness_of(samples), settings.rank)
+    maps, coefficients = factored(images, weights, settings.rank)
     maps = np.stack([_continued(one, seen) for one in maps])
     wide = np.ones((*matte.shape, 1), np.float32)
     box.of(wide)[:] = resized(spread, box.height, box.width)
@@ -126,21 +128,17 @@ def light_basis(
         maps=maps,
         directions=rig.numpy(),
         triangles=ConvexHull(rig.double().numpy()).simplices.astype(np.uint16),
-        coefficients=coefficients,
+        coefficients=coefficients * brightness[:, None],
         samples=samples,
     )
 
 
-def factored(
-    images: np.ndarray, weights: np.ndarray, brightness: np.ndarray, rank: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Maps [K, ...] and coefficients [L, K] whose products come nearest to images [L, ...] under weights.
+def factored(images: np.ndarray, weights: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """Maps [K, ...] and orthonormal coefficients [L, K] whose products come nearest to images [L, ...].
 
-    An image counts in proportion to its `brightness` [L]: one of a light from behind is shown at an exposure
-    that makes it as bright as the others. The images are divided by it in place. By the eigenvectors of the
-    images' Gram matrix: there are far fewer lights than pixels.
+    An error counts in proportion to `weights`, which broadcast to an image. By the eigenvectors of the images'
+    Gram matrix: there are far fewer lights than pixels.
     """
-    images /= brightness.reshape(-1, *[1] * (images.ndim - 1))
     flat = images.reshape(len(images), -1)
     weight = np.broadcast_to(weights, images.shape[1:]).reshape(-1)
     gram = np.zeros((len(flat), len(flat)))
@@ -148,16 +146,30 @@ def factored(
         part = flat[:, columns] * weight[columns]
         gram += part @ part.T
     _, vectors = np.linalg.eigh(gram)
-    chosen = np.ascontiguousarray(vectors[:, ::-1][:, :rank], np.float32)
-    return (chosen.T @ flat).reshape(-1, *images.shape[1:]), chosen * brightness[:, None]
+    coefficients = np.ascontiguousarray(vectors[:, ::-1][:, :rank], np.float32)
+    return (coefficients.T @ flat).reshape(-1, *images.shape[1:]), coefficients
 
 
 def brightness_of(samples: ExposureSamples) -> np.ndarray:
-    """Radiance [L] that the exposure of each light's image makes bright: about 1 over its gain."""
+    """A brightness [L] by which the images of lights are divided before they are factored.
+
+    Exposure shows a light from behind as bright as others, so its image counts for more than its radiance
+    says; less than in proportion, since the darkest are the least use.
+    """
     skin, person = (luminance(points) for points in (samples.skin, samples.person))
-    face = np.percentile(skin, FACE_PERCENTILE, axis=1) if skin.size else np.zeros(len(skin))
+    face = np.percentile(skin, FACE_PERCENTILE, axis=1)
     most = np.percentile(person, AUTO_EXPOSURE_PERCENTILE, axis=1) / 4
-    return np.asarray(np.maximum(np.maximum(face, most), 1e-6), np.float32)
+    shown = np.maximum(face, most)
+    floor = max(_LEAST_BRIGHTNESS * float(np.median(shown)), 1e-6)
+    return np.asarray(np.maximum(shown, floor) ** _EVENNESS, np.float32)
+
+
+def _spread(images: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Root mean square [h, w, 1] of each pixel over images [L, h, w, 3], continued over the background."""
+    spread = np.sqrt(np.einsum("lhwc,lhwc->hw", images, images) / (3 * len(images)))
+    inside = spread[seen > _SURE]
+    least = _LEAST_SPREAD * float(inside.mean()) if inside.size else 1.0
+    return np.maximum(_continued(spread[..., None], seen), least)
 
 
 def _under_rig(
@@ -165,7 +177,8 @@ def _under_rig(
 ) -> tuple[np.ndarray, ExposureSamples, Relit]:
     """The small images [L, h, w, 3] of a rig's lights, samples, and the head under all lights at once."""
     images = np.zeros(0, np.float32)
-    skin, person = (_spaced(mask) for mask in _masks(field))
+    skin_mask, person_mask = _masks(field)
+    skin, person = _spaced(skin_mask, _SKIN_SAMPLES), _spaced(person_mask, _PERSON_SAMPLES)
     coarse: list[Tensor] = []
     texture, surround = torch.zeros(()), torch.zeros(())
     for index, relit in enumerate(_single_lights(small, head, field, rig)):
@@ -199,11 +212,13 @@ def _masks(field: PortraitField) -> tuple[Tensor, Tensor]:
     return classes[class_index("skin")] > _SURE, 1 - classes[0] > _SURE
 
 
-def _spaced(mask: Tensor) -> Tensor:
-    """Indices of `_SAMPLES` of a mask's pixels at most, evenly spaced."""
+def _spaced(mask: Tensor, most: int) -> Tensor:
+    """Indices of `most` of a mask's pixels, evenly spaced; of fewer, all; of none, that of the middle."""
     every = mask.flatten().nonzero()[:, 0]
-    step = max(1.0, len(every) / _SAMPLES)
-    return every[(torch.arange(min(len(every), _SAMPLES)) * step).long()]
+    if not len(every):
+        return torch.tensor([mask.numel() // 2])
+    step = max(1.0, len(every) / most)
+    return every[(torch.arange(min(len(every), most)) * step).long()]
 
 
 def _dark(head: Head, field: PortraitField) -> Relit:

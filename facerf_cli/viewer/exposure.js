@@ -5,7 +5,6 @@ const BLACK = 1e-9;
 
 class AutoExposure {
   constructor(data) {
-    this.rank = data.scales.length;
     this.about = data.exposure;
     this.skin = this.samples(data.exposure.skin);
     this.person = this.samples(data.exposure.person);
@@ -28,7 +27,7 @@ class AutoExposure {
 
   luminances(part, sums) {
     const values = new Float32Array(part.count);
-    for (let k = 0; k < this.rank; k++) {
+    for (let k = 0; k < part.scales.length; k++) {
       const weights = LUMINANCE.map((share, c) => (share * sums[3 * k + c] * part.scales[k]) / 127);
       for (let n = 0; n < part.count; n++) {
         const at = 3 * (k * part.count + n);

@@ -17,7 +17,7 @@ _SEEN = 0.02  # share of the person from which on a pixel is inside the box
 
 
 @dataclass(frozen=True)
-class Box:
+class PersonBox:
     """A part of a frame, in its pixels."""
 
     left: int
@@ -26,13 +26,13 @@ class Box:
     height: int
 
     @staticmethod
-    def around(matte: np.ndarray) -> "Box":
+    def around(matte: np.ndarray) -> "PersonBox":
         """The smallest box with all of a person's matte [H, W]; the whole frame of an empty matte."""
         rows, columns = (np.flatnonzero((matte > _SEEN).any(axis)) for axis in (1, 0))
         if not len(rows):
-            return Box(0, 0, matte.shape[1], matte.shape[0])
+            return PersonBox(0, 0, matte.shape[1], matte.shape[0])
         left, top = int(columns[0]), int(rows[0])
-        return Box(left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top)
+        return PersonBox(left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top)
 
     def of(self, image: np.ndarray) -> np.ndarray:
         """The part [height, width, ...] of an image."""
@@ -56,15 +56,21 @@ def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:
 
 def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarray, Head]:
     """A photo [H, W, 3] of `most_px` at most, and its head in the pixels of the smaller one."""
-    height, width = fitted(*photo.shape[:2], most_px)
+    height, width = fitted(photo.shape[0], photo.shape[1], most_px)
     if (height, width) == photo.shape[:2]:
         return photo, head
-    whole = Box(0, 0, photo.shape[1], photo.shape[0])
+    whole = PersonBox(0, 0, photo.shape[1], photo.shape[0])
     return resized(photo, height, width), _moved_head(head, whole, width / photo.shape[1])
 
 
 def small_composition(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField, matte: np.ndarray, box: Box, px: int
+    models: Models,
+    photo: np.ndarray,
+    head: Head,
+    field: PortraitField,
+    matte: np.ndarray,
+    box: PersonBox,
+    px: int,
 ) -> Composition:
     """Compose the person in a box of the photo, at `px` pixels along its longer side at most."""
     height, width = fitted(box.height, box.width, px)
@@ -80,11 +86,11 @@ def small_composition(
     )
 
 
-def _moved_head(head: Head, box: Box, scale: float) -> Head:
+def _moved_head(head: Head, box: PersonBox, scale: float) -> Head:
     return replace(head, fit=replace(head.fit, crop=_moved(head.fit.crop, box, scale)))
 
 
-def _moved(crop: Crop, box: Box, scale: float) -> Crop:
+def _moved(crop: Crop, box: PersonBox, scale: float) -> Crop:
     """A crop of a photo, in the pixels of a box that is scaled."""
     x0_px, y0_px = (crop.x0_px - box.left) * scale, (crop.y0_px - box.top) * scale
     return replace(crop, x0_px=x0_px, y0_px=y0_px, side_px=crop.side_px * scale)

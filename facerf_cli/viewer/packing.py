@@ -19,7 +19,8 @@ from facerf_cli.colour import (
 from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
 from facerf_cli.viewer.basis import ExposureSamples, LightBasis, brightness_of
 
-_PHOTO_QUALITY, _MAP_QUALITY, _STRIP_QUALITY = 93, 88, 82
+_EXPOSURE_RANK = 64  # factors of the samples of exposure
+_PHOTO_QUALITY, _MAP_QUALITY, _STRIP_QUALITY = 93, 90, 82
 _TILE = 8  # a JPEG's blocks: tiles of the atlas begin on them
 _ZERO, _STEPS = 128, 127  # the byte of 0 in a map, and that of its scale above it
 _HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
@@ -93,7 +94,7 @@ def _exposure(samples: ExposureSamples, coefficients: np.ndarray) -> dict[str, A
     """Factors [K, n, 3] of the samples as bytes, and what `colour.anchored_exposure_ev` compares them with."""
 
     brightness = brightness_of(samples)[:, None]  # by which `factored` weighs the lights
-    inverse = (coefficients / brightness).T / brightness.T
+    inverse = ((coefficients / brightness).T / brightness.T)[:_EXPOSURE_RANK]
 
     def factors(points: np.ndarray) -> dict[str, Any]:
         factor = np.einsum("kl,lnc->knc", inverse, points)

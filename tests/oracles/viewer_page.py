@@ -90,7 +90,8 @@ class Page:
             part = about[name]
             raw = np.frombuffer(base64.b64decode(part["factors"]), np.int8).astype(np.float64)
             scales = np.array(part["scales"])[:, None, None]
-            radiance = np.einsum("knc,kc->nc", raw.reshape(self.rank, part["count"], 3) / 127 * scales, sums)
+            factors = raw.reshape(len(scales), part["count"], 3) / 127 * scales
+            radiance = np.einsum("knc,kc->nc", factors, sums[: len(scales)])
             return float(np.percentile(radiance @ (0.2126, 0.7152, 0.0722), percentile))
 
         face, most = (

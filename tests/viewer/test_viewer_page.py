@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from facerf_cli.colour import anchored_exposure_ev
-from facerf_cli.viewer.basis import brightness_of, factored
-from facerf_cli.viewer.frame import Box, fitted, resized
+from facerf_cli.viewer.basis import ExposureSamples, brightness_of, factored
+from facerf_cli.viewer.frame import PersonBox, fitted, resized
 from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 from tests.oracles.viewer_page import Page, direction, document_of, encoded
@@ -59,18 +59,23 @@ def test_exposure_is_that_of_relight() -> None:
 
 def test_factors_of_enough_rank_give_the_images_back() -> None:
     images = np.einsum("lk,khwc->lhwc", np.random.rand(30, 4), np.random.rand(4, 5, 6, 3)).astype(np.float32)
-    brightness = np.linspace(0.1, 2, 30).astype(np.float32)
-    maps, coefficients = factored(images.copy(), np.ones((5, 6, 1)), brightness, 4)
+    maps, coefficients = factored(images, np.ones((5, 6, 1)), 4)
     np.testing.assert_allclose(np.einsum("lk,khwc->lhwc", coefficients, maps), images, atol=1e-5)
 
 
-def test_a_dim_light_counts_as_much_as_a_bright_one() -> None:
-    images = np.zeros((3, 1, 3, 3), np.float32)
-    images[0, 0, 0], images[1, 0, 1], images[2, 0, 2] = 1.0, 0.001, 0.0005
-    maps, coefficients = factored(images.copy(), np.ones((1, 3, 1)), np.array([1, 1e-3, 1e-2], np.float32), 2)
-    found = np.einsum("lk,khwc->lhwc", coefficients, maps)
-    np.testing.assert_allclose(found[:2], images[:2], atol=1e-6)
-    assert brightness_of(toy.basis().samples).shape == (120,)
+def test_weights_decide_what_a_low_rank_keeps() -> None:
+    images = np.zeros((2, 1, 2, 3), np.float32)
+    images[0, 0, 0], images[1, 0, 1] = 1.0, 0.5
+    for weight, kept in (((1, 1), 0), ((1, 4), 1)):
+        maps, coefficients = factored(images, np.array(weight, float).reshape(1, 2, 1), 1)
+        found = np.einsum("lk,khwc->lhwc", coefficients, maps)
+        np.testing.assert_allclose(found[kept], images[kept], atol=1e-6)
+
+
+def test_a_light_from_behind_counts_for_more_than_its_radiance() -> None:
+    points = np.ones((9, 4, 3), np.float32) * np.array([1, 1, 1, 1, 1, 1, 0.1, 0.05, 0])[:, None, None]
+    found = brightness_of(ExposureSamples(points, points, points[0], points[0]))
+    assert found[0] == pytest.approx(1) and 0.1 < found[6] < 0.6 and found[8] > 0.1
 
 
 def test_the_page_loads_nothing_and_names_are_escaped() -> None:
@@ -98,7 +103,9 @@ def test_an_index_shows_the_strips_of_its_pages() -> None:
 def test_frames() -> None:
     matte = np.zeros((20, 30))
     matte[4:9, 10:25] = 1
-    assert Box.around(matte) == Box(10, 4, 15, 5) and Box.around(matte * 0) == Box(0, 0, 30, 20)
+    assert PersonBox.around(matte) == PersonBox(10, 4, 15, 5) and PersonBox.around(matte * 0) == PersonBox(
+        0, 0, 30, 20
+    )
     assert fitted(800, 1200, 600) == (400, 600) and fitted(80, 120, 600) == (80, 120)
     ramp = np.broadcast_to(np.arange(12.0)[:, None, None], (12, 8, 3))
     np.testing.assert_allclose(resized(ramp, 6, 4)[1:-1, 0, 0], [2.5, 4.5, 6.5, 8.5], atol=1e-5)

@@ -8,10 +8,10 @@ from scipy.spatial import ConvexHull
 from facerf_cli.face.crop import Crop
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.viewer.basis import ExposureSamples, LightBasis, brightness_of, factored
-from facerf_cli.viewer.frame import Box
+from facerf_cli.viewer.frame import PersonBox
 
 WIDTH_PX, HEIGHT_PX = 120, 96
-BOX = Box(20, 8, 80, 80)
+BOX = PersonBox(20, 8, 80, 80)
 ALBEDO = np.array([0.8, 0.5, 0.3], np.float32)
 
 
@@ -55,7 +55,8 @@ def basis(lights: int = 120, rank: int = 12) -> LightBasis:
     BOX.of(detail)[:] = ALBEDO
     images = np.stack([radiance(toward) / ALBEDO for toward in directions])
     known = samples(directions)
-    maps, coefficients = factored(images, np.ones((80, 80, 1)), brightness_of(known), rank)
+    brightness = brightness_of(known)[:, None]
+    maps, coefficients = factored(images / brightness[..., None, None], np.ones((80, 80, 1)), rank)
     return LightBasis(
         photo=photo(),
         background=photo() * (1 - matte()[..., None]),
@@ -66,7 +67,7 @@ def basis(lights: int = 120, rank: int = 12) -> LightBasis:
         maps=maps,
         directions=directions,
         triangles=ConvexHull(rig.double().numpy()).simplices.astype(np.uint16),
-        coefficients=coefficients,
+        coefficients=coefficients * brightness,
         samples=known,
     )
 

@@ -74,7 +74,7 @@ def page_maps() -> tuple[PageMap, ...]:
 
 def _strip(photo: np.ndarray, basis: LightBasis) -> str:
     """The photo and the person under a few lights, small and side by side."""
-    height, width = fitted(*photo.shape[:2], _STRIP_PX)
+    height, width = fitted(photo.shape[0], photo.shape[1], _STRIP_PX)
     images = [resized(photo, height, width)]
     for azimuth, elevation in _STRIP_LIGHTS:
         images.append(resized(basis.nearest_image(azimuth, elevation), height, width))
