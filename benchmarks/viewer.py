@@ -1,4 +1,4 @@
-"""Agreement of a page of `facerf view` with `facerf relight`: errors in 8-bit steps, bytes, and texture fetches.
+"""Agreement of a page of `facerf view` with `facerf relight`, in 8-bit steps; bytes; texture fetches.
 
     python benchmarks/viewer.py [PHOTO ...] [--rank 192] [--lights 800]
 
@@ -26,7 +26,7 @@ from facerf_cli.viewer.packing import packed
 from facerf_cli.viewer.page import page
 
 sys.path.insert(0, str(ROOT))
-from tests.oracles.viewer_page import Page, direction  # noqa: E402
+from tests.oracles.viewer_page import Page, direction
 
 LIGHTS = (
     (20, 5),
@@ -80,9 +80,8 @@ def measure(path: Path, settings: BasisSettings) -> None:
         lights = list(zip(directions.double().numpy(), weights.numpy(), strict=True))
         sums = twin.sums([(toward / np.linalg.norm(toward), rgb) for toward, rgb in lights])
         error = np.abs(truth - twin.shown(sums, twin.exposure_ev(sums)))[seen]
-        print(
-            f"{name:12}{ev:11.2f}{twin.exposure_ev(sums):7.2f}{error.mean():8.2f}{np.percentile(error, 99):7.1f}"
-        )
+        errors = f"{error.mean():8.2f}{np.percentile(error, 99):7.1f}"
+        print(f"{name:12}{ev:11.2f}{twin.exposure_ev(sums):7.2f}{errors}", flush=True)
 
 
 def main() -> None:

@@ -136,8 +136,8 @@ def light_basis(
 def factored(images: np.ndarray, weights: np.ndarray, rank: int) -> tuple[np.ndarray, np.ndarray]:
     """Maps [K, ...] and orthonormal coefficients [L, K] whose products come nearest to images [L, ...].
 
-    An error counts in proportion to `weights`, which broadcast to an image. By the eigenvectors of the images'
-    Gram matrix: there are far fewer lights than pixels.
+    An error counts in proportion to `weights`, which broadcast to an image. By the eigenvectors of the
+    Gram matrix of the images: there are far fewer lights than pixels.
     """
     flat = images.reshape(len(images), -1)
     weight = np.broadcast_to(weights, images.shape[1:]).reshape(-1)

@@ -88,8 +88,9 @@ class Page {
 
   // The frame as large as the stage allows, with the photo's sides.
   fit() {
-    const stage = byId("stage").getBoundingClientRect();
     const canvas = byId("before");
+    byId("stage").style.setProperty("--sides", canvas.height / canvas.width);
+    const stage = byId("stage").getBoundingClientRect();
     const room = this.state.panel ? 24 : 0;
     const scale = Math.min((stage.width - room) / canvas.width, (stage.height - room) / canvas.height);
     byId("frame").style.width = `${Math.floor(canvas.width * scale)}px`;

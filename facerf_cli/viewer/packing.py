@@ -91,8 +91,7 @@ def _head(basis: LightBasis) -> list[float]:
 
 
 def _exposure(samples: ExposureSamples, coefficients: np.ndarray) -> dict[str, Any]:
-    """Factors [K, n, 3] of the samples as bytes, and what `colour.anchored_exposure_ev` compares them with."""
-
+    """Factors [K, n, 3] of the samples as bytes, and what `anchored_exposure_ev` compares them with."""
     brightness = brightness_of(samples)[:, None]  # by which `factored` weighs the lights
     inverse = ((coefficients / brightness).T / brightness.T)[:_EXPOSURE_RANK]
 
