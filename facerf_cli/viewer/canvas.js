@@ -36,8 +36,11 @@ class CanvasView {
       for (let x = 0; x < this.width; x++, i += 4) {
         const column = within(Math.floor((((x + 0.5) / this.scale - left) / width) * mapWidth), mapWidth);
         const share = this.matte[i] / 255;
+        const at = 3 * (row * mapWidth + column);
+        const grey = (ratio[at] + ratio[at + 1] + ratio[at + 2]) / 3;
+        const colour = limited((grey * gain) / SHADE, 0, 1);
         for (let c = 0; c < 3; c++) {
-          const change = Math.max(0, ratio[3 * (row * mapWidth + column) + c]);
+          const change = Math.max(0, grey + colour * (ratio[at + c] - grey));
           const person = DECODED[this.detail[i + c]] * change * gain;
           const linear = withBackground ? DECODED[this.background[i + c]] + share * person : person;
           shown.data[i + c] = 255 * encoded(linear) + 0.5;

@@ -2,6 +2,7 @@
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const BLACK = 1e-9;
+const SHADE = 0.06; // of an exposed ratio, below which its colour fades: there it is noise
 
 class AutoExposure {
   constructor(data) {

@@ -24,6 +24,7 @@ void main() {
 
 const COMPOSE = `#version 300 es
 precision highp float;
+const float SHADE = ${SHADE};
 uniform sampler2D detail, matte, background, ratio;
 uniform vec4 box; // left, top, width, height in pixels of the photo
 uniform float gain, keep;
@@ -37,7 +38,9 @@ vec3 encoded(vec3 x) {
 void main() {
   vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
   ivec2 at = ivec2(pixel);
-  vec3 change = max(texture(ratio, (pixel - box.xy) / box.zw).rgb, 0.0);
+  vec3 change = texture(ratio, (pixel - box.xy) / box.zw).rgb;
+  vec3 grey = vec3(dot(change, vec3(1.0 / 3.0)));
+  change = max(mix(grey, change, clamp(grey.r * gain / SHADE, 0.0, 1.0)), 0.0);
   vec3 person = decoded(texelFetch(detail, at, 0).rgb) * change * gain;
   float share = texelFetch(matte, at, 0).r;
   vec3 behind = decoded(texelFetch(background, at, 0).rgb);

@@ -38,6 +38,9 @@ def direction(azimuth_deg: float, elevation_deg: float) -> np.ndarray:
     return np.array([math.cos(el) * math.sin(az), math.sin(el), math.cos(el) * math.cos(az)])
 
 
+SHADE = 0.06  # of an exposed ratio, below which its colour fades: there it is noise
+
+
 @dataclass(frozen=True)
 class Page:
     document: dict[str, Any]
@@ -109,7 +112,10 @@ class Page:
         small = np.einsum("khwc,kc->hwc", self.maps, sums)
         x = (np.arange(width) + 0.5 - left) / box_w * small.shape[1] - 0.5
         y = (np.arange(height) + 0.5 - top) / box_h * small.shape[0] - 0.5
-        ratio = _bilinear(small, y, x).clip(min=0)
+        ratio = _bilinear(small, y, x)
+        grey = ratio.mean(-1, keepdims=True)
+        exposed = grey * self.document["gain"] * 2.0**ev
+        ratio = (grey + (exposed / SHADE).clip(0, 1) * (ratio - grey)).clip(min=0)
         detail = decoded(image(self.document["detail"]) / 255) * self.document["gain"]
         matte = image(self.document["matte"])[..., None] / 255
         behind = decoded(image(self.document["background"]) / 255)
