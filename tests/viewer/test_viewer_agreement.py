@@ -33,8 +33,8 @@ def test_page_agrees_with_relight_at_lights_of_its_rig() -> None:
         ev = whole.exposure_ev(relit, "auto")
         truth = 255 * linear_to_srgb((whole.image(relit, ev).pixels * 2.0**ev).clip(0, 1))
         sums = twin.sums([(basis.directions[light].astype(float), np.ones(3))])
-        assert abs(twin.exposure_ev(sums) - ev) < 0.08
+        assert abs(twin.exposure_ev(sums) - ev) < 0.05
         error = np.abs(truth - twin.shown(sums, ev))
-        # The truncation is exact here; what is left is 8 bits, JPEG and the maps' size.
-        assert error[seen].mean() < 2 and np.percentile(error[seen], 99) < 10
-        assert error[basis.matte == 0].mean() < 1.5
+        # No light is truncated; what is left, 2.3 and 14 at most, is 8 bits, JPEG and the size of the maps.
+        assert error[seen].mean() < 2.6 and np.percentile(error[seen], 99) < 18
+        assert error[basis.matte == 0].mean() < 1.3
