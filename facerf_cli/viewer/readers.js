@@ -102,7 +102,7 @@ async function readExr(bytes) {
     const count = Math.min(rows, height - first);
     if (first < 0 || count < 1) throw new Error("the .exr map is damaged; save it again");
     const packed = bytes.subarray(at + 8, at + 8 + view.getInt32(at + 4, true));
-    const raw = kind && packed.length < count * rowBytes ? await exrInflated(packed, count * rowBytes) : packed;
+    const raw = kind && packed.length < count * rowBytes ? await exrUnzipped(packed, count * rowBytes) : packed;
     if (raw.length < count * rowBytes) throw new Error("the .exr map is cut short; copy it again");
     exrRows(raw, channels, width, first, count, rowBytes, pixels);
   }
@@ -143,6 +143,14 @@ function exrChannels(bytes, view, attribute) {
   }
   if (!found.some((one) => one.to.length)) throw new Error("the .exr map has no channels R, G, B; save it as RGB");
   return found;
+}
+
+async function exrUnzipped(packed, size) {
+  try {
+    return await exrInflated(packed, size);
+  } catch {
+    throw new Error("the .exr map is damaged or cut short; copy it again");
+  }
 }
 
 // ZIP of EXR: inflated, then differences of bytes, in two halves that are interleaved.

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from facerf_cli.cli.values import parse_exposure
 from facerf_cli.main import main
 
 
@@ -40,3 +41,7 @@ def test_a_photo_named_index_is_refused(folder: Path, capsys: pytest.CaptureFixt
     (folder / "in" / "a.jpg").rename(folder / "in" / "index.jpg")
     assert main(["view", str(folder / "in"), "-o", str(folder / "out")]) == 2
     assert "rename the photo" in capsys.readouterr().err
+
+
+def test_the_exposure_of_a_page_s_command_is_understood() -> None:
+    assert parse_exposure("1.37") == 1.37 and parse_exposure("auto") == "auto"
