@@ -36,7 +36,7 @@ _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
 ExposureRule = Literal["auto", "face"]
-_FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
+FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
@@ -268,7 +268,7 @@ def anchored_exposure_ev(
     stays as dark beside a light one as it was. No more than lets the brightest hundredth of the person
     exceed white, or the plate's own, by one EV, as in a light from behind. A black face gives 0 EV.
     """
-    bright, wanted = (_brighter_than(image, face, _FACE_PERCENTILE) for image in (relit, plate))
+    bright, wanted = (_brighter_than(image, face, FACE_PERCENTILE) for image in (relit, plate))
     if min(bright, wanted) <= _BLACK:
         return 0.0
     whole = face if person is None else person

@@ -33,13 +33,14 @@ from facerf_cli.cli.relight_dataset import relight_dataset
 from facerf_cli.cli.segment import segment
 from facerf_cli.cli.synth_stage import synth_stage
 from facerf_cli.cli.train import train
+from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
 
 _PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
 # The verbs by panel of the help, in the order of a user's day.
 VERBS: dict[str, tuple[Callable[..., Any], ...]] = {
-    _PHOTOS: (relight, estimate_light, predict_olat, segment, fit_geometry),
+    _PHOTOS: (relight, view, estimate_light, predict_olat, segment, fit_geometry),
     _LIGHT: (convert_light, envmap),
     _DATA: (synth_stage, prepare_dataset, relight_dataset, train),
     _SETUP: (check, doctor, config),

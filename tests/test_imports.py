@@ -12,7 +12,7 @@ LEVELS = (
     ("cli",),
     ("evaluation", "training", "api"),
     ("dataset",),
-    ("synth", "capture"),
+    ("synth", "capture", "viewer"),
     ("pipeline",),
     ("field", "baselines", "composite", "group_photo", "near_textures", "portrait_field", "whole_person"),
     ("models", "portrait"),

@@ -68,7 +68,7 @@ def parse_exposure(text: str) -> Exposure:
         return "auto"
     if text == "face":
         return "face"
-    return numbers(text, ("EV or auto or face",), "--exposure")[0]
+    return numbers(text, ("auto or face or EV",), "--exposure")[0]
 
 
 def parse_lights(text: str) -> int | list[tuple[float, float]]:

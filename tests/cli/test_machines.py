@@ -19,7 +19,7 @@ from tests.cli.toy_batch import outputs_of, run
 FOLDER_VERBS = {
     "relight", "estimate-light", "convert-light", "predict-olat", "fit-geometry", "synth-stage",
     "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
-    "evaluate geometry", "evaluate yale-b", "evaluate pairs", "segment",
+    "evaluate geometry", "evaluate yale-b", "evaluate pairs", "segment", "view",
 }  # fmt: skip
 Call = Callable[..., tuple[int, Settings]]
 
