@@ -33,7 +33,7 @@ _PAGE, _INDEX = ".html", "index.html"
 
 
 @dataclass(frozen=True)
-class View:
+class MakePage:
     """Makes the page of one photo; settings only."""
 
     photo: PhotoOptions
@@ -110,7 +110,7 @@ def view(
         landmarks_from=landmarks_from,
     )
     photo.check()
-    work = View(photo, size, lights)
+    work = MakePage(photo, size, lights)
     one = output.suffix.lower() == _PAGE
     folder = output.parent if one else output
     items = collect_items(inputs, folder, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)

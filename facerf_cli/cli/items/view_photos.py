@@ -19,14 +19,14 @@ from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 
 if TYPE_CHECKING:
-    from facerf_cli.cli.view import View
+    from facerf_cli.cli.view import MakePage
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
 _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(item: Item, work: "View") -> tuple[list[Path], dict[str, Any]]:
+def write_pages(item: Item, work: "MakePage") -> tuple[list[Path], dict[str, Any]]:
     """Write a page for each chosen face of a photo; their paths, and facts for the report."""
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
@@ -44,7 +44,7 @@ def write_pages(item: Item, work: "View") -> tuple[list[Path], dict[str, Any]]:
     return paths[::-1], facts_of(faces)
 
 
-def write_index(path: Path, items: Sequence[Item], work: "View") -> None:
+def write_index(path: Path, items: Sequence[Item], work: "MakePage") -> None:
     """Write the list of all pages that exist, and print its path."""
     entries = []
     for item in items:
