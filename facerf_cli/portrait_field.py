@@ -37,7 +37,7 @@ from facerf_cli.raster.texture import bake_attributes
 SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
-_SHARE = 0.4  # of the portrait field in the face, where the other one is finer
+_SHARE = 0.25  # of the portrait field in the face, where the other one is finer
 _PROXY_NORMALS = 1.0  # weight of the proxy's normals on face and neck; that of the network's is 1
 _HAIRLINE_PX = 4  # of the square, in which the network's normals are kept
 _SKIN = class_index("skin")
