@@ -1,12 +1,15 @@
 #!/usr/bin/env bash
-# The shipped Portrait Network: synthetic people from head to chest, nothing else. Two processor cores, about two hours.
+# The shipped Portrait Network: synthetic people from head to chest, nothing else. Two processor cores, about four hours:
+# one to bake the people, one for a first leg of training, two for a second one that starts from it.
 # Run it again after an interruption: it goes on.
-# Usage: [PEOPLE=340] examples/train_portrait.sh ICT-FaceKit.tar.xz RUN [TIME]
+# Usage: [PEOPLE=340] examples/train_portrait.sh ICT-FaceKit.tar.xz RUN [TIME OF THE FIRST LEG] [OF THE SECOND]
 set -euo pipefail
-archive=$1 run=$2 time=${3:-75m}
+archive=$1 run=$2 first=${3:-60m} second=${4:-125m}
 export OMP_NUM_THREADS=2
 export MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296  # else much of the time is the kernel's
 mkdir -p "$run"
 [ -f "$run/ict.npz" ] || facerf face-model import ict-facekit "$archive" -o "$run/ict.npz"
-facerf train --stage portrait --seed 16 --heads-from "builtin,$run/ict.npz" --heads "${PEOPLE:-340}" --bank "$run/bank" \
-    -j 2 --max-time "$time" --validate-every 250 --workers 1 --resume -o "$run/portrait"
+people=(--stage portrait --heads-from "builtin,$run/ict.npz" --heads "${PEOPLE:-340}" --bank "$run/bank" -j 2 --workers 1)
+facerf train "${people[@]}" --seed 16 --max-time "$first" --validate-every 250 --resume -o "$run/first"
+facerf train "${people[@]}" --seed 17 --max-time "$second" --validate-every 500 --resume -o "$run/portrait" \
+    --start-from "$run/first/best.safetensors"
