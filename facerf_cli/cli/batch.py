@@ -15,7 +15,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,11 @@ def run_files(
     prepare: Callable[[], object] | None = None,
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
-    return run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
+    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
+    missing = [item for item in items if options.dry_run and not item.input_path.exists()]
+    for item in missing:
+        log.error("%s: no such file; check the path", item.input_path)
+    return max(code, int(bool(missing)))
 
 
 def run_items(
@@ -114,8 +118,9 @@ def run_items(
     """
     items = settings.shard.share(items)
     index = FolderIndex(options.output, verb, settings.shard, recipes_of) if recipes_of else None
-    reasons = {item: _why_again(item, outputs_of(item), options, index) for item in items}
-    todo = [item for item in items if reasons[item] is not None]
+    states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
+    reasons = {item: reason for item, (reason, _) in states.items()}
+    todo = [replace(item, stale=states[item][1]) for item in items if reasons[item] is not None]
     finished = [item for item in items if reasons[item] is None]
     if todo and prepare:
         prepare()
@@ -158,7 +163,7 @@ def all_finished(
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
     index = FolderIndex(options.output, verb, settings.shard, recipes_of)
     share = settings.shard.share(items)
-    return all(_why_again(item, outputs_of(item), options, index) is None for item in share)
+    return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
 
 
 def report_name(shard: Shard) -> str:
@@ -235,12 +240,12 @@ def _broken(item: Item, error: Exception) -> _Result:
 
 def _why_again(
     item: Item, outputs: Sequence[Path], options: BatchOptions, index: FolderIndex | None
-) -> str | None:
-    """Say why an item must be made, None if it is finished; empty where it never was."""
+) -> tuple[str | None, frozenset[Path]]:
+    """Say why an item must be made, and which of its outputs; see `FolderIndex.why_again`."""
     if options.overwrite == "always":
-        return ""
+        return "", frozenset(outputs)
     if options.overwrite == "never" or index is None:
-        return None if _exist(outputs) else ""
+        return (None, frozenset()) if _exist(outputs) else ("", frozenset(outputs))
     return index.why_again(item.input_path, outputs)
 
 

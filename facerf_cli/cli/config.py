@@ -54,14 +54,19 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
     """The options of a table by the names of their parameters."""
     if not isinstance(table, Mapping):
         raise UsageError(f"--config {path}: {verb} is no table; write [{verb}]")
-    names = {parameter.name for parameter in _options(command)} - {"help", "version", "config"}
+    names = {
+        option.lstrip("-").replace("-", "_"): parameter.name
+        for parameter in _options(command)
+        for option in parameter.opts
+        if parameter.name not in ("help", "version", "config")
+    }
     values = {}
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in names:
             of_verb = "" if verb == GLOBAL else f"{verb} ".replace(".", " ")
             raise UsageError(f"--config {path}: [{verb}] {key}: no such option; see `facerf {of_verb}--help`")
-        values[name] = value
+        values[names[name]] = value
     return values
 
 
@@ -106,7 +111,7 @@ def _print_given(tables: Mapping[str, Any], source: str, above: str) -> None:
         if isinstance(value, Mapping):
             _print_given(value, source, f"{above}{name} ")
         else:
-            print(f"{above}--{name.replace('_', '-')} = {_shown(value)}  ({source})")
+            print(f"{above}--{name.strip('_').replace('_', '-')} = {_shown(value)}  ({source})")
 
 
 def _shown(value: Any) -> str:

@@ -106,24 +106,35 @@ class FolderIndex:
             self._note(known)
         return str(known["sha256"])
 
-    def why_again(self, input_path: Path, outputs: Sequence[Path]) -> str | None:
-        """Say why an item must be made, None if it is finished; empty where none of its outputs exist."""
-        present = [path.exists() for path in outputs]
-        if not all(present):
-            return "an output is missing" if any(present) else ""
+    def why_again(self, input_path: Path, outputs: Sequence[Path]) -> tuple[str | None, frozenset[Path]]:
+        """Say why an item must be made, and which of its outputs; None if it is finished.
+
+        The reason is empty where they never were made.
+        """
+        stale: dict[Path, str] = {}
         for number, path in enumerate(outputs):
-            row = self._rows.outputs.get(self._name(path))
-            if row is None or row.get("verb") != self._verb:
-                return "there is no record of what they were made from"
-            key, recipe = self._wanted[number if len(self._wanted) > 1 else 0]
-            if row.get("recipe") != key:
-                old = self._rows.recipes.get(str(row.get("recipe")), {})
-                return differences(old, recipe) if old else "other options"
-            if self._digest_or_none(input_path) != row.get("input"):
-                return "the input changed"
-            if path.stat().st_size == 0:
-                return "an output is empty"
-        self.edited += [path for path in outputs if self._is_edited(path)]
+            reason = self._why(number, path, input_path)
+            if reason is not None:
+                stale[path] = reason
+        self.edited += [path for path in outputs if path not in stale and self._is_edited(path)]
+        if not stale:
+            return None, frozenset()
+        return next(filter(None, stale.values()), ""), frozenset(stale)
+
+    def _why(self, number: int, path: Path, input_path: Path) -> str | None:
+        row = self._rows.outputs.get(self._name(path))
+        if not path.exists():
+            return "" if row is None else "an output is missing"
+        if row is None or row.get("verb") != self._verb:
+            return "there is no record of what they were made from"
+        key, recipe = self._wanted[number if len(self._wanted) > 1 else 0]
+        if row.get("recipe") != key:
+            old = self._rows.recipes.get(str(row.get("recipe")), {})
+            return differences(old, recipe) if old else "other options"
+        if self._digest_or_none(input_path) != row.get("input"):
+            return "the input changed"
+        if path.stat().st_size == 0:
+            return "an output is empty"
         return None
 
     def _is_edited(self, path: Path) -> bool:

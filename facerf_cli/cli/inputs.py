@@ -4,7 +4,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from facerf_cli.cli.naming import NamePattern, fields_of
@@ -30,6 +30,7 @@ class Item:
     output_base: Path  # output folder / name: the outputs' common beginning
     name: str  # path in the output folder, without suffix; the item's identity there
     mirrored: PurePosixPath | None = None  # of a file: path in its input folder, or name alone
+    stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
 
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
@@ -84,7 +85,7 @@ def collect_items(
     for _, (path, mirrored) in sorted(found.items()):
         own = mirrored.with_suffix("").as_posix()
         name = pattern.filled(fields_of(path, mirrored)) if pattern else own
-        items.append(Item(path, output_folder / name, name, mirrored))
+        items.append(Item(path, output_folder / name, name, mirrored=mirrored))
     _refuse_meeting(items)
     return items
 

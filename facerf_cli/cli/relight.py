@@ -94,6 +94,17 @@ class Relight:
         suffixes = self.output.suffixes
         return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in suffixes]
 
+    def for_stale(self, item: Item) -> "Relight":
+        """These settings with the lights of the item's stale images; a light has all of its frames."""
+        tag = "" if self.composite == "photo" else self.photo.first_tag
+        stale = {
+            setup.name
+            for setup in self.setups
+            for suffix in self.output.suffixes
+            if not item.stale or setup.output(item, tag, suffix, self.name) in item.stale
+        }
+        return replace(self, setups=tuple(setup for setup in self.setups if setup.name in stale))
+
     def with_leaders(self, items: Sequence[Item]) -> "Relight":
         """These settings with the first photo of each group of --exposure-group."""
         groups = {self._group(item): item for item in reversed(items)}
@@ -149,7 +160,7 @@ class Relight:
         """Relight a photo or a stack."""
         from facerf_cli.cli.items.relight_photos import relight_item
 
-        written, facts = relight_item(item, self)
+        written, facts = relight_item(item, self.for_stale(item))
         outputs = [path.with_suffix(suffix) for path in written for suffix in self.output.suffixes]
         exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
         return Outcome(outputs, facts | {"exposure_ev": exposures_ev})

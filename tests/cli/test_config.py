@@ -14,6 +14,7 @@ seed = 3
 exposure = "face"
 light = ["0,20", "40,10"]
 dry-run = true
+format = "png"
 [evaluate.yale-b]
 overwrite = "always"
 """

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.cli import folder_index
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main
-from tests.cli.test_batch import rows, run
+from tests.cli.test_batch import copy, outputs_of, rows, run
 
 
 @pytest.fixture
@@ -93,6 +95,38 @@ def test_an_output_that_the_user_changed_is_kept_and_said(
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
 
 
+def test_only_stale_outputs_are_made(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """As when a light is added: what was made, and then changed by hand, stays."""
+    out, lights = tmp_path / "out", ["a"]
+
+    def files(item: Item) -> list[Path]:
+        return [item.output(f"_{light}.bin") for light in lights]
+
+    def write(item: Item) -> Outcome:
+        made = [path for path in files(item) if not item.stale or path in item.stale]
+        for path in made:
+            path.write_bytes(b"made")
+        return Outcome(made)
+
+    def call() -> int:
+        recipes = [{"light": light} for light in lights]
+        options, settings = BatchOptions(out), Settings()
+        return run_batch("copy", [str(photos)], write, files, options, settings, lambda digest_of: recipes)
+
+    assert call() == 0
+    (out / "a_a.bin").write_bytes(b"retouched")
+    lights.append("b")
+    capsys.readouterr()
+    assert call() == 0
+    said = capsys.readouterr()
+    assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
+    assert "made again" not in said.err and "1 outputs were changed" in said.err
+    assert (out / "a_a.bin").read_bytes() == b"retouched"
+    (out / "b_a.bin").unlink()
+    assert call() == 0
+    assert "1 made again: an output is missing" in capsys.readouterr().err
+
+
 def test_check_reads_all_outputs_again(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "out"
     run([photos], out)
@@ -129,9 +163,6 @@ def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: pyte
 def test_shards_know_what_the_others_made(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    from facerf_cli.cli.batch import BatchOptions, run_batch
-    from tests.cli.test_batch import copy, outputs_of
-
     for number in (1, 2):
         settings, options = Settings(shard=Shard(number, 2)), BatchOptions(tmp_path / "out")
         run_batch("copy", [str(photos)], copy, outputs_of, options, settings, lambda digest_of: [{}])
