@@ -86,20 +86,23 @@ def collect_items(
         own = mirrored.with_suffix("").as_posix()
         name = pattern.filled(fields_of(path, mirrored)) if pattern else own
         items.append(Item(path, output_folder / name, name, mirrored=mirrored))
-    _refuse_meeting(items)
+    _refuse_meeting(items, pattern)
     return items
 
 
-def _refuse_meeting(items: Sequence[Item]) -> None:
+def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
     """Raise UsageError for two items with one name; case counts only where one folder holds both."""
     by_name: dict[str, Item] = {}
     for item in items:
         other = by_name.setdefault(item.name.casefold(), item)
         apart = other.name != item.name and other.input_path.parent == item.input_path.parent
         if other is not item and not apart:
+            advice = (
+                "rename one, name the folder that holds both, or give --name, such as '{dir}/{stem}_{ext}'"
+            )
             raise UsageError(
-                f"{other.input_path} and {item.input_path}: would both be written as {item.name}; rename "
-                "one, name the folder that holds both, or give --name, such as '{dir}/{stem}_{ext}'"
+                f"{other.input_path} and {item.input_path}: would both be written as {item.name}; "
+                + ("give --name more fields, such as {stem} and {ext}" if pattern else advice)
             )
 
 
