@@ -1,6 +1,6 @@
 """Agreement of a page of `facerf view` with `facerf relight`, in 8-bit steps; bytes; texture fetches.
 
-    python benchmarks/viewer.py [PHOTO ...] [--rank 192] [--lights 800]
+    python benchmarks/page_agreement.py [PHOTO ...] [--rank 192] [--lights 800]
 
 Ten single lights and three procedural maps, at the automatic exposure of each side. The page is drawn by its
 numpy twin (`tests/oracles/viewer_page.py`), which `tests/viewer/test_viewer_browser.py` holds to a browser.
