@@ -8,7 +8,6 @@ ends it.
 
 import json
 import logging
-import shutil
 import sys
 import time
 import traceback
@@ -148,7 +147,7 @@ def run_items(
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
     elif failures and is_new:
-        shutil.rmtree(options.output)
+        _remove_what_is_empty(options.output, [report, *([index.path] if index else [])])
     return 1 if failures else 0
 
 
@@ -251,6 +250,15 @@ def _why_again(
 
 def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.exists() for path in outputs)
+
+
+def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
+    """Remove a new folder in which only these records are; what another process wrote there stays."""
+    if not any(path.is_file() and path not in records for path in folder.rglob("*")):
+        for record in records:
+            record.unlink()
+        for empty in sorted([folder, *folder.rglob("*")], reverse=True):
+            empty.rmdir()
 
 
 def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:

@@ -91,7 +91,7 @@ class FolderIndex:
         self._new: list[Row] = []  # files read since the rows were last written
         self.edited: list[Path] = []  # finished outputs that are not as they were written
         name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
-        self._path = folder / f".facerf-index{name}.jsonl"
+        self.path = folder / f".facerf-index{name}.jsonl"
         self._wanted = [(_key(recipe), recipe) for recipe in recipes_of(self.digest_of)]
 
     def digest_of(self, path: Path) -> str:
@@ -127,7 +127,7 @@ class FolderIndex:
             return "" if row is None else "an output is missing"
         if row is None or row.get("verb") != self._verb:
             return "there is no record of what they were made from"
-        key, recipe = self._wanted[number if len(self._wanted) > 1 else 0]
+        key, recipe = self._wanted_of(number)
         if row.get("recipe") != key:
             old = self._rows.recipes.get(str(row.get("recipe")), {})
             return differences(old, recipe) if old else "other options"
@@ -147,14 +147,14 @@ class FolderIndex:
         rows: list[Mapping[str, Any]] = list(self._rows.files.values())
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._rows.recipes.items()]
         rows += self._rows.outputs.values()
-        with atomic_path(self._path) as temporary:
+        with atomic_path(self.path) as temporary:
             temporary.write_text("".join(json_line(row) + "\n" for row in rows), encoding="utf-8")
 
     def add(self, made: Made, outputs: Sequence[Path]) -> None:
         """Add the rows of an item that was made; `outputs` are those that have a recipe, in their order."""
         rows: list[Row] = []
         self._note(made.read)
-        keys = {self._name(path): self._key_of(number) for number, path in enumerate(outputs)}
+        keys = {self._name(path): self._wanted_of(number)[0] for number, path in enumerate(outputs)}
         for row in made.outputs:
             self._note(row)
             name = self._name(Path(row["file"]))
@@ -162,11 +162,12 @@ class FolderIndex:
             rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], **made_from})
         rows += self._new
         self._new.clear()
-        with self._path.open("a", encoding="utf-8") as stream:
+        with self.path.open("a", encoding="utf-8") as stream:
             stream.write("".join(json_line(row) + "\n" for row in rows))
 
-    def _key_of(self, number: int) -> str:
-        return self._wanted[number if len(self._wanted) > 1 else 0][0]
+    def _wanted_of(self, number: int) -> tuple[str, Recipe]:
+        """Key and recipe of an item's output, or those of all of them."""
+        return self._wanted[number if len(self._wanted) > 1 else 0]
 
     def _digest_or_none(self, path: Path) -> str | None:
         try:

@@ -11,6 +11,7 @@ from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
+from facerf_cli.errors import InputError
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main
 from tests.cli.test_batch import copy, outputs_of, rows, run
@@ -179,6 +180,21 @@ def test_a_single_photo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     assert run([tmp_path / "a.png"], tmp_path / "out") == 1
     assert (tmp_path / "out" / "report.jsonl").exists()  # a folder that was there stays
+
+
+def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path: Path) -> None:
+    """As when two shards of one photo each begin in a new folder."""
+    out = tmp_path / "out"
+    (tmp_path / "a.png").touch()
+
+    def fail(item: Item) -> Outcome:
+        (out / "other").mkdir()
+        (out / "other" / "b_copy.bin").write_bytes(b"b")
+        raise InputError(f"{item.input_path}: is bad")
+
+    given = [str(tmp_path / "a.png")]
+    run_batch("copy", given, fail, outputs_of, BatchOptions(out), Settings(), lambda digest_of: [{}])
+    assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 
 @dataclass(frozen=True)
