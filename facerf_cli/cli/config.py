@@ -1,13 +1,13 @@
 """Defaults of options from a TOML file, and `facerf config`, which shows what is in force and from where."""
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.toml_files import read_toml
 
 GLOBAL = "global"  # the table of options before the verb
 _LIMIT_BYTES = 1 << 20
@@ -18,16 +18,11 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
 
     Raises UsageError for a file that is no TOML, and for verbs and options that do not exist.
     """
+    too_long = f"larger than {_LIMIT_BYTES >> 20} MiB; give a TOML file"
     try:
-        with path.open("rb") as stream:
-            data = stream.read(_LIMIT_BYTES + 1)
-        if len(data) > _LIMIT_BYTES:
-            raise UsageError(f"--config {path}: larger than {_LIMIT_BYTES >> 20} MiB; give a TOML file")
-        tables = tomllib.loads(data.decode())
-    except OSError as error:
-        raise UsageError(f"--config {path}: cannot be read ({error.strerror}); check the path") from None
-    except (ValueError, RecursionError) as error:  # of TOML, or of UTF-8
-        raise UsageError(f"--config {path}: not TOML ({error}); mend it") from None
+        tables = read_toml(path, _LIMIT_BYTES, too_long, "mend it")
+    except InputError as error:
+        raise UsageError(f"--config {error}") from None
     own = tables.pop(GLOBAL, {})
     return _checked(path, GLOBAL, own, group) | _by_verb(path, "", tables, group)
 

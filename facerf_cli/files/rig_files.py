@@ -1,10 +1,10 @@
 """Rig files: the lights of a studio in TOML, a table for each by its name."""
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.toml_files import read_toml
 
 MOST_RIG_LIGHTS = 32
 _LIMIT_BYTES = 1 << 16
@@ -17,16 +17,8 @@ def read_rig(path: Path) -> dict[str, Settings]:
 
     [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
     """
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(_LIMIT_BYTES + 1)
-        if len(data) > _LIMIT_BYTES:
-            raise InputError(f"{path}: more than {_LIMIT_BYTES} bytes; a rig file holds lights alone")
-        tables = tomllib.loads(data.decode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give a rig file") from None
-    except (ValueError, RecursionError) as error:  # also of the decoding
-        raise InputError(f"{path}: not TOML: {error}; see docs/light.md") from None
+    too_long = f"more than {_LIMIT_BYTES} bytes; a rig file holds lights alone"
+    tables = read_toml(path, _LIMIT_BYTES, too_long, "see docs/lights.md")
     if not 1 <= len(tables) <= MOST_RIG_LIGHTS:
         raise InputError(f"{path}: {len(tables)} lights; give 1 to {MOST_RIG_LIGHTS}")
     return {name: _settings(table, f"{path}: {name}") for name, table in tables.items()}

@@ -31,6 +31,7 @@ from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.viewer.frame import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
@@ -55,21 +56,6 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
     return outputs, facts_of(faces) | {"lights": len(directions)}
 
 
-def _at_most(image: LinearImage, side_px: int) -> LinearImage:
-    """The image, its longer side at most so many pixels."""
-    scale = side_px / max(image.pixels.shape[:2])
-    if scale >= 1:
-        return image
-    height, width = (max(1, round(side * scale)) for side in image.pixels.shape[:2])
-
-    def smaller(values: np.ndarray) -> np.ndarray:
-        stacked = torch.from_numpy(np.ascontiguousarray(values)).permute(2, 0, 1)[None]
-        return np.asarray(interpolate(stacked, (height, width), mode="area")[0].permute(1, 2, 0).numpy())
-
-    alpha = None if image.alpha is None else smaller(image.alpha[..., None])[..., 0]
-    return replace(image, pixels=smaller(image.pixels), alpha=alpha)
-
-
 def _of_person(
     item: Item,
     image: LinearImage,
@@ -79,14 +65,10 @@ def _of_person(
     tiles: list[np.ndarray],
 ) -> tuple[StackHeader, Iterator[Tensor]]:
     """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
-    models, large_px = load_models_once(work.photo), max(image.pixels.shape[:2])
-    image = _at_most(image, work.size_px)
-    fit = replace(face.fit, crop=face.fit.crop.of_scaled(max(image.pixels.shape[:2]) / large_px))
-    head = replace(face.head, fit=fit)
-    reflectance = reflectance_of(
-        models, head, "portrait", work.network_alone, work.memory_bytes, image.pixels
-    )
-    composition = composition_of(models, image.pixels, head, reflectance, Target(background="none"))
+    models = load_models_once(work.photo)
+    photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
+    reflectance = reflectance_of(models, head, "portrait", work.network_alone, work.memory_bytes, photo)
+    composition = composition_of(models, photo, head, reflectance, Target(background="none"))
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
@@ -105,12 +87,12 @@ def _of_person(
     header = StackHeader(
         kind="photo",
         directions=directions.numpy(),
-        rotation=fit.rotation.numpy(),
-        source=image.pixels,
+        rotation=head.fit.rotation.numpy(),
+        source=photo,
         seen=layers["person.A"],
         normals=layers["normal"],
         layout_version=LAYOUT_VERSION,
-        fit=fit_to_arrays(fit),
+        fit=fit_to_arrays(head.fit),
         metadata=_metadata(item, work),
     )
     return header, olats()

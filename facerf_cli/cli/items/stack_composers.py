@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 
 from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.composite import Relit, RelitImage
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
+from facerf_cli.viewer.frame import resized
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
@@ -68,7 +67,7 @@ class PersonStack:
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
         """The matte and the layer of normals; raises UsageError for others."""
-        normals = _resized(self.header.normals, self._size())
+        normals = resized(self.header.normals, *self._size())
         return {"person.A": self._matte()} | _only_normals(names, normals)
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
@@ -85,13 +84,14 @@ class PersonStack:
             return own, self.header.seen
         source = self.header.source
         change = own / (source + _DARK * source.mean())
-        return self.photo * _resized(change, self._size()), self._matte()
+        return self.photo * resized(change, *self._size()), self._matte()
 
     def _matte(self) -> np.ndarray:
-        return _resized(self.header.seen[..., None], self._size())[..., 0]
+        return resized(self.header.seen, *self._size())
 
-    def _size(self) -> tuple[int, ...]:
-        return self.header.seen.shape if self.photo is None else self.photo.shape[:2]
+    def _size(self) -> tuple[int, int]:
+        height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
+        return height, width
 
 
 def _pixels(relit: Relit) -> np.ndarray:
@@ -102,14 +102,6 @@ def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
     """Colours before they were multiplied by the matte; 0 where it is."""
     share = matte[..., None]
     return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
-
-
-def _resized(values: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    if values.shape[:2] == tuple(size):
-        return values
-    stacked = torch.from_numpy(np.ascontiguousarray(values, np.float32)).permute(2, 0, 1)[None]
-    sized = F.interpolate(stacked, tuple(size), mode="bilinear", align_corners=False)[0]
-    return np.asarray(sized.permute(1, 2, 0).numpy())
 
 
 def _only_normals(names: Sequence[str], normals: np.ndarray) -> dict[str, np.ndarray]:
