@@ -45,8 +45,9 @@ from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
 from facerf_cli.portrait.occluders import uncovered
+from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.portrait_field import PortraitField, SteadyFrame, maps_of
 from facerf_cli.whole_person import WholePerson
 
 
@@ -128,8 +129,11 @@ def reflectance_of(
     network_alone: bool = False,
     memory_bytes: int = MEMORY_BYTES,
     photo: np.ndarray | None = None,
+    steady: SteadyFrame | None = None,
 ) -> Reflectance:
     """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
+
+    A frame of a shot comes with what is steadied by the frames around it.
 
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
     with `network_alone` they are not. The models that the paper compares with have no such correction.
@@ -138,11 +142,12 @@ def reflectance_of(
         return explain(models, head, kind).reflectance
     if kind == "portrait" and photo is None:
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
-    own = None if network_alone else own_light(models, head.face)
+    own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
     field = Field(models, head.face, own.quotient if own else None, memory_bytes)
     if photo is None or kind == "field":
         return field
-    return PortraitField.of(models.face, photo, head, field, own)
+    person = steady.person if steady else look_at_person(models.face, photo, head.fit)
+    return PortraitField.of(models.face, head, field, own, person, steady.maps if steady else maps_of(person))
 
 
 def composition_of(

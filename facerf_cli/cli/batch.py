@@ -39,6 +39,7 @@ class BatchOptions:
     overwrite: Overwrite = "changed"
     dry_run: bool = False
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
+    in_a_row: int = 1  # neighbouring items that one of the processes takes
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def run_items(
         kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
         log.warning(kept, len(index.edited))
     failures = 0
-    workers = workers_of(settings, options.jobs)
+    workers = workers_of(settings, options.jobs, options.in_a_row)
     with closing(spread(_Work(process, index is not None), todo, workers, _broken)) as results:
         for result in _with_progress(results, len(todo), verb, settings):
             if result.stops_the_run is not None:

@@ -56,6 +56,14 @@ from facerf_cli.cli.photo_options import (
     check_companion,
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.shots import (
+    FRAMES_IN_A_ROW,
+    SequenceOption,
+    Shot,
+    check_shots,
+    collect_frames,
+    recipe_of_shots,
+)
 from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
@@ -87,6 +95,7 @@ class Relight:
     exposure_group: ExposureGroup = "photo"
     photo_of_stack: Path | None = None
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
+    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
@@ -136,6 +145,7 @@ class Relight:
         shared = recipe_of(self, digest_of)
         if self.leaders:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
+        shared |= recipe_of_shots(self.shots, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
@@ -149,6 +159,7 @@ class Relight:
 
         check_output(self.output)
         self.photo.preparation(dry_run)()
+        self._follow(dry_run)
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self
         setups = readable(self.setups)
@@ -156,8 +167,16 @@ class Relight:
             raise FacerfError("no map can be read; give others")
         return replace(self, setups=setups)
 
+    def _follow(self, dry_run: bool) -> None:
+        """Follow the face through each shot."""
+        if self.shots and not dry_run:
+            from facerf_cli.cli.items.shot_frames import follow_shot
+
+            for shot in self.shots:
+                follow_shot(shot, self.photo, self.photo.settings)
+
     def __call__(self, item: Item) -> Outcome:
-        """Relight a photo or a stack."""
+        """Relight a photo, a frame or a stack."""
         from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self.for_stale(item))
@@ -352,6 +371,7 @@ def relight(
             rich_help_panel=BATCH,
         ),
     ] = None,
+    sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -422,9 +442,10 @@ def relight(
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
         _write_to_stdout(inputs, work)
         return
-    options = BatchOptions(output, overwrite, dry_run, jobs)
-    items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
-    work = work.with_leaders(items)
+    items, shots = collect_frames(inputs, output, settings, sequence, pattern)
+    check_shots(shots, photo)
+    options = BatchOptions(output, overwrite, dry_run, jobs, FRAMES_IN_A_ROW if shots else 1)
+    work = replace(work.with_leaders(items), shots=shots)
     work.refuse_meeting(items)
     finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
     usable = work if finished else work.readable(dry_run)
