@@ -40,6 +40,7 @@ class BatchOptions:
     dry_run: bool = False
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
     in_a_row: int = 1  # neighbouring items that one of the processes takes
+    print_outputs: bool = True  # on stdout; not those that are to be joined
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,7 @@ def run_items(
                 index.add(result.made, outputs_of(result.item))
             with report.open("a", encoding="utf-8") as stream:
                 stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
-            failures += _print_result(result)
+            failures += _print_result(result, options)
     if failures and len(items) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
     elif failures and is_new:
@@ -344,15 +345,16 @@ def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, An
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
-def _print_result(result: _Result) -> int:
+def _print_result(result: _Result, options: BatchOptions) -> int:
     """Print outputs to stdout, an error to stderr; return 1 for a failure."""
     if result.error:
         log.error("%s", one_line(result.error))
         if result.trace:
             log.debug("%s", "\n" + result.trace)
         return 1
-    for path in result.outcome.outputs if result.outcome else ():
-        print(path, flush=True)
+    if result.outcome and options.print_outputs:
+        for path in result.outcome.outputs:
+            print(path, flush=True)
     return 0
 
 

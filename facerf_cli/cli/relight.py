@@ -12,6 +12,7 @@ import typer
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import BackgroundChoice, parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
@@ -24,11 +25,9 @@ from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
-    InputsArgument,
     JobsOption,
     MemoryOption,
     NetworkAloneOption,
-    OutputOption,
     OverwriteOption,
     refuse_given,
     settings_of,
@@ -58,6 +57,7 @@ from facerf_cli.cli.photo_options import (
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
+    PhotosArgument,
     SequenceOption,
     Shot,
     check_shots,
@@ -187,8 +187,8 @@ class Relight:
 
 def relight(
     context: typer.Context,
-    inputs: InputsArgument,
-    output: OutputOption,
+    inputs: PhotosArgument,
+    output: FilmOrFolderOption,
     envmap: Annotated[
         list[str] | None,
         typer.Option(
@@ -362,6 +362,7 @@ def relight(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    fps: FpsOption = None,
     name: Annotated[
         str | None,
         typer.Option(
@@ -389,7 +390,11 @@ def relight(
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
-    formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
+    film = film_output(output, fps)
+    if film is not None:
+        refuse_given(context, ("format_", "ball", "name"), f"is not for -o {output}; leave it out")
+        output = film.folder
+    formats = film.formats if film else parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
     refuse_unused(context, formats)
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
@@ -412,6 +417,8 @@ def relight(
     behind = parse_background(background)
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+    if film and (behind.kind == "none" or composite == "face" or pose is not None):
+        raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
     check_companion(matte, "--matte")
     check_companion(photo_of_stack, "--photo")
     shown: Composite = composite or ("photo" if pose is None else "face")
@@ -444,9 +451,12 @@ def relight(
         return
     items, shots = collect_frames(inputs, output, settings, sequence, pattern)
     check_shots(shots, photo)
-    options = BatchOptions(output, overwrite, dry_run, jobs, FRAMES_IN_A_ROW if shots else 1)
+    in_a_row = FRAMES_IN_A_ROW if shots else 1
+    options = BatchOptions(output, overwrite, dry_run, jobs, in_a_row, print_outputs=film is None)
     work = replace(work.with_leaders(items), shots=shots)
     work.refuse_meeting(items)
+    if film is not None:
+        raise typer.Exit(run_to_film(film, items, shots, work, options, settings))
     finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
     usable = work if finished else work.readable(dry_run)
     code = run_files("relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of)

@@ -18,6 +18,15 @@ from facerf_cli.errors import UsageError
 
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
 _DIGITS = 4  # of a film's frame numbers, or more
+PhotosArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PHOTO|FILM...",
+        help="Images, films (.mp4, .mov, .webm), folders of images (walked recursively), frames "
+        "(plate.%04d.exr), or - to read a list of paths.",
+        show_default=False,
+    ),
+]
 SequenceOption = Annotated[
     bool,
     typer.Option(
@@ -54,9 +63,11 @@ def collect_frames(
     sequence: bool = False,
     pattern: NamePattern | None = None,
 ) -> tuple[list[Item], tuple[Shot, ...]]:
-    """List photos and the frames of films, in order, and the shots that they make; see `collect_items`."""
-    suffixes = PHOTO_SUFFIXES | FILM_SUFFIXES
-    found = collect_items(inputs, output, suffixes, pattern, settings.null_separated)
+    """List photos and the frames of films, in order, and the shots that they make; see `collect_items`.
+
+    A film is named itself: in folders only images are looked for.
+    """
+    found = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
     films = [item for item in found if item.input_path.suffix.lower() in FILM_SUFFIXES]
     photos = [item for item in found if item not in films]
     shots = [_of_film(item, pattern) for item in films if item.input_path.exists()]

@@ -75,6 +75,11 @@ class Film:
         """Close the file."""
         self._container.close()
 
+    @property
+    def has_sound(self) -> bool:
+        """True if the film has a sound track."""
+        return bool(self._container.streams.audio)
+
     def _presented(self) -> list[int]:
         """Time stamps of all frames in the order of presentation; packets are read, not decoded."""
         try:

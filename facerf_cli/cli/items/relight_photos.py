@@ -324,7 +324,7 @@ def _write_setups(
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
-            if work.output.shown_suffix:
+            if work.output.shown_suffix and not chosen_ev:
                 log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.shown_suffix), ev)
             yield path, ev
 
