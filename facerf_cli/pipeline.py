@@ -36,7 +36,7 @@ from facerf_cli.field import (
     shrunk,
     weighted_sums,
 )
-from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
+from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import NearLights
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
@@ -240,8 +240,11 @@ def estimate_light(
     rig: Tensor | None = None,
     estimator: Estimator = DEFAULT_ESTIMATOR,
     keep_eyes: bool = False,
+    more: Sequence[Head] = (),
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
+
+    Of a shot the heads of `more` frames take part in the field's least squares.
 
     The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
@@ -253,9 +256,13 @@ def estimate_light(
         small = resize(texture, evidence.photo.shape[-1])[0]
         return LightEstimate(explained.light, evidence, small)
     rig = rig_directions() if rig is None else rig
-    olats = torch.cat(list(Field(models, shrunk(head.face)).olats(rig)))
-    evidence = replace(evidence, directions=rig, olats=olats)
-    weights, features = evidence.least_squares(estimator.non_negative), estimator.features
+    heads = [(head, evidence), *((one, photo_evidence(one.face, keep_eyes)) for one in more)]
+    frames = [
+        replace(seen, directions=rig, olats=torch.cat(list(Field(models, shrunk(one.face)).olats(rig))))
+        for one, seen in heads
+    ]
+    evidence, features = frames[0], estimator.features
+    weights = joined(frames).least_squares(estimator.non_negative)
     if features is None:
         return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training

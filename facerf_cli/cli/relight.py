@@ -62,6 +62,7 @@ from facerf_cli.cli.shots import (
     Shot,
     check_shots,
     collect_frames,
+    follow_all,
     recipe_of_shots,
 )
 from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
@@ -159,21 +160,13 @@ class Relight:
 
         check_output(self.output)
         self.photo.preparation(dry_run)()
-        self._follow(dry_run)
+        follow_all(self.shots, self.photo, dry_run)
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self
         setups = readable(self.setups)
         if not setups:
             raise FacerfError("no map can be read; give others")
         return replace(self, setups=setups)
-
-    def _follow(self, dry_run: bool) -> None:
-        """Follow the face through each shot."""
-        if self.shots and not dry_run:
-            from facerf_cli.cli.items.shot_frames import follow_shot
-
-            for shot in self.shots:
-                follow_shot(shot, self.photo, self.photo.settings)
 
     def __call__(self, item: Item) -> Outcome:
         """Relight a photo, a frame or a stack."""

@@ -134,6 +134,15 @@ def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
     return {"sequence": "sha256:" + hashlib.sha256(digests.encode()).hexdigest()}
 
 
+def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
+    """Follow the face through each shot; what was followed before is kept."""
+    if shots and not dry_run:
+        from facerf_cli.cli.items.shot_frames import follow_shot
+
+        for shot in shots:
+            follow_shot(shot, photo, photo.settings)
+
+
 def check_shots(shots: Sequence[Shot], photo: PhotoOptions) -> None:
     """Raise UsageError for options that a shot cannot have."""
     if not shots:

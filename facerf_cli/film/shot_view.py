@@ -74,21 +74,34 @@ class ShotView:
             raise InputError("no frame shows a face")
         return spread_over(self.seen, KEY_FRAMES)
 
+    @property
+    def middle_first(self) -> list[int]:
+        """The key frames, that of the middle first."""
+        keys = self.key_frames
+        middle = keys[len(keys) // 2]
+        return [middle, *(key for key in keys if key != middle)]
+
     @cached_property
     def _identity(self) -> Tensor:
         shape = self._read(self.seen[0]).shape
         places = [self._path[frame] for frame in self.seen]
         return identity_of(self._models.face, places, (shape[0], shape[1]), self._sides.crop_px)
 
+    def landmarks_px(self, frame: int) -> np.ndarray:
+        """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
+        if frame not in self._seen_set:
+            raise InputError(f"frame {frame}: the face is lost, in more frames than are bridged")
+        found: np.ndarray = self._path[frame]
+        return found
+
     def _fit(self, frame: int) -> FaceFit:
-        if not np.isfinite(self._path[frame]).all():
-            raise InputError(f"frame {frame}: the face is lost here, and in more frames than are bridged")
+        landmarks_px = self.landmarks_px(frame)
         shape = self._read(frame).shape
         return next(
             fit_frames(
                 self._models.face,
                 self._identity,
-                [self._path[frame]],
+                [landmarks_px],
                 (shape[0], shape[1]),
                 self._sides.crop_px,
             )
@@ -111,7 +124,7 @@ class ShotView:
     def _look(self, frame: int) -> tuple[Tensor, Tensor]:
         """Classes of a frame alone, and the small image that they were seen in."""
         image = self._display(frame)
-        return seen_classes(image, self._path[frame]), small_image(image)
+        return seen_classes(image, self.landmarks_px(frame)), small_image(image)
 
     def _segmentation(self, frame: int) -> Segmentation:
         around = self._around(frame)

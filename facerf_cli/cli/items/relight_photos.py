@@ -121,8 +121,7 @@ def _leader_of(item: Item, work: Relight) -> Item | None:
     place = shot_of(work.shots, item)
     if place is None:
         return work.leader_of(item)
-    keys = view_of(place[0], work.photo).key_frames
-    return place[0].frames[keys[len(keys) // 2]]
+    return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
 
 
 @cache

@@ -3,7 +3,8 @@
 import json
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -16,12 +17,13 @@ from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot
 from facerf_cli.colour import SRGB, named_space, to_linear_rec709
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import face_at, read_landmarks, to_display
+from facerf_cli.face.landmarks import Face, face_at, read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
 from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line
+from facerf_cli.portrait.segment import Segmentation
 
 _DECODED = 12  # frames of a film that are kept as they were decoded
 log = logging.getLogger(LOGGER_NAME)
@@ -165,13 +167,27 @@ def view_of(shot: Shot, options: PhotoOptions) -> ShotView:
     return _opened(shot, options)[1]
 
 
+@contextmanager
+def _named(shot: Shot, number: int) -> Iterator[None]:
+    """Put the name of a frame's file before an error."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{shot.frames[number].input_path}: {error}") from None
+
+
+def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[LinearImage, Face, Segmentation]:
+    """A frame, its face, and its person, steadied by the frames around it."""
+    frames, view = _opened(shot, options)
+    with _named(shot, number):
+        face, found = face_at(view.landmarks_px(number)), view.segmentation(number)
+    return frames.image(number), face, found
+
+
 def seen_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[LinearImage, FittedFace]:
     """A frame, and its head with what is steadied by the frames around it."""
     frames, view = _opened(shot, options)
-    try:
-        head = view.head(number)
-        steady = view.steady(number)
-    except InputError as error:
-        raise InputError(f"{shot.frames[number].input_path}: {error}") from None
+    with _named(shot, number):
+        head, steady = view.head(number), view.steady(number)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
     return frames.image(number), FittedFace("", face_at(landmarks_px), head, steady)
