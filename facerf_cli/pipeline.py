@@ -146,8 +146,10 @@ def reflectance_of(
     field = Field(models, head.face, own.quotient if own else None, memory_bytes)
     if photo is None or kind == "field":
         return field
-    person = steady.person if steady else look_at_person(models.face, photo, head.fit)
-    return PortraitField.of(models.face, head, field, own, person, steady.maps if steady else maps_of(person))
+    if steady and steady.portrait:
+        return PortraitField.of(models.face, head, field, own, *steady.portrait)
+    person = look_at_person(models.face, photo, head.fit)
+    return PortraitField.of(models.face, head, field, own, person, maps_of(person))
 
 
 def composition_of(

@@ -30,6 +30,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
+from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 
@@ -63,11 +64,14 @@ class PortraitLight:
 
 @dataclass(frozen=True, eq=False)
 class SteadyFrame:
-    """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot."""
+    """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot.
+
+    `portrait` is for the portrait field alone: the person as it sees them, and their maps.
+    """
 
     light: RigLight
-    person: SeenPerson
-    maps: PortraitMaps
+    segmentation: Segmentation
+    portrait: tuple[SeenPerson, PortraitMaps] | None = None
 
 
 class _Some(NamedTuple):

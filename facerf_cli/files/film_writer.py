@@ -12,7 +12,7 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode
-from facerf_cli.files.film import Film, require_av
+from facerf_cli.files.film import Film, exact, require_av
 from facerf_cli.files.images import PHOTO_LIMIT_PX
 
 _BT709, _LIMITED = 1, 1  # matrix, primaries and transfer; range (ITU-T H.273)
@@ -82,7 +82,7 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
             sound = _Sound(av, container, timing.sound, form.copied) if timing.sound else None
             for ticks, lasts, image in _timed(images, timing):
                 frame = av.VideoFrame.from_ndarray(_even(_pixels(image, form)), format=form.source)
-                frame = frame.reformat(format=form.pixels, dst_colorspace=_BT709)
+                frame = frame.reformat(format=form.pixels, dst_colorspace=_BT709, interpolation=exact(av))
                 frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, _CLOCK), lasts
                 container.mux(stream.encode(frame))
                 if sound:

@@ -57,9 +57,10 @@ class ShotView:
         classes = self.segmentation(frame).classes
         return head.without(model, uncovered_in(classes, (height, width), fit.crop))
 
-    def steady(self, frame: int) -> SteadyFrame:
-        """The person of a frame, as the portrait field takes it."""
-        return SteadyFrame(self.light, self._person(frame), self._steady_maps(frame))
+    def steady(self, frame: int, portrait: bool = True) -> SteadyFrame:
+        """What a frame takes from those around it; `portrait` says whether the portrait field is wanted."""
+        maps = (self._person(frame), self._steady_maps(frame)) if portrait else None
+        return SteadyFrame(self.light, self.segmentation(frame), maps)
 
     @cached_property
     def light(self) -> RigLight:

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-REACH = 3  # frames on each side of a curve's window
+REACH = 5  # frames on each side of a curve's window
 _FULL = 4  # frames with weight from which on a window has a quadratic; with fewer it is a line or a mean
 MAPS_REACH = 2  # frames on each side of a map's window
 _ALIKE = 0.03  # difference of images, in 0..1, at which a neighbour's weight falls to 0.6

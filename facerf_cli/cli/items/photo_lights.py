@@ -49,7 +49,7 @@ def write_shot_light(shot: Shot, item: Item, options: LightOptions, width_px: in
     """Estimate and write the one light of a shot, from key frames together; facts for the report."""
     view = view_of(shot, options.photo)
     number, *others = view.middle_first
-    image, face = seen_frame(shot, number, options.photo)
+    image, face = seen_frame(shot, number, options.photo, portrait=False)
     more = [view.head(frame) for frame in others]
     return _write(item, image, face, options, width_px, sh_order, more) | {"frames": view.key_frames}
 

@@ -110,7 +110,7 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 def _seen(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
     """The image of an item and its faces; those of a frame of a shot steadied by the frames around it."""
     if place := shot_of(work.shots, item):
-        image, face = seen_frame(*place, work.photo)
+        image, face = seen_frame(*place, work.photo, work.reflectance == "portrait")
         return image, [face]
     image = read_photo(item, work.photo)
     return image, fit_faces(item, image, work.photo)
@@ -207,7 +207,7 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
         return Target(posed, work.composite)
     matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
     if matte is None and face.steady is not None:
-        matte = face.steady.person.segmentation.matte
+        matte = face.steady.segmentation.matte
     kind = work.background.kind
     return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
 

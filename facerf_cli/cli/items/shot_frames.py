@@ -184,10 +184,12 @@ def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[Lin
     return frames.image(number), face, found
 
 
-def seen_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[LinearImage, FittedFace]:
-    """A frame, and its head with what is steadied by the frames around it."""
+def seen_frame(
+    shot: Shot, number: int, options: PhotoOptions, portrait: bool = True
+) -> tuple[LinearImage, FittedFace]:
+    """A frame, and its head with what is steadied by the frames around it; see `ShotView.steady`."""
     frames, view = _opened(shot, options)
     with _named(shot, number):
-        head, steady = view.head(number), view.steady(number)
+        head, steady = view.head(number), view.steady(number, portrait)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
     return frames.image(number), FittedFace("", face_at(landmarks_px), head, steady)
