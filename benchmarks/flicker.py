@@ -25,7 +25,7 @@ from facerf_cli import pipeline
 from facerf_cli.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
-from facerf_cli.film.follow import Follower, path_of
+from facerf_cli.film.follow import Follower
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import BakeSettings
@@ -129,8 +129,8 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight the frames as `facerf relight FILM` does."""
     follower = Follower("largest")
-    path = path_of([follower.see(to_display(frame)) for frame in frames])
-    view = ShotView(models, models.sides(), frames.__getitem__, path)
+    sightings = [follower.see(to_display(frame)) for frame in frames]
+    view = ShotView(models, models.sides(), frames.__getitem__, sightings)
     return [relit(models, frames[n], view.head(n), view.steady(n)) for n in range(len(frames))]
 
 

@@ -4,7 +4,7 @@ What a frame needs of its neighbours is computed once, as frames are asked for i
 than it is needed; so memory does not grow with the length of the shot.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -16,6 +16,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.field import light_of_frames
+from facerf_cli.film.follow import Sighting, path_of
 from facerf_cli.film.shot_fit import fit_frames, identity_of, spread_over
 from facerf_cli.film.smoothing import MAPS_REACH, steadied
 from facerf_cli.light.sphere import RigLight
@@ -32,30 +33,39 @@ _UNIT = ("normals", "strands")  # maps of unit vectors
 
 
 class ShotView:
-    """A person through a shot, whose smoothed landmarks are `path` [N, 68, 2], NaN where the face is lost.
+    """A person through a shot, whose face was sighted in some frames.
 
     `read` gives frames [H, W, 3], scene-linear, by number.
     """
 
     def __init__(
-        self, models: Models, sides: Sides, read: Callable[[int], np.ndarray], path: np.ndarray
+        self,
+        models: Models,
+        sides: Sides,
+        read: Callable[[int], np.ndarray],
+        sightings: Sequence[Sighting | None],
     ) -> None:
-        self._models, self._sides, self._read, self._path = models, sides, read, path
-        self.seen = np.flatnonzero(np.isfinite(path).all((1, 2))).tolist()
+        self._models, self._sides, self._read = models, sides, read
+        self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
+        self._sighted = [frame for frame, seen in enumerate(sightings) if seen]
+        self._shown = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
         self._display = lru_cache(2)(lambda frame: to_display(read(frame)))
         self._classes = lru_cache(_KEPT)(self._look)
-        self.segmentation = lru_cache(_KEPT)(self._segmentation)
+        self.head: Callable[[int], Head] = lru_cache(_KEPT)(self._seen_head)  # without what covers its skin
+        self.segmentation: Callable[[int], Segmentation] = lru_cache(_KEPT)(self._segmentation)
         self._person = lru_cache(_KEPT)(self._seen_person)
         self._maps = lru_cache(_KEPT)(lambda frame: maps_of(self._person(frame)))
 
-    def head(self, frame: int) -> Head:
-        """The head of a frame, without what covers its skin."""
+    def _seen_head(self, frame: int) -> Head:
         model, fit, photo = self._models.face, self._fit(frame), self._read(frame)
         cropped = fit.crop.apply(photo)
         head = Head(cropped, fit, unwrap_face(model, fit, cropped, self._sides.texture, photo.shape))
         height, width = photo.shape[:2]
         classes = self.segmentation(frame).classes
-        return head.without(model, uncovered_in(classes, (height, width), fit.crop))
+        try:
+            return head.without(model, uncovered_in(classes, (height, width), fit.crop))
+        except InputError:  # all of it is covered: in this frame something passes before it
+            return head
 
     def steady(self, frame: int, portrait: bool = True) -> SteadyFrame:
         """What a frame takes from those around it; `portrait` says whether the portrait field is wanted."""
@@ -70,10 +80,10 @@ class ShotView:
 
     @cached_property
     def key_frames(self) -> list[int]:
-        """Frames that stand for the shot, evenly spread over those that show the face."""
-        if not self.seen:
+        """Frames that stand for the shot, evenly spread over those in which the face was sighted."""
+        if not self._sighted:
             raise InputError("no frame shows a face")
-        return spread_over(self.seen, KEY_FRAMES)
+        return spread_over(self._sighted, KEY_FRAMES)
 
     @property
     def middle_first(self) -> list[int]:
@@ -84,13 +94,13 @@ class ShotView:
 
     @cached_property
     def _identity(self) -> Tensor:
-        shape = self._read(self.seen[0]).shape
-        places = [self._path[frame] for frame in self.seen]
+        shape = self._read(self._sighted[0]).shape
+        places = [self._path[frame] for frame in self._sighted]
         return identity_of(self._models.face, places, (shape[0], shape[1]), self._sides.crop_px)
 
     def landmarks_px(self, frame: int) -> np.ndarray:
         """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
-        if frame not in self._seen_set:
+        if frame not in self._shown:
             raise InputError(f"frame {frame}: the face is lost, in more frames than are bridged")
         found: np.ndarray = self._path[frame]
         return found
@@ -113,14 +123,10 @@ class ShotView:
         found = [frame]
         for step in (-1, 1):
             at = frame + step
-            while abs(at - frame) <= MAPS_REACH and 0 <= at < len(self._path) and at in self._seen_set:
+            while abs(at - frame) <= MAPS_REACH and 0 <= at < len(self._path) and at in self._shown:
                 found.append(at)
                 at += step
         return sorted(found)
-
-    @cached_property
-    def _seen_set(self) -> frozenset[int]:
-        return frozenset(self.seen)
 
     def _look(self, frame: int) -> tuple[Tensor, Tensor]:
         """Classes of a frame alone, and the small image that they were seen in."""

@@ -20,7 +20,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import Face, face_at, read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
-from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
+from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.portrait.segment import Segmentation
@@ -157,8 +157,8 @@ def _say_gaps(shot: Shot, sightings: Sequence[Sighting | None]) -> None:
 def _opened(shot: Shot, options: PhotoOptions) -> tuple[ShotFrames, ShotView]:
     frames = ShotFrames(shot, options)
     models = load_models_once(options)
-    path = path_of([_sighting(row) for row in _rows(shot)[1:]])
-    view = ShotView(models, models.sides(options.texture_side), frames.pixels, path)
+    sightings = [_sighting(row) for row in _rows(shot)[1:]]
+    view = ShotView(models, models.sides(options.texture_side), frames.pixels, sightings)
     return frames, view
 
 
