@@ -65,7 +65,7 @@ from facerf_cli.cli.shots import (
     follow_all,
     recipe_of_shots,
 )
-from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
+from facerf_cli.cli.values import Exposure, is_sweep, parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
 Composite = Literal["photo", "face"]
@@ -341,12 +341,14 @@ def relight(
         ),
     ] = False,
     envmap_sampling: Annotated[
-        Sampling,
+        Sampling | None,
         typer.Option(
-            help="Give each light the map's integral over its cell, or, as in the paper, one pixel.",
+            help="Give each light the map's integral over its cell; share it smoothly among lights; or, "
+            "as in the paper, one pixel.",
+            show_default="cell; smooth for --rotate FROM:TO:N",
             rich_help_panel=LIGHT,
         ),
-    ] = "cell",
+    ] = None,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
     face: FaceOption = "largest",
@@ -421,7 +423,7 @@ def relight(
         photo=photo,
         setups=collect_setups(envmap or (), rotate, light or (), output, settings.seed, lit),
         rig=lights,
-        sampling=envmap_sampling,
+        sampling=envmap_sampling or ("smooth" if rotate and is_sweep(rotate) else "cell"),
         pose=pose,
         composite=shown,
         background=behind,
