@@ -168,6 +168,8 @@ def estimate_light(
     is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the residual
     inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
 
+    A film, or images with --sequence, has one light, which is estimated from several frames together.
+
     A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
     the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
     """

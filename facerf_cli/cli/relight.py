@@ -380,6 +380,10 @@ def relight(
     serves all maps and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the
     end.
 
+    A film, or images with --sequence, is one shot: one identity, and one light by which the field is
+    corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or FILE.mov joins
+    frames to a film, with the sound of the film that they come from.
+
     An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
     the nearest of them.
     """

@@ -74,6 +74,8 @@ def segment(
     'person.A' and 'class.skin', 'class.hair', 'class.ears', 'class.neck', 'class.garment' and others, 0 to 1,
     which sum to the matte), _person.png (the person over nothing), _overlay.jpg (classes and landmarks over
     the photo), _landmarks.json (for --landmarks). The report says how sure facerf is of each photo.
+
+    Each frame of a film, or with --sequence of numbered images, is steadied by the frames around it.
     """
     photo = PhotoOptions(
         settings_of(context),

@@ -159,4 +159,7 @@ def whole_shots(items: Sequence[Item], shots: Sequence[Shot]) -> list[Item]:
     """The items with one for each shot, its first frame, in place of its frames."""
     inside = {item.output_base for shot in shots for item in shot.frames}
     alone = [item for item in items if item.output_base not in inside]
-    return alone + [replace(shot.frames[0], output_base=shot.base, name=shot.base.name) for shot in shots]
+    for shot in shots:
+        name = PurePosixPath(shot.frames[0].name).with_name(shot.base.name).as_posix()
+        alone.append(replace(shot.frames[0], output_base=shot.base, name=name))
+    return alone

@@ -45,10 +45,9 @@ def envmap_weights(
     """Weights [L, 3] float32 of the lights at `directions` [L, 3] under a linear map [H, W, 3].
 
     `rotate_deg` is added to every azimuth of the map. Sampling "cell" integrates the map over cells: pi times
-    the sum of the weights is the integral of the map, at any map size. Sampling "smooth" shares each direction
-    of the map among the three lights around it, so that weights change without steps as the map turns.
-    Sampling "paper" takes the map's pixel at the light's direction (paper, 'Relighting'), times an equal share
-    of the sphere.
+    the sum of the weights is the integral of the map, at any map size. "smooth" shares each direction of the
+    map among the three lights around it, so that weights change without steps as the map turns. "paper" takes
+    the map's pixel at the light's direction (paper, 'Relighting'), times an equal share of the sphere.
     """
     return rotated_weights(envmap, directions, [rotate_deg], sampling)[0]
 

@@ -171,6 +171,16 @@ def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     assert [row["landmarks"] is None for row in track] == [False, True, False]
 
 
+def test_a_sequence_with_a_hole_is_said(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in (1, 3):
+        write_exr(tmp_path / f"plate.{number}.exr", frame_of(number) / np.float32(255))
+    line = (tmp_path / "plate.1-3.exr", "--sequence", "--light", "0,0", "-o", tmp_path / "out")
+    assert facerf(given, "relight", *line, *CHEAP) == 1
+    assert "plate.2.exr: no such file; a shot needs all of its frames" in capsys.readouterr().err
+
+
 def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert facerf(given, "estimate-light", given / "me.mp4", "--lights", "20", "-o", out) == 0

@@ -65,6 +65,8 @@ def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:
 
     The landmarks of each frame are added to the shot's track at once.
     """
+    if missing := [item for item in shot.frames if not item.input_path.is_file()]:
+        raise InputError(f"{missing[0].input_path}: no such file; a shot needs all of its frames")
     head = json.loads(json_line(_made_from(shot, options)))
     rows = _rows(shot)
     if not rows or rows[0] != head:
