@@ -112,14 +112,14 @@ class FilmOutput:
             self.folder.rmdir()
 
 
-class Frames(Protocol):
+class FrameWork(Protocol):
     """A verb's work on frames: `Relight`."""
 
     def outputs_of(self, item: Item) -> list[Path]:
         """The images of an item."""
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """What shapes them."""
+        """Recipes of the images."""
 
     def readable(self, dry_run: bool) -> Self:
         """The work with its models loaded."""
@@ -132,7 +132,7 @@ def run_to_film(
     film: FilmOutput,
     items: Sequence[Item],
     shots: Sequence[Shot],
-    work: Frames,
+    work: FrameWork,
     options: BatchOptions,
     settings: Settings,
 ) -> int:

@@ -21,7 +21,7 @@ _CLOCK = 90_000  # ticks a second, in which the times of frames are written
 
 @dataclass(frozen=True)
 class _Form:
-    """A way to write a film; `copied` sound is kept as it is, other sound is encoded anew as AAC."""
+    """A way to write a film; `copied` sound is kept as it is, other sound is encoded again, as AAC."""
 
     codec: str
     pixels: str
@@ -135,7 +135,7 @@ def _even(pixels: np.ndarray) -> np.ndarray:
 
 
 class _Sound:
-    """Sound of a film, copied into another one; encoded anew where that cannot hold it."""
+    """Sound of a film, copied into another one; encoded again where that cannot hold it."""
 
     def __init__(self, av: Any, container: Any, path: Path, copied: Sequence[str]) -> None:
         self._av, self._container = av, container

@@ -68,7 +68,7 @@ class ShotView:
             return head
 
     def steady(self, frame: int, portrait: bool = True) -> SteadyFrame:
-        """What a frame takes from those around it; `portrait` says whether the portrait field is wanted."""
+        """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
         maps = (self._person(frame), self._steady_maps(frame)) if portrait else None
         return SteadyFrame(self.light, self.segmentation(frame), maps)
 
