@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
@@ -160,6 +160,8 @@ def _see_shard(backgrounds: Tensor, seed: int, paths: list[Path]) -> None:
 def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Tensor]:
     """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
 
+    All is seen in the view's own frame, so that it lies on the view's images.
+
     classes [C, S, S], covered [1, S, S] and visible [L, s, s] of the view's lights: uint8, of 255; normals
     [3, S, S], depth [1, S, S]: float16.
     """
@@ -176,7 +178,7 @@ def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Ten
             face = find_faces(exposed, "portrait")[0]
             crop = from_landmarks(face.landmarks_px, _CROP_PX)
             fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-            person = look_at_person(_builtin(), exposed, fit)
+            person = look_at_person(_builtin(), exposed, fit, Crop(0.0, 0.0, float(SIDE_PX), SIDE_PX))
             normals, depth, covered = surface_of(person.maps)
             return {
                 "classes": (255 * person.classes).round().byte(),
