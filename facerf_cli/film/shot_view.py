@@ -141,7 +141,7 @@ class ShotView:
 
     def _seen_person(self, frame: int) -> SeenPerson:
         fit, segmentation = self._fit(frame), self.segmentation(frame)
-        return look_at_person(self._models.face, self._read(frame), fit, segmentation)
+        return look_at_person(self._models.face, self._read(frame), fit, segmentation=segmentation)
 
     def _steady_maps(self, frame: int) -> PortraitMaps:
         """Maps of a frame, averaged with its neighbours' in the square, which follows the head."""
