@@ -202,6 +202,7 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
         (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--format", "png"), "--format"),
         (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--background", "none"), "has no alpha"),
         (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "25"), "keeps its own times"),
+        (("{film}", "--light", "0,0", "-o", "{film}"), "is the input"),
         (("{film}", "--light", "0,0", "-o", "{out}.webm"), "give one of these"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--fps", "25"), "is for -o FILE.mp4"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "not a rate"),
