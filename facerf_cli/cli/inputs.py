@@ -66,13 +66,13 @@ def collect_items(
     one place are refused. `-` reads paths from stdin. Hidden files and folders are left out, and so is an
     output folder inside an input folder.
     """
-    output_real = output_folder.resolve()
+    output_real = os.path.realpath(output_folder)  # resolve() fails for links in a circle
     found: dict[Path, tuple[Path, PurePosixPath]] = {}  # absolute -> as the user would write it, mirrored
     for path in map(Path, expand_inputs(inputs, null_separated)):
         if not path.is_dir():
             found.setdefault(Path(os.path.abspath(path)), (path, PurePosixPath(path.name)))
             continue
-        if path.resolve() == output_real:
+        if os.path.realpath(path) == output_real:
             raise UsageError(f"{path}: the output folder is an input folder; give another one with -o")
         for file in _walk(path, output_real, suffixes):
             absolute, mirrored = Path(os.path.abspath(file)), PurePosixPath(file.relative_to(path))
@@ -147,10 +147,12 @@ def _numbered(entry: str, before: str, after: str) -> list[str]:
     return [path for _, path in found]
 
 
-def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator[Path]:
+def _walk(folder: Path, output_real: str, suffixes: frozenset[str]) -> Iterator[Path]:
     for here, folders, files in os.walk(folder):
         folders[:] = [
-            name for name in folders if name[0] != "." and (Path(here) / name).resolve() != output_real
+            name
+            for name in folders
+            if name[0] != "." and os.path.realpath(os.path.join(here, name)) != output_real
         ]
         for name in files:
             sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files
