@@ -19,12 +19,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.faults import mutations
 from benchmarks.faults.doors import DOORS, Door
 from facerf_cli.errors import FacerfError
 from facerf_cli.logs import LOGGER_NAME, shown
 
 MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 20.0, 2000
 _LONGEST_MESSAGE = 3000
+_LARGEST_BYTES = 4 << 20  # of a case's file
 _PACKAGE = "facerf_cli"
 
 
@@ -35,7 +37,7 @@ class Ended:
     number: int
     outcome: str
     said: str = ""  # of an uncaught error: its class, its place and its message
-    grown_mib: float = 0.0  # of the resident memory, at its peak
+    grown_mib: float = 0.0  # the peak of the child's memory so far, over that at its start
     seconds: float = 0.0
 
 
@@ -46,8 +48,19 @@ def damaged(door: Door, name: str, seed: int, number: int) -> tuple[str, bytes]:
     file = draw.choice(sorted(sound))
     content = sound[file]
     for _ in range(draw.choice((1, 1, 2))):
-        content = draw.choice(door.faults)(content, draw)[: 4 << 20]
+        try:
+            content = draw.choice(door.faults)(content, draw)[:_LARGEST_BYTES]
+        except Exception:  # an earlier fault broke the structure that this one changes
+            content = mutations.bytes_(content, draw)
     return file, content
+
+
+def lay_out(door: Door, path: Path, content: bytes) -> None:
+    """Write a case's file, and those that stand beside it."""
+    for fixed, sound in door.fixed().items():
+        (path.parent / fixed).parent.mkdir(parents=True, exist_ok=True)
+        (path.parent / fixed).write_bytes(sound)
+    path.write_bytes(content)
 
 
 def outcome_of(door: Door, path: Path) -> tuple[str, str]:
@@ -133,36 +146,22 @@ def _serve(door: Door, name: str, seed: int, cases: range, folder: Path, pipe: i
     limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    begin = _peak_mib()
     for number in cases:
         place = folder / str(number)
         place.mkdir()
-        for fixed, content in door.fixed().items():
-            (place / fixed).write_bytes(content)
         file, content = damaged(door, name, seed, number)
-        (place / file).write_bytes(content)
-        before = _resident_mib()
+        lay_out(door, place / file, content)
         start = time.perf_counter()
         outcome, said = outcome_of(door, place / file)
         seconds = time.perf_counter() - start
-        grown = _peak_mib() - before
+        grown = _peak_mib() - begin
         shutil.rmtree(place, ignore_errors=True)
         row = [number, outcome, said, round(grown, 1), round(seconds, 3)]
         fields = ("number", "outcome", "said", "grown_mib", "seconds")
         os.write(pipe, json.dumps(dict(zip(fields, row, strict=True))).encode() + b"\n")
 
 
-def _resident_mib() -> float:
-    """Resident memory now; the peak starts from here."""
-    Path("/proc/self/clear_refs").write_text("5")
-    return _status("VmRSS")
-
-
 def _peak_mib() -> float:
-    return _status("VmHWM")
-
-
-def _status(field: str) -> float:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(field):
-            return int(line.split()[1]) / 1024
-    return 0.0
+    """The most memory that this process has had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -16,7 +16,7 @@ from collections import Counter
 from pathlib import Path
 
 from benchmarks._common import arguments
-from benchmarks.faults.children import Ended, damaged, outcome_of, run_door
+from benchmarks.faults.children import Ended, damaged, lay_out, outcome_of, run_door
 from benchmarks.faults.doors import DOORS, Door
 
 _SLOW_S = 2.0
@@ -81,18 +81,14 @@ def _keep(folder: Path, name: str, seed: int, kind: str, ended: Ended) -> None:
     place.mkdir(parents=True, exist_ok=True)
     if ended.outcome == "uncaught" and "Memory" not in kind:
         content = _smaller(door, place / file, content, ended.said.split(": ")[0])
-    for fixed, sound in door.fixed().items():
-        (place / fixed).write_bytes(sound)
-    (place / file).write_bytes(content)
+    lay_out(door, place / file, content)
 
 
 def _smaller(door: Door, path: Path, content: bytes, kind: str) -> bytes:
     """Leave out parts while the file fails alike: halves, quarters and so on."""
 
     def fails(attempt: bytes) -> bool:
-        for fixed, sound in door.fixed().items():
-            (path.parent / fixed).write_bytes(sound)
-        path.write_bytes(attempt)
+        lay_out(door, path, attempt)
         return outcome_of(door, path)[1].split(": ")[0] == kind
 
     step, attempts = len(content) // 2, 0

@@ -66,7 +66,7 @@ def _oiio(path: Path, kind: str = "uint8", **attributes: Any) -> None:
 def images() -> Samples:
     """An image of each format and of the compressions of EXR and TIFF."""
     files: Samples = {}
-    for name in ("a.jpg", "a.tif", "a.webp", "a.tga", "a.dpx", "a.ppm", "a.pgm", "a.jp2", "a.jxl", "a.hdr"):
+    for name in ("a.jpg", "a.tif", "a.webp", "a.tga", "a.dpx", "a.ppm", "a.pgm", "a.jxl", "a.hdr"):
         channels = 1 if name.endswith("pgm") else 3
         try:
             files |= _written(lambda path, c=channels: _oiio(path, channels=c), name)  # type: ignore[misc]
@@ -158,6 +158,7 @@ def lights() -> Samples:
     return files
 
 
+@cache
 def numbers() -> Samples:
     """Text lights of 9 and 27 numbers."""
     return {
@@ -165,6 +166,7 @@ def numbers() -> Samples:
     }
 
 
+@cache
 def landmarks() -> Samples:
     """68 landmarks as .pts and JSON."""
     points = fit_arrays()["landmarks_px"].tolist()
@@ -176,6 +178,7 @@ def landmarks() -> Samples:
     }
 
 
+@cache
 def light_lists() -> Samples:
     """LP files and lists of directions."""
     rows = [
@@ -185,6 +188,7 @@ def light_lists() -> Samples:
     return {"a.lp": "\n".join(["5", *rows]).encode(), "lights.txt": bare.encode()}
 
 
+@cache
 def shifts() -> Samples:
     """Shifts of Extended Yale B, and facts of evaluated images."""
     return {
@@ -193,6 +197,7 @@ def shifts() -> Samples:
     }
 
 
+@cache
 def directions() -> Samples:
     """A file of `--lights`."""
     return {"lights.csv": b"# az,el\n0,0\n30,10\n-45.5 20\n"}
@@ -218,6 +223,7 @@ def fits() -> Samples:
     return _written(lambda path: save_fit(path, fit_from_arrays(fit_arrays())), "fit.npz")
 
 
+@cache
 def arrays() -> Samples:
     """Images as .npy."""
     files = {}
@@ -228,6 +234,7 @@ def arrays() -> Samples:
     return files
 
 
+@cache
 def face_models() -> Samples:
     """The built-in face model with few coefficients."""
     with np.load(BUILTIN_PATH, allow_pickle=False) as file:
@@ -238,7 +245,7 @@ def face_models() -> Samples:
 
 
 @cache
-def _grid(side: int = 9) -> tuple[np.ndarray, np.ndarray]:
+def _grid(side: int = 21) -> tuple[np.ndarray, np.ndarray]:
     """A bent sheet in metres: vertices [N, 3] and triangles [F, 3]."""
     y, x = np.meshgrid(np.linspace(-0.1, 0.1, side), np.linspace(-0.08, 0.08, side), indexing="ij")
     mean = np.stack([x, -y, 0.05 - 3 * (x**2 + y**2)], -1).reshape(-1, 3)
@@ -247,6 +254,7 @@ def _grid(side: int = 9) -> tuple[np.ndarray, np.ndarray]:
     return mean, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)])
 
 
+@cache
 def flame() -> Samples:
     """FLAME's tables as a pickle of numpy arrays and as .npz, and embeddings of its landmarks."""
     import pickle
@@ -267,6 +275,7 @@ def flame() -> Samples:
     }
 
 
+@cache
 def basel_2009() -> Samples:
     """`01_MorphableModel.mat`, compressed and not."""
     import scipy.io
@@ -286,6 +295,7 @@ def basel_2009() -> Samples:
     return files
 
 
+@cache
 def basel_2017() -> Samples:
     """`model2017-1.h5`."""
     import h5py
@@ -332,6 +342,7 @@ def ict() -> Samples:
     return {"a.zip": zipped.getvalue(), **files}
 
 
+@cache
 def stages() -> Samples:
     """`stage.json` of two cameras."""
     lights = [
@@ -356,6 +367,7 @@ def stages() -> Samples:
     return {"stage.json": json.dumps(content, indent=1).encode()}
 
 
+@cache
 def datasets() -> Samples:
     """`dataset.json` of two subjects."""
     lights = [
@@ -380,6 +392,20 @@ def datasets() -> Samples:
     return {"dataset.json": json.dumps(content, indent=1).encode()}
 
 
+@cache
+def beside_datasets() -> Samples:
+    """Files that a dataset names; only their presence is looked at."""
+    places = [f"{subject}/{camera}" for subject in ("0000", "0001") for camera in ("C0", "C1")]
+    return {f"olat/{place}.exr": b"x" for place in places} | {f"fits/{place}.npz": b"x" for place in places}
+
+
+@cache
+def dataset_of_pairs() -> Samples:
+    """What stands beside `pairs.jsonl`."""
+    return datasets() | beside_datasets()
+
+
+@cache
 def pairs() -> Samples:
     """`relit/pairs.jsonl` of that dataset."""
     row = {
@@ -397,18 +423,21 @@ def pairs() -> Samples:
     return {"pairs.jsonl": "".join(json.dumps(entry) + "\n" for entry in rows).encode()}
 
 
+@cache
 def rigs() -> Samples:
     """The rigs that facerf ships."""
     return {path.name: path.read_bytes() for path in sorted(_RIGS.glob("*.toml"))}
 
 
+@cache
 def configurations() -> Samples:
     """Defaults of options."""
-    text = "[relight]\nexposure = 'auto'\nbackdrop = 'envmap'\n\n[evaluate.yale-b]\nlights = 5\n\n"
+    text = "[relight]\nexposure = 'auto'\njobs = 2\n\n[evaluate.yale-b]\nlights = 5\n\n"
     text += "[global]\nseed = 3\n"
     return {"facerf.toml": text.encode()}
 
 
+@cache
 def indexes() -> Samples:
     """The index of an output folder."""
     rows = [
@@ -419,6 +448,7 @@ def indexes() -> Samples:
     return {".facerf-index.jsonl": "".join(json.dumps(row) + "\n" for row in rows).encode()}
 
 
+@cache
 def reports() -> Samples:
     """The report of an output folder."""
     done = {"verb": "segment", "item": "x", "input": "in/x.jpg", "status": "done", "seconds": 0.1}
@@ -429,6 +459,7 @@ def reports() -> Samples:
     return {"report.jsonl": "".join(json.dumps(row) + "\n" for row in rows).encode()}
 
 
+@cache
 def figures() -> Samples:
     """The figures of an evaluated item."""
     row = {"case": "a", "person": "p", "method": "field", "facts": {"tone": "light"}, "values": {"l1": 0.1}}
@@ -445,11 +476,13 @@ def figures() -> Samples:
     return {"a.json": json.dumps(content).encode()}
 
 
+@cache
 def names() -> Samples:
     """Names of files, as bytes."""
     return {"name": b"a photo.0001.jpg", "other": "Fran\u00e7ois \u4e2d.exr".encode()}
 
 
+@cache
 def words() -> Samples:
     """Values of options."""
     texts = ("30,10", "0:360:24", "at=0.5,0.3,1;size=0.4;rgb=1,0.9,0.8", "from=20,10;name=key", "auto", "1.5")
@@ -464,6 +497,7 @@ def words() -> Samples:
     return {str(number): value.encode() for number, value in enumerate(texts)}
 
 
+@cache
 def pages() -> Samples:
     """A page of `facerf view`, of which the index reads the strip."""
     from facerf_cli.viewer.page import page

@@ -8,6 +8,7 @@ ends it.
 
 import json
 import logging
+import os
 import sys
 import time
 import traceback
@@ -25,7 +26,7 @@ from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path, sweep_leftovers
 from facerf_cli.files.folder_lock import alone_in
-from facerf_cli.files.regular import is_regular
+from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
 from facerf_cli.workers import process_died, spread
 
@@ -92,7 +93,7 @@ def run_files(
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
     code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
-    missing = [item for item in items if options.dry_run and not item.input_path.exists()]
+    missing = [item for item in items if options.dry_run and not os.path.exists(item.input_path)]
     for item in missing:
         log.error("%s: no such file; check the path", item.input_path)
     return max(code, int(bool(missing)))
@@ -247,9 +248,7 @@ class _OfFile:
     process: Callable[[Item], Outcome]
 
     def __call__(self, item: Item) -> Outcome:
-        if not item.input_path.is_file():
-            state = "not a regular file" if item.input_path.exists() else "no such file"
-            raise InputError(f"{item.input_path}: {state}; check the path")
+        require_regular(item.input_path)
         return self.process(item)
 
 
@@ -267,7 +266,7 @@ class _Work:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
-            read = read_row(item.input_path) if self.indexed and item.input_path.is_file() else None
+            read = read_row(item.input_path) if self.indexed and is_regular(item.input_path) else None
             outcome = self.process(item)
             made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
             return result(outcome=outcome, made=made)
@@ -377,7 +376,7 @@ def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
             row = json.loads(line)
         except (ValueError, RecursionError):  # a run that was killed may leave half a line
             continue
-        if isinstance(row, dict):
+        if isinstance(row, dict) and isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
             yield row
 
 

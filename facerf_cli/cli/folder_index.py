@@ -76,7 +76,7 @@ def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
     """Read all outputs in a folder's index; yield each, and `whole`, `missing`, `empty` or `changed`."""
     for name, row in sorted(_Rows(folder).outputs.items()):
         path = folder / name
-        if not path.is_file():
+        if not is_regular(path):
             yield path, "missing"
         elif not path.stat().st_size:
             yield path, "empty"

@@ -69,7 +69,7 @@ def collect_items(
     output_real = os.path.realpath(output_folder)  # resolve() fails for links in a circle
     found: dict[Path, tuple[Path, PurePosixPath]] = {}  # absolute -> as the user would write it, mirrored
     for path in map(Path, expand_inputs(inputs, null_separated)):
-        if not path.is_dir():
+        if not os.path.isdir(path):
             found.setdefault(Path(os.path.abspath(path)), (path, PurePosixPath(path.name)))
             continue
         if os.path.realpath(path) == output_real:

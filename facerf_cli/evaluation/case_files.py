@@ -74,6 +74,9 @@ def read_figures(path: Path) -> ItemFigures:
 
 def _row(entry: Mapping[str, Any]) -> Row:
     values = {name: math.nan if value is None else float(value) for name, value in entry["values"].items()}
+    facts = entry["facts"].items() if isinstance(entry["facts"], dict) else ()
+    if len(facts) != len(entry["facts"]) or not all(isinstance(fact, str | int | float) for _, fact in facts):
+        raise ValueError("its facts are not names and values")
     return Row(**{**entry, "values": values})
 
 
