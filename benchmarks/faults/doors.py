@@ -227,7 +227,7 @@ def _names(path: Path) -> None:
     for made in (item.output("_relit.exr"), item.filled(pattern)):
         assert out in Path(os.path.normpath(made)).parents, f"out of the folder: {made!a}"
     report = path.parent / "report.jsonl"
-    report.write_text(json_line({"item": item.name, "input": item.input_path}) + "\n", encoding="utf-8")
+    report.write_text(json_line({"verb": "x", "item": item.name}) + "\n", encoding="utf-8")
     (row,) = _rows_of(report)
     assert row["item"] == json.loads(json_line({"item": item.name}))["item"]
     assert "<script>x" not in index_page([IndexEntry(f"<script>x{name}", name, "")])
@@ -317,8 +317,8 @@ DOORS: dict[str, Door] = {
     "npy images": Door(_npy_pixels, _array, (mutations.npy, mutations.bytes_), 1),
     "face models": Door(samples.face_models, _face_model, _FITS, 0.1),
     "FLAME": Door(samples.flame, _flame, (mutations.bytes_, mutations.bytes_, mutations.zip_), 2),
-    "Basel 2009": Door(samples.basel_2009, _basel_2009, weight=0.06),
-    "Basel 2017": Door(samples.basel_2017, _basel_2017, weight=0.06),
+    "Basel 2009": Door(samples.basel_2009, _basel_2009, weight=0.04),
+    "Basel 2017": Door(samples.basel_2017, _basel_2017, weight=0.04),
     "ICT-FaceKit": Door(samples.ict, _ict, (mutations.zip_, mutations.bytes_), 0.2),
     "stage.json": Door(samples.stages, _stage, _JSON, 2),
     "dataset.json": Door(samples.datasets, _dataset, _JSON, 2, samples.beside_datasets),

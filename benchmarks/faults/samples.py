@@ -212,7 +212,7 @@ def checkpoints() -> Samples:
     network = DefaultReflectanceNetwork(settings)
     metadata = {"layout_version": 1, "provenance": {"licence": "MIT"}, "metrics": {"l1": 0.1}}
     files = _written(lambda path: save_networks(path, {"reflectance": network}, metadata), "a.safetensors")
-    bare = {"format": "facerf-checkpoint-1", "facerf": json.dumps({"networks": {}})}
+    bare = {"format": "facerf-checkpoint-1", "facerf": json.dumps({"networks": {}, "layout_version": 1})}
     files["b.safetensors"] = save({"w": torch.zeros(3, 4), "n": torch.arange(4)}, bare)
     return files
 
@@ -432,7 +432,7 @@ def rigs() -> Samples:
 @cache
 def configurations() -> Samples:
     """Defaults of options."""
-    text = "[relight]\nexposure = 'auto'\njobs = 2\n\n[evaluate.yale-b]\nlights = 5\n\n"
+    text = "[relight]\nexposure = 'auto'\njobs = 2\n\n[evaluate.yale-b]\njobs = 5\n\n"
     text += "[global]\nseed = 3\n"
     return {"facerf.toml": text.encode()}
 

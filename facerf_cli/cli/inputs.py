@@ -20,6 +20,7 @@ _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
 _NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
 _MOST_FRAMES = 100_000
+_LONGEST_PATH = 4096  # characters
 
 
 @dataclass(frozen=True, order=True)
@@ -111,7 +112,7 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
     for entry in inputs:
         if entry == "-":
             yield from filter(None, _stdin_names(null_separated))
-        elif os.path.exists(entry):
+        elif os.path.exists(entry) or len(entry) > _LONGEST_PATH:
             yield entry
         elif frames := _FRAMES.fullmatch(entry):
             yield from _range(entry, *frames.groups())

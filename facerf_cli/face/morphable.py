@@ -29,7 +29,7 @@ HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by i
 _ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
 # numpy parses a header as a text of Python, and believes its sizes.
 _HEADER_ERRORS = (SyntaxError, TokenError, OverflowError, MemoryError, SystemError)
-_ARRAY_ERRORS = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, AttributeError)
+_ARRAY_ERRORS = (ValueError, OSError, LookupError, EOFError, RuntimeError, TypeError, AttributeError)
 NPZ_ERRORS = (*_ARRAY_ERRORS, *_HEADER_ERRORS, *_ZIP_ERRORS)
 _HEAD_KEYS = ("mean", "identity", "expression", "triangles", "part", "uv")
 _HEAD_PREFIX = "head_"  # of the head's arrays in a face model's file

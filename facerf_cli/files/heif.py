@@ -30,7 +30,7 @@ def heif_header(path: Path) -> tuple[Any, oiio.ImageSpec]:
         ) from None
     try:
         image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
-    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
+    except Exception as error:  # whatever a damaged file makes the decoder raise
         raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
     width, height = image.size
     channels = len(image.mode.split(";")[0]) if image.mode.startswith("RGB") else 1
@@ -49,7 +49,7 @@ def decode_heif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
     """Decode all channels [H, W, C] of the main image, upright, as float32 in 0..1."""
     try:
         values = np.asarray(image)
-    except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
+    except Exception as error:  # whatever a damaged file makes the decoder raise
         raise InputError(f"{path}: damaged or cut short; copy it again ({error})") from None
     most = np.float32(65535 if values.dtype == np.uint16 else 255)
     return values.reshape(spec.height, spec.width, spec.nchannels).astype(np.float32) / most
