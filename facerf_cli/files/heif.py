@@ -30,11 +30,11 @@ def heif_header(path: Path) -> tuple[Any, oiio.ImageSpec]:
         ) from None
     try:
         image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
+        (width, height), mode = image.size, image.mode  # of a file without images these raise, too
     except Exception as error:  # whatever a damaged file makes the decoder raise
         raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
-    width, height = image.size
-    channels = len(image.mode.split(";")[0]) if image.mode.startswith("RGB") else 1
-    spec = oiio.ImageSpec(width, height, channels, "uint16" if image.mode.endswith(";16") else "uint8")
+    channels = len(mode.split(";")[0]) if mode.startswith("RGB") else 1
+    spec = oiio.ImageSpec(width, height, channels, "uint16" if mode.endswith(";16") else "uint8")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if profile := image.info.get("icc_profile"):
         content = np.frombuffer(profile, np.uint8)

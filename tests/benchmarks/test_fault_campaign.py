@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import re
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ from facerf_cli.errors import InputError
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "corpus"
 FINDINGS = sorted(path.relative_to(CORPUS) for path in CORPUS.rglob("*") if path.is_file())
-BY_FOLDER = {name.replace(" ", "_").replace(".", "_").replace("-", "_"): name for name in DOORS}
+BY_FOLDER = {re.sub(r"\W+", "_", name): name for name in DOORS}  # as inputs.py names them
 NOT_FOR_IT = {"environment maps", "options", "command lines"}  # have samples that they refuse
 SCRIPTS = ("inputs", "kills", "places")
 
