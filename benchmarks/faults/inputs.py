@@ -25,9 +25,7 @@ _ROUNDS = 300  # attempts at making a finding smaller
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument(
-        "--cases", type=int, default=20_000, help="of all doors together; a door has its share"
-    )
+    parser.add_argument("--cases", type=int, default=20_000, help="of all doors together")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--door", action="append", choices=sorted(DOORS), help="these only; may be repeated")
     parser.add_argument("--findings", type=Path, help="folder for files that were uncaught, crashed or hung")
