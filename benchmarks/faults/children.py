@@ -24,7 +24,7 @@ from benchmarks.faults.doors import DOORS, Door
 from facerf_cli.errors import FacerfError
 from facerf_cli.logs import LOGGER_NAME, shown
 
-MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 20.0, 2000
+MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 60.0, 2000
 _LONGEST_MESSAGE = 3000
 _LARGEST_BYTES = 4 << 20  # of a case's file
 _PACKAGE = "facerf_cli"

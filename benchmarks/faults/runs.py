@@ -1,5 +1,6 @@
 """Runs of a verb in forks of this process, and what they left: nothing half, one row an item."""
 
+import atexit
 import json
 import os
 import shutil
@@ -99,6 +100,7 @@ def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -
             code = main(line)
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
+        atexit._run_exitfuncs()
     finally:
         os._exit(code)
 

@@ -85,8 +85,13 @@ def images() -> Samples:
     files |= _written(lambda path: (_oiio(path), embed_xmp(path, {"Software": "x"})), "xmp.png", "xmp.jpg")
     profile = _profile()
     files |= _written(lambda path: _with_profile(path, profile), "icc.png", "icc.jpg", "icc.tif")
-    files["a.heic"] = (Path(__file__).parents[2] / "tests" / "files" / "phone.heic").read_bytes()
     return files
+
+
+@cache
+def phone_photos() -> Samples:
+    """A HEIC photo; each is decoded in a process of its own."""
+    return {"a.heic": (Path(__file__).parents[2] / "tests" / "files" / "phone.heic").read_bytes()}
 
 
 def _profile() -> bytes:

@@ -25,12 +25,15 @@ _CHILD = "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
 _CHILD += "from facerf_cli.files.apart import serve; serve()"
 
 
-def arrays_apart(module: str, reader: str, path: Path, time_s: float = _TIME_S) -> dict[str, np.ndarray]:
-    """Call `reader` of a module, which takes a path and returns arrays by name, in a process of its own.
+def arrays_apart(
+    module: str, reader: str, path: Path, *limits: int, time_s: float = _TIME_S
+) -> dict[str, np.ndarray]:
+    """Call `reader(path, *limits)` of a module, which returns arrays by name, in a process of its own.
 
     Raises ValueError with what the reader raised there, or how its process ended.
     """
     command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), module, reader, os.fspath(path)]
+    command += map(str, limits)
     with tempfile.TemporaryFile() as file:
         try:
             ended = subprocess.run(
@@ -60,10 +63,10 @@ def _death(code: int) -> str:
 
 def serve() -> None:
     """The child: read and send."""
-    _, _, module, reader, path = sys.argv
+    _, _, module, reader, path, *limits = sys.argv
     _limit()
     try:
-        arrays = getattr(importlib.import_module(module), reader)(Path(path))
+        arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
     except Exception as error:  # whatever a damaged file makes its library raise
         print(str(error) or type(error).__name__, file=sys.stderr)
         sys.exit(_REFUSED)

@@ -6,6 +6,7 @@ data is on the disk before the rename, and the rename before the next step (Pill
 Are Not Created Equal', OSDI 2014).
 """
 
+import atexit
 import errno
 import hashlib
 import os
@@ -77,6 +78,7 @@ def _remove_own() -> None:
 
 
 clean_by(_remove_own)
+atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
 
 
 def _room_name(stem: str) -> str:

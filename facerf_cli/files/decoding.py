@@ -8,7 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.heif import decode_heif, heif_header, is_heif
+from facerf_cli.files.heif import decode_heif, is_heif
 from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
 from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import LOGGER_NAME, one_line
@@ -25,9 +25,7 @@ def decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; give an image file")
     if is_heif(path):
-        image, spec = heif_header(path)
-        _check_size(path, spec, limit_px)
-        return decode_heif(path, image, spec), spec
+        return decode_heif(path, limit_px)
     require_whole_png(path)
     return _decode_by_oiio(path, limit_px)
 

@@ -166,6 +166,7 @@ def require_whole_png(path: Path) -> None:
 
     OpenImageIO does not report such damage reliably.
     """
+    size = path.stat().st_size
     with path.open("rb") as stream:
         if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
             return
@@ -173,7 +174,7 @@ def require_whole_png(path: Path) -> None:
         while kind != b"IEND":
             head = stream.read(8)
             length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
-            body, checksum = stream.read(length), stream.read(4)
+            body, checksum = stream.read(min(length, size)), stream.read(4)  # a length may be 4 GiB
             if len(body) != length or len(checksum) != 4:
                 raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
             if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
