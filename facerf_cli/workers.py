@@ -6,7 +6,6 @@ A process that is killed costs its own item; in joblib's and the standard librar
 import logging
 import os
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
@@ -16,10 +15,11 @@ from typing import Any, TypeVar
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.logs import LOGGER_NAME, log_to_queue
+from facerf_cli.stopping import end_on_signals
 
 T = TypeVar("T")
 R = TypeVar("R")
-_PATIENCE_S = 10  # for a worker to end after SIGTERM
+_PATIENCE_S = 1.0  # for a worker to unwind after SIGTERM
 
 
 @dataclass
@@ -132,7 +132,7 @@ def _end_workers(workers: Sequence[_Worker]) -> None:
     for worker in workers:
         worker.process.terminate()
     for worker in workers:
-        worker.process.join(_PATIENCE_S)
+        worker.process.join(1.5 * _PATIENCE_S)
         worker.process.kill()
         worker.process.join()
         worker.pipe.close()
@@ -141,8 +141,10 @@ def _end_workers(workers: Sequence[_Worker]) -> None:
 def _serve(pipe: Any, level: int, threads: int) -> None:
     """Run a worker process: a result for each item, until None. Imports torch only after this call."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds: temporary files are removed
+    for number in ("SIGINT", "SIGHUP"):  # a terminal sends them to all; our parent ends us
+        if hasattr(signal, number):
+            signal.signal(getattr(signal, number), signal.SIG_IGN)
+    end_on_signals(_PATIENCE_S, interrupts=False)
     wire = _Wire(pipe)
     log_to_queue(wire, level)
     with suppress(EOFError, BrokenPipeError):  # the parent has ended
