@@ -85,7 +85,7 @@ def view(
 ) -> None:
     """Make a web page in which a photo is relit by moving lights.
 
-    One file of a few megabytes, which a browser opens without a server or a network: single lights, rotated
+    One file of about 10 MB, which a browser opens without a server or a network: single lights, rotated
     environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
     """
     photo = PhotoOptions(

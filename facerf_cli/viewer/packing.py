@@ -107,7 +107,7 @@ def _head(matte: np.ndarray, crop: Crop) -> list[float]:
 
 
 def _exposure(field: PortraitField, whole: WholePerson) -> dict[str, Any]:
-    """What `anchored_exposure_ev` compares a relit person with."""
+    """Brightness of the photo, with which `anchored_exposure_ev` compares a relit person."""
     plate = luminance(field.person.image.permute(1, 2, 0).numpy())
     skin = field.person.classes[class_index("skin")].numpy() > _SURE
 
