@@ -143,15 +143,15 @@ class Composition:
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
         self._photo = photo if target.composite == "photo" else None
         self._face, self._target = head.face, target
-        self._detail: PhotoDetail | None = None
+        self.detail: PhotoDetail | None = None
         self.surround: AroundFace | None = None
         self._person = person
         self._mask = self.view.full(self.view.mask)
         if self._photo is not None:
             matte = target.matte
-            self._matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
-            self._own = self._photo if matte is None else _own_colours(self._photo, self._matte)
-            self._detail = PhotoDetail(self._own, head.face, self.view)
+            self.matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
+            self.own = self._photo if matte is None else _own_colours(self._photo, self.matte)
+            self.detail = PhotoDetail(self.own, head.face, self.view)
             self.surround = person or Surround(vertices, crop, head.face.texture, *size_px)
 
     def image(self, relit: Relit, ev: float = 0.0, behind: np.ndarray | None = None) -> RelitImage:
@@ -162,32 +162,32 @@ class Composition:
         if self._photo is None:
             return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask)
         person = self._relit_person(relit)
-        matte = self._matte[..., None]
+        matte = self.matte[..., None]
         if self._target.background == "none":
-            return RelitImage(person, self._matte)
+            return RelitImage(person, self.matte)
         if behind is not None:
             return RelitImage(behind + matte * (person - behind))
-        behind = (self._photo - matte * self._own) * np.float32(2.0**-ev)
+        behind = (self._photo - matte * self.own) * np.float32(2.0**-ev)
         return RelitImage(behind + matte * person)
 
     def _relit_person(self, relit: Relit) -> np.ndarray:
         """Pixels [H, W, 3] of the person, also where the matte leaves none of them."""
-        assert self.surround is not None and self._detail is not None and relit.surround is not None
-        person = self.surround.over_photo(self._own, relit.surround)
+        assert self.surround is not None and self.detail is not None and relit.surround is not None
+        person = self.surround.over_photo(self.own, relit.surround)
         mask = self.view.mask.numpy()[..., None]
-        person[self.view.window] += mask * (self._detail.relit(relit.texture) - person[self.view.window])
+        person[self.view.window] += mask * (self.detail.relit(relit.texture) - person[self.view.window])
         return person
 
     def person(self, relit: Relit) -> tuple[np.ndarray, np.ndarray]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
         own = self._mask if self._person is None else self._person.matte
-        return self._relit_person(relit), np.minimum(self._matte, own)
+        return self._relit_person(relit), np.minimum(self.matte, own)
 
     def light_layer(self, relit: Relit) -> np.ndarray:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""
         if self._photo is None:
             return self.view.full(self.view.render(relit.texture)) * self._mask[..., None]
-        return self._relit_person(relit) * self._matte[..., None]
+        return self._relit_person(relit) * self.matte[..., None]
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
@@ -195,7 +195,7 @@ class Composition:
         `names` are of `PERSON_LAYERS` where a whole person is relit; else, and for what only the face has, of
         `FACE_LAYERS`. Raises UsageError for others.
         """
-        found = {} if self._photo is None else {"person.A": self._matte}
+        found = {} if self._photo is None else {"person.A": self.matte}
         for name in names:
             if self._person is not None and relit.surround is not None and name in PERSON_LAYERS:
                 found |= self._person.layer(name, relit.surround)
@@ -244,11 +244,13 @@ class PhotoDetail:
         self._view, self._texture = view, face.texture
         own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
         side = face.texture.shape[1:]
-        own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[0, 0]
-        self._trusted = face.visible * (1 - own)
-        self._mean_source = _mean(face.texture, self._trusted)
-        floor = _DARK * float(self._mean_source.mean()) + _TINY
-        self._around_source = inpaint(face.texture, self._trusted).clamp(min=floor)
+        self.own_texture = own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[
+            0, 0
+        ]
+        self.trusted = face.visible * (1 - own)
+        self.mean_source = _mean(face.texture, self.trusted)
+        self.floor = floor = _DARK * float(self.mean_source.mean()) + _TINY
+        self._around_source = inpaint(face.texture, self.trusted).clamp(min=floor)
         rendered = view.render(torch.cat([face.texture, own[None]])).numpy()
         source, self._own = rendered[..., :3], rendered[..., 3:]
         self._pixels = photo[view.window].clip(min=0)
@@ -260,8 +262,8 @@ class PhotoDetail:
 
     def relit(self, texture: Tensor) -> np.ndarray:
         """The photo's pixels [h, w, 3] under the light of a relit texture [3, T, T]."""
-        mean_change = _mean(texture, self._trusted) / self._mean_source.clamp(min=_TINY)
-        around = inpaint(texture, self._trusted) / self._around_source
+        mean_change = _mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)
+        around = inpaint(texture, self.trusted) / self._around_source
         rendered = self._view.render(torch.cat([texture, around])).numpy()
         skin = rendered[..., :3] * self._gain + mean_change.numpy() * self._bias
         return skin + self._own * (rendered[..., 3:] * self._pixels - skin)

@@ -5,6 +5,7 @@ light keeps every pore and hair; shading and highlights of a light are smooth an
 """
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -36,10 +37,10 @@ class WholePerson:
     def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
         self.matte = field.person.segmentation.matte
         self._field, self._photo = field, photo
-        self._own = (1 - field.person.classes[0] > _SURE).float()
+        self.own = (1 - field.person.classes[0] > _SURE).float()
         hair = field.person.classes[[class_index("hair"), class_index("beard")]].sum(0, keepdim=True)
-        self._hair_maps = torch.cat([self._filled(field.maps.albedo[0].mean(0, keepdim=True)), hair])
-        self._albedo_maps = torch.cat([self._gain_lines(), self._filled(field.maps.bias[0])])
+        self.hair_maps = torch.cat([self._filled(field.maps.albedo[0].mean(0, keepdim=True)), hair])
+        self.albedo_maps = torch.cat([self._gain_lines(), self._filled(field.maps.bias[0])])
 
     @property
     def nbytes(self) -> int:
@@ -50,7 +51,7 @@ class WholePerson:
         """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
         result = np.empty_like(photo)
         highlights = _blurred(self._filled(lit[3:6]), _GLOSS_PX)
-        maps = [self._albedo_maps, self._filled(lit[:3]), highlights, self._change(lit), self._hair_maps]
+        maps = [self.albedo_maps, self._filled(lit[:3]), highlights, self._change(lit), self.hair_maps]
         for rows, wide, inside in self._bands(torch.cat(maps)):
             shading, shine, change, hair = torch.split(wide[_ALBEDO_MAPS:], [3, 3, 3, 2])
             albedo = self._albedo(photo[rows], wide)
@@ -63,17 +64,20 @@ class WholePerson:
 
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
+        return _blurred(self._filled(self._relit(lit)), _CHANGE_PX) / self.own_change
+
+    @cached_property
+    def own_change(self) -> Tensor:
+        """The photo's own part [3, S, S] of that change: its blur, and a little that keeps it from 0."""
         own = self._field.person.image
-        both = self._filled(torch.cat([self._relit(lit), own]))
-        smooth = _blurred(both, _CHANGE_PX)
-        return smooth[:3] / (smooth[3:] + _DARK * own.mean())
+        return _blurred(self._filled(own), _CHANGE_PX) + _DARK * own.mean()
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [9, S, S]."""
         images = self._relit(lit), self._field.person.image
         relit, plate = (image.permute(1, 2, 0).numpy() for image in images)
         skin = self._field.person.classes[class_index("skin")].numpy()
-        return chosen_exposure_ev(rule, relit, plate, skin, self._own.numpy())
+        return chosen_exposure_ev(rule, relit, plate, skin, self.own.numpy())
 
     def _relit(self, lit: Tensor) -> Tensor:
         """The person in the square [3, S, S], as coarse as the maps."""
@@ -110,7 +114,7 @@ class WholePerson:
 
     def _albedo_map(self) -> np.ndarray:
         albedo = np.empty_like(self._photo)
-        for rows, wide, _ in self._bands(self._albedo_maps):
+        for rows, wide, _ in self._bands(self.albedo_maps):
             part = self._albedo(self._photo[rows], wide) * self._field.exposure
             albedo[rows] = part.permute(1, 2, 0).numpy()
         return albedo
@@ -121,13 +125,13 @@ class WholePerson:
         guide = torch.from_numpy(to_display(photo)).permute(2, 0, 1).float() / 255
         slopes, offset, bias = torch.split(wide[:_ALBEDO_MAPS], [9, 3, 3])
         log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
-        log_gain = log_gain.clamp(self._range[0], self._range[1])
+        log_gain = log_gain.clamp(self.gain_range[0], self.gain_range[1])
         return pixels / self._field.person.exposure * log_gain.exp() + bias
 
     def _gain_lines(self) -> Tensor:
         """Log of the gain as a linear function of the photo's colours: slopes and offsets [12, S, S]."""
         log_gain = self._filled(self._field.maps.gain[0].log())
-        self._range = float(log_gain.min()), float(log_gain.max())
+        self.gain_range = float(log_gain.min()), float(log_gain.max())
         guide = to_display(self._field.person.image.permute(1, 2, 0).numpy()).astype(np.float32) / 255
         lines = [local_lines(channel.numpy(), guide, _REACH_PX, _SMOOTHNESS) for channel in log_gain]
         slopes = np.concatenate([slope.transpose(2, 0, 1) for slope, _ in lines])
@@ -135,7 +139,7 @@ class WholePerson:
 
     def _filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with the person's values continued over the background."""
-        return inpaint(maps, self._own)
+        return inpaint(maps, self.own)
 
     def _bands(self, maps: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Rows of the photo, the maps [C, h, W] over them, and the weight [h, W] of the square there."""

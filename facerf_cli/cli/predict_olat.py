@@ -37,6 +37,7 @@ from facerf_cli.errors import UsageError
 
 Precision = Literal["float32", "bf16"]
 Frame = Literal["photo", "face", "uv"]
+StackFormat = Literal["exr", "relight"]
 _LARGEST_PX = 16384
 
 
@@ -52,14 +53,18 @@ class PredictOlat:
     network_alone: bool
     memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     precision: Precision
+    format: StackFormat = "exr"
+    page: bool = False
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """The stack and its contact sheet."""
+        """The stack, its contact sheet and, where they are asked for, its page."""
         return self.files_of(item, self.photo.first_tag)
 
     def files_of(self, item: Item, tag: str) -> list[Path]:
-        """The stack and the contact sheet of the face with a tag."""
-        return [item.output(f"{tag}_olat.exr"), item.output(f"{tag}_olat.png")]
+        """The files of the face with a tag: stack, contact sheet, page."""
+        stack = f"{tag}_olat.exr" if self.format == "exr" else f"{tag}_relight/info.json"
+        pages = [item.output(f"{tag}.html")] if self.page else []
+        return [item.output(stack), item.output(f"{tag}_olat.png"), *pages]
 
     def __call__(self, item: Item) -> Outcome:
         """Predict every chosen face."""
@@ -113,6 +118,18 @@ def predict_olat(
     precision: Annotated[
         Precision, typer.Option(help="Compute the network in this precision.", rich_help_panel=METHOD)
     ] = "float32",
+    format_: Annotated[
+        StackFormat,
+        typer.Option(
+            "--format",
+            help="Write OpenEXR; or a folder for the web viewers Relight and OpenLIME, front lights only.",
+            rich_help_panel=IMAGE,
+        ),
+    ] = "exr",
+    page: Annotated[
+        bool,
+        typer.Option("--page", help="Write the web page of `facerf view`, too.", rich_help_panel=IMAGE),
+    ] = False,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
@@ -141,7 +158,16 @@ def predict_olat(
     if frame == "photo" and pose is not None:
         raise UsageError("--pose: turns the head out of its photo; use --frame face or uv with it")
     chosen: Frame = frame or ("photo" if pose is None else "face")
-    work = PredictOlat(photo, lights, pose, chosen, size, network_alone, int(memory * 2**30), precision)
+    if format_ == "relight" and chosen == "uv":
+        raise UsageError("--format relight: shows images, not UV textures; use --frame photo or face")
+    if page and (network_alone or pose is not None):
+        raise UsageError(
+            "--page: shows the photo's own pose and light; give neither --pose nor --network-alone"
+        )
+    memory_bytes = int(memory * 2**30)
+    work = PredictOlat(
+        photo, lights, pose, chosen, size, network_alone, memory_bytes, precision, format_, page
+    )
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
         "predict-olat",

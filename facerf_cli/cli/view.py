@@ -10,7 +10,6 @@ from facerf_cli.cli.batch import BatchOptions, Outcome, run_files, sums_up
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.options import (
     IMAGE,
-    LIGHT,
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
@@ -38,7 +37,6 @@ class MakePage:
 
     photo: PhotoOptions
     size_px: int
-    lights: int
 
     def outputs_of(self, item: Item) -> list[Path]:
         """The page of an item's (first) face."""
@@ -75,16 +73,6 @@ def view(
             rich_help_panel=IMAGE,
         ),
     ] = 1024,
-    lights: Annotated[
-        int,
-        typer.Option(
-            min=60,
-            max=2000,
-            metavar="N",
-            help="Sample the directions of light at so many; more are sharper.",
-            rich_help_panel=LIGHT,
-        ),
-    ] = 800,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
@@ -97,7 +85,7 @@ def view(
 ) -> None:
     """Make a web page in which a photo is relit by moving lights.
 
-    One file of a few megabytes, which a browser opens without a server or a network: single lights, rotated
+    One file of about 10 MB, which a browser opens without a server or a network: single lights, rotated
     environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
     """
     photo = PhotoOptions(
@@ -110,7 +98,7 @@ def view(
         landmarks_from=landmarks_from,
     )
     photo.check()
-    work = MakePage(photo, size, lights)
+    work = MakePage(photo, size)
     one = output.suffix.lower() == _PAGE
     folder = output.parent if one else output
     items = collect_items(inputs, folder, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)

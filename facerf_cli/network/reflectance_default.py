@@ -76,7 +76,7 @@ class DefaultReflectanceNetwork(nn.Module):
         )
         coarser = (*dec[1:], dec[-1])
         self.up = nn.ModuleList(
-            _LitUp(coarser[i], dec[i], enc[i], coarsest=i == len(dec) - 1) for i in range(len(dec))
+            LitUp(coarser[i], dec[i], enc[i], coarsest=i == len(dec) - 1) for i in range(len(dec))
         )
         self.head = nn.Conv2d(dec[0], 6, 3, padding=1)
         nn.init.normal_(self.head.weight, std=1e-3)
@@ -200,7 +200,7 @@ class Down(nn.Module):
         return result
 
 
-class _LitUp(nn.Module):
+class LitUp(nn.Module):
     """Double the side (except in the coarsest), add skip and light maps, modulate by the light's code."""
 
     def __init__(self, channels_in: int, channels_out: int, skip_channels: int, coarsest: bool) -> None:
@@ -215,6 +215,7 @@ class _LitUp(nn.Module):
         self.outer = nn.Conv2d(channels_out, channels_out, 3, padding=1)
 
     def forward(self, x: Tensor, skip: Tensor, maps: Tensor, code: Tensor, lights: int) -> Tensor:
+        """Features [B * lights, C, H, W] from those below, the face's, and the maps and codes of lights."""
         side = skip.shape[-1]
         x = self.enter(x)
         if self.scale == 2:

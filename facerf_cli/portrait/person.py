@@ -49,14 +49,15 @@ class SeenPerson:
 
     def visibility(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights [L, 3] that reaches the person, on `VISIBILITY_PX`."""
-        return visibility(self.proxy, self._small_camera, directions)
+        return visibility(self.proxy, self.small_camera, directions)
 
     def visibility_of_points(self, places_m: Tensor) -> Tensor:
         """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
-        return visibility_of_points(self.proxy, self._small_camera, places_m)
+        return visibility_of_points(self.proxy, self.small_camera, places_m)
 
     @property
-    def _small_camera(self) -> Camera:
+    def small_camera(self) -> Camera:
+        """The camera of the square at `VISIBILITY_PX`."""
         square = Crop(self.square.x0_px, self.square.y0_px, self.square.side_px, VISIBILITY_PX)
         return square_camera(self.fit, square)
 

@@ -82,6 +82,28 @@ class ProxyMaps:
     covered: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class ShadowRays:
+    """The rays by which a light's visibility is found in a camera's pixels that a proxy covers [s, s].
+
+    They begin at origins [N, 3] and end on the disc of a light, by numbers [rays, 2, N, 1] in 0..1.
+    """
+
+    covered: Tensor
+    origins: np.ndarray
+    numbers: np.ndarray
+
+    @staticmethod
+    def of(proxy: Proxy, camera: Camera) -> "ShadowRays":
+        """Begin rays a little off the surface that the camera sees."""
+        maps = proxy_maps(proxy, camera)
+        inside = maps.covered.numpy() > 0
+        normals, points = (field.numpy()[:, inside].T for field in (maps.normals, maps.positions_m))
+        origins = (points + _OFF_M * normals).astype(np.float32)
+        numbers = np.random.default_rng(_SEED).random((_RAYS, 2, len(origins), 1)).astype(np.float32)
+        return ShadowRays(maps.covered, origins, numbers)
+
+
 def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop) -> Proxy:
     """Shape the proxy of a fitted face; classes [C, S, S] are what is seen in the square around it."""
     person = _person()
@@ -145,19 +167,16 @@ def _toward(place_m: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, np.nd
 
 def _reached(proxy: Proxy, camera: Camera, lights: Sequence[_Light]) -> Tensor:
     """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
-    maps = proxy_maps(proxy, camera)
-    inside = maps.covered.numpy() > 0
-    normals, points = (field.numpy()[:, inside].T for field in (maps.normals, maps.positions_m))
-    origins = (points + _OFF_M * normals).astype(np.float32)
+    rays = ShadowRays.of(proxy, camera)
     scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
-    random = np.random.default_rng(_SEED)
-    numbers = random.random((_RAYS, 2, len(origins), 1)).astype(np.float32)
+    inside, origins = rays.covered.numpy() > 0, rays.origins
     found = np.zeros((len(lights), *inside.shape), np.float32)
     for number, light in enumerate(lights):
         axis, reach_m = light(origins)
-        blocked = [occluded(scene, origins, on_disc(axis, _RADIUS_DEG, *pair), reach_m) for pair in numbers]
+        directions = (on_disc(axis, _RADIUS_DEG, *pair) for pair in rays.numbers)
+        blocked = [occluded(scene, origins, some, reach_m) for some in directions]
         found[number, inside] = 1 - np.mean(blocked, 0)
-    filled = inpaint(torch.from_numpy(found), maps.covered)
+    filled = inpaint(torch.from_numpy(found), rays.covered)
     return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
 
 

@@ -1,78 +1,100 @@
-// The relit image without WebGL2: the same sums by the processor, at a smaller size.
+// The relit image without WebGL2: the same formulas by the processor, at a smaller size.
 
 const CANVAS_PX = 400; // of the longer side
 
 class CanvasView {
-  constructor(canvas, data, images) {
-    this.data = data;
+  constructor(canvas, data, arrays, images) {
+    Object.assign(this, { data, arrays });
     const scale = Math.min(1, CANVAS_PX / Math.max(...data.size));
+    this.scale = scale;
     [this.width, this.height] = data.size.map((side) => Math.max(1, Math.round(side * scale)));
     [canvas.width, canvas.height] = [this.width, this.height];
     this.context = canvas.getContext("2d");
-    this.scale = scale;
-    this.detail = this.small(images.detail);
-    this.matte = this.small(images.matte);
-    this.background = this.small(images.background);
-    this.atlas = pixelsOf(images.maps);
-    this.atlasWidth = images.maps.width;
+    this.bytes = ["photo", "fringe", "matte"].map((name) => pixelsOf(images[name]));
+    this.facePx = Math.sqrt(arrays.faceTexture.length / 3);
   }
 
-  small(image) {
-    const canvas = document.createElement("canvas");
-    [canvas.width, canvas.height] = [this.width, this.height];
-    const context = canvas.getContext("2d");
-    context.drawImage(image, 0, 0, this.width, this.height);
-    return context.getImageData(0, 0, this.width, this.height).data;
+  light(lit) {
+    this.lit = lit;
   }
 
-  draw(sums, ev, withBackground) {
-    const ratio = this.summed(sums);
-    const gain = this.data.gain * 2 ** ev;
+  draw(withBackground) {
     const shown = this.context.createImageData(this.width, this.height);
-    const [mapWidth, mapHeight] = this.data.mapSize;
-    const [left, top, width, height] = this.data.box;
-    for (let y = 0, i = 0; y < this.height; y++) {
-      const row = within(Math.floor((((y + 0.5) / this.scale - top) / height) * mapHeight), mapHeight);
-      for (let x = 0; x < this.width; x++, i += 4) {
-        const column = within(Math.floor((((x + 0.5) / this.scale - left) / width) * mapWidth), mapWidth);
-        const share = this.matte[i] / 255;
-        const at = 3 * (row * mapWidth + column);
-        const grey = (ratio[at] + ratio[at + 1] + ratio[at + 2]) / 3;
-        const colour = limited((grey * gain) / SHADE, 0, 1);
-        for (let c = 0; c < 3; c++) {
-          const change = Math.max(0, grey + colour * (ratio[at + c] - grey));
-          const person = DECODED[this.detail[i + c]] * change * gain;
-          const linear = withBackground ? DECODED[this.background[i + c]] + share * person : person;
-          shown.data[i + c] = 255 * encoded(linear) + 0.5;
-        }
-        shown.data[i + 3] = withBackground ? 255 : 255 * share;
+    for (let y = 0, to = 0; y < this.height; y++) {
+      for (let x = 0; x < this.width; x++, to += 4) {
+        const at = [x, y].map((value, i) => Math.min(this.data.size[i] - 1, Math.floor((value + 0.5) / this.scale)));
+        shown.data.set(this.pixel(...at, withBackground), to);
       }
     }
     this.context.putImageData(shown, 0, 0);
   }
 
-  // The sum of the maps [h, w, 3].
-  summed(sums) {
-    const { scales, mapSize, tile, columns } = this.data;
-    const [width, height] = mapSize;
-    const ratio = new Float32Array(3 * width * height);
-    for (let k = 0; k < scales.length; k++) {
-      const corner = Math.floor(k / columns) * tile[1] * this.atlasWidth + (k % columns) * tile[0];
-      const weights = [0, 1, 2].map((c) => (sums[3 * k + c] * scales[k]) / 127);
-      for (let y = 0; y < height; y++) {
-        let from = 4 * (corner + y * this.atlasWidth);
-        let to = 3 * y * width;
-        for (let x = 0; x < width; x++, from += 4, to += 3) {
-          for (let c = 0; c < 3; c++) ratio[to + c] += weights[c] * (this.atlas[from + c] - 128);
-        }
-      }
-    }
-    return ratio;
+  // The bytes [4] of a pixel of the photo.
+  pixel(x, y, withBackground) {
+    const [photo, fringe, matte] = this.bytes;
+    const from = 4 * (y * this.data.size[0] + x);
+    const share = matte[from] / 255;
+    const plate = [0, 1, 2].map((c) => DECODED[photo[from + c]]);
+    const own = share > 0 && share < 1 ? [0, 1, 2].map((c) => DECODED[fringe[from + c]]) : plate;
+    const person = this.withFace(this.person(own, x + 0.5, y + 0.5), own, x, y);
+    const bytes = plate.map((value, c) => {
+      const mixed = value - share * own[c] + share * person[c];
+      const seen = withBackground ? mixed + share * (softened(mixed) - mixed) : softened(person[c]);
+      return 255 * encoded(seen);
+    });
+    return [...bytes, withBackground ? 255 : 255 * share];
+  }
+
+  person(own, x, y) {
+    const { person } = this.data;
+    const { side } = person;
+    const area = side * side;
+    const [u, v] = [(x - person.square[0]) / person.square[2], (y - person.square[1]) / person.square[2]];
+    const fine = (planes, c) => sampledAt(planes, c * area, side, u * side, v * side);
+    const lines = this.arrays.albedoLines;
+    const guide = own.map((value) => Math.round(255 * encoded(value * person.guideGain)) / 255);
+    const albedo = own.map((value, c) => {
+      const gain = guide.reduce((sum, shown, k) => sum + shown * fine(lines, 3 * c + k), fine(lines, 9 + c));
+      return (value / person.personExposure) * Math.exp(limited(gain, ...person.gainRange)) + fine(lines, 12 + c);
+    });
+    const mean = (albedo[0] + albedo[1] + albedo[2]) / 3;
+    const finer = limited(mean / Math.max(fine(this.arrays.hair, 0), 1e-4), ...STRAND_RANGE);
+    const strands = 1 + fine(this.arrays.hair, 1) * (finer - 1);
+    const inside = limited((1 - Math.max(Math.abs(2 * u - 1), Math.abs(2 * v - 1))) / FEATHER, 0, 1);
+    const { lit, change, gain } = this.lit;
+    const blocks = Math.sqrt(change.length / 3);
+    return own.map((value, c) => {
+      const radiance = (albedo[c] * fine(lit, c) + strands * fine(lit, 3 + c)) * person.exposure;
+      const beyond = value * sampledAt(change, c * blocks * blocks, blocks, blockAt(u, side), blockAt(v, side));
+      return gain * (beyond + inside * (radiance - beyond));
+    });
+  }
+
+  withFace(person, own, x, y) {
+    const [left, top, width, height] = this.data.window;
+    const [column, row] = [x - left, y - top];
+    if (column < 0 || row < 0 || column >= width || row >= height) return person;
+    const { window, faceTexture, ownDetail } = this.arrays;
+    const at = row * width + column;
+    const mask = window[2 * width * height + at] / 65535;
+    if (!mask) return person;
+    const px = this.facePx;
+    const [u, v] = [(window[at] / 65535) * px, (window[width * height + at] / 65535) * px];
+    const texel = (planes, c) => sampledAt(planes, c * px * px, px, u, v);
+    const { texture, around, mean, gain } = this.lit;
+    const floor = this.data.person.detailFloor;
+    const kept = texel(ownDetail, 0);
+    return own.map((value, c) => {
+      const source = texel(faceTexture, c);
+      const skin = texel(texture, c);
+      const relit =
+        value >= source
+          ? (skin * (value + floor)) / (source + floor) + (mean[c] * floor * (value - source)) / (source + floor)
+          : (skin * value) / Math.max(source, 1e-8);
+      const detailed = gain * (relit + kept * (texel(around, c) * value - relit));
+      return person[c] + mask * (detailed - person[c]);
+    });
   }
 }
 
 const DECODED = Float32Array.from({ length: 256 }, (_, value) => decoded(value / 255));
-
-function within(index, size) {
-  return Math.min(size - 1, Math.max(0, index));
-}

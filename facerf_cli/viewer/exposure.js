@@ -1,42 +1,31 @@
-// The exposure of `facerf relight --exposure auto`: the face as bright as in the photo (colour.py).
+// The exposure of `facerf relight --exposure auto`: the face as bright as in the photo; and its view (colour.py).
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const BLACK = 1e-9;
-const SHADE = 0.06; // of an exposed ratio, below which its colour fades: there it is noise
+const SHOULDER = 0.8; // luminance from which on the soft view bends
 
 class AutoExposure {
-  constructor(data) {
+  constructor(data, arrays) {
     this.about = data.exposure;
-    this.skin = this.samples(data.exposure.skin);
-    this.person = this.samples(data.exposure.person);
+    this.masks = [arrays.skin, arrays.own];
   }
 
-  samples(part) {
-    const signed = new Int8Array(bytesOf(part.factors).buffer);
-    return { count: part.count, scales: part.scales, factors: signed };
-  }
-
-  // EV, to two decimals, of a light with sums [K * 3].
-  ev(sums) {
-    const [face, most] = [this.skin, this.person].map((part, i) =>
-      percentile(this.luminances(part, sums), this.about.percentiles[i]),
-    );
+  // EV, to two decimals, of a person [3, side, side] as coarse as the maps.
+  ev(relit) {
+    const [face, most] = this.masks.map((mask, i) => percentile(luminances(relit, mask), this.about.percentiles[i]));
     if (Math.min(face, this.about.wanted) <= BLACK) return 0;
     const gain = Math.min(this.about.wanted / face, (2 * Math.max(1, this.about.own)) / Math.max(most, BLACK));
     return Math.round(100 * Math.log2(gain)) / 100;
   }
+}
 
-  luminances(part, sums) {
-    const values = new Float32Array(part.count);
-    for (let k = 0; k < part.scales.length; k++) {
-      const weights = LUMINANCE.map((share, c) => (share * sums[3 * k + c] * part.scales[k]) / 127);
-      for (let n = 0; n < part.count; n++) {
-        const at = 3 * (k * part.count + n);
-        for (let c = 0; c < 3; c++) values[n] += weights[c] * part.factors[at + c];
-      }
-    }
-    return values;
+function luminances(planes, mask) {
+  const values = [];
+  const area = mask.length;
+  for (let i = 0; i < area; i++) {
+    if (mask[i] > 0.5) values.push(LUMINANCE[0] * planes[i] + LUMINANCE[1] * planes[area + i] + LUMINANCE[2] * planes[2 * area + i]);
   }
+  return values;
 }
 
 function percentile(values, percent) {
@@ -46,6 +35,10 @@ function percentile(values, percent) {
   const low = Math.floor(at);
   const high = Math.min(low + 1, sorted.length - 1);
   return sorted[low] + (at - low) * (sorted[high] - sorted[low]);
+}
+
+function softened(linear) {
+  return linear <= SHOULDER ? linear : 1 - (1 - SHOULDER) * Math.exp((SHOULDER - linear) / (1 - SHOULDER));
 }
 
 function encoded(linear) {

@@ -1,42 +1,12 @@
-"""The photo of a page and, smaller, the part of it that holds the person: two frames of one head."""
+"""The photo of a page at its size, and images at others."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.composite import Composition, Target
-from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
-from facerf_cli.models import Models
-from facerf_cli.pipeline import composition_of
-from facerf_cli.portrait_field import PortraitField
-
-_SEEN = 0.02  # share of the person from which on a pixel is inside the box
-
-
-@dataclass(frozen=True)
-class PersonBox:
-    """A part of a frame, in its pixels."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-
-    @staticmethod
-    def around(matte: np.ndarray) -> "PersonBox":
-        """The smallest box with all of a person's matte [H, W]; the whole frame of an empty matte."""
-        rows, columns = (np.flatnonzero((matte > _SEEN).any(axis)) for axis in (1, 0))
-        if not len(rows):
-            return PersonBox(0, 0, matte.shape[1], matte.shape[0])
-        left, top = int(columns[0]), int(rows[0])
-        return PersonBox(left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top)
-
-    def of(self, image: np.ndarray) -> np.ndarray:
-        """The part [height, width, ...] of an image."""
-        return image[self.top : self.top + self.height, self.left : self.left + self.width]
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -59,38 +29,5 @@ def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarra
     height, width = fitted(photo.shape[0], photo.shape[1], most_px)
     if (height, width) == photo.shape[:2]:
         return photo, head
-    whole = PersonBox(0, 0, photo.shape[1], photo.shape[0])
-    return resized(photo, height, width), _moved_head(head, whole, width / photo.shape[1])
-
-
-def small_composition(
-    models: Models,
-    photo: np.ndarray,
-    head: Head,
-    field: PortraitField,
-    matte: np.ndarray,
-    box: PersonBox,
-    px: int,
-) -> Composition:
-    """Compose the person in a box of the photo, at `px` pixels along its longer side at most."""
-    height, width = fitted(box.height, box.width, px)
-    scale = width / box.width
-    person = replace(field.person, square=_moved(field.person.square, box, scale))
-    target = Target(matte=resized(box.of(matte), height, width), background="none")
-    return composition_of(
-        models,
-        resized(box.of(photo), height, width),
-        _moved_head(head, box, scale),
-        replace(field, person=person),
-        target,
-    )
-
-
-def _moved_head(head: Head, box: PersonBox, scale: float) -> Head:
-    return replace(head, fit=replace(head.fit, crop=_moved(head.fit.crop, box, scale)))
-
-
-def _moved(crop: Crop, box: PersonBox, scale: float) -> Crop:
-    """A crop of a photo, in the pixels of a box that is scaled."""
-    x0_px, y0_px = (crop.x0_px - box.left) * scale, (crop.y0_px - box.top) * scale
-    return replace(crop, x0_px=x0_px, y0_px=y0_px, side_px=crop.side_px * scale)
+    crop = head.fit.crop.of_scaled(width / photo.shape[1])
+    return resized(photo, height, width), replace(head, fit=replace(head.fit, crop=crop))

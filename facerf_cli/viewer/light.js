@@ -13,19 +13,19 @@ function azimuthElevation([x, y, z]) {
   return [Math.atan2(x, z) / DEGREE, Math.atan2(y, Math.hypot(x, z)) / DEGREE];
 }
 
-// The rig of a page: coefficients of any direction, linear over the triangle of lights that it meets.
+// The stage: the lights over which maps are integrated, and coefficients of its factored textures.
 class Rig {
-  constructor(data) {
-    this.rank = data.scales.length;
-    this.directions = floatsOf(data.directions);
-    this.table = floatsOf(data.coefficients);
-    this.planes = this.inverses(wordsOf(data.triangles));
-    this.stage = floatsOf(data.stage);
+  constructor(stage) {
+    this.rank = stage.scales.length;
+    this.stage = floatsOf(stage.directions);
+    this.table = floatsOf(stage.coefficients);
+    this.planes = this.inverses(wordsOf(stage.triangles));
     this.lights = this.stage.length / 3;
-    this.stageTable = new Float32Array(this.lights * this.rank);
-    for (let i = 0; i < this.lights; i++) {
-      this.stageTable.set(this.coefficients(this.stage.subarray(3 * i, 3 * i + 3)), i * this.rank);
-    }
+  }
+
+  // The unit direction of a light of the stage.
+  toward(light) {
+    return Array.from(this.stage.subarray(3 * light, 3 * light + 3));
   }
 
   // For each triangle its corners, and the inverse of the matrix of their directions.
@@ -33,7 +33,7 @@ class Rig {
     const found = [];
     for (let t = 0; t < triangles.length; t += 3) {
       const corners = Array.from(triangles.subarray(t, t + 3));
-      const [a, b, c] = corners.map((i) => this.directions.subarray(3 * i, 3 * i + 3));
+      const [a, b, c] = corners.map((i) => this.toward(i));
       const rows = [cross(b, c), cross(c, a), cross(a, b)];
       const volume = dot(a, rows[0]);
       found.push({ corners, rows: rows.map((row) => row.map((x) => x / volume)) });
@@ -62,21 +62,13 @@ class Rig {
     return sum;
   }
 
-  // Sums [K * 3] of lights {azimuth, elevation, rgb} and of a map's weights [lights * 3] over the stage.
-  sums(lights, weights) {
+  // Sums [K * 3] of a map's weights [lights * 3].
+  sums(weights) {
     const sums = new Float32Array(3 * this.rank);
-    for (const light of lights) {
-      const own = this.coefficients(directionOf(light.azimuth, light.elevation));
+    for (let i = 0; i < this.lights; i++) {
       for (let k = 0; k < this.rank; k++) {
-        for (let c = 0; c < 3; c++) sums[3 * k + c] += own[k] * light.rgb[c];
-      }
-    }
-    if (weights) {
-      for (let i = 0; i < this.lights; i++) {
-        for (let k = 0; k < this.rank; k++) {
-          const own = this.stageTable[i * this.rank + k];
-          for (let c = 0; c < 3; c++) sums[3 * k + c] += own * weights[3 * i + c];
-        }
+        const own = this.table[i * this.rank + k];
+        for (let c = 0; c < 3; c++) sums[3 * k + c] += own * weights[3 * i + c];
       }
     }
     return sums;

@@ -1,17 +1,16 @@
 // The page: its data are decoded, then every change of the state is shown in the next frame.
 
 class Page {
-  constructor(data, images) {
+  constructor(data, arrays, images) {
     this.photo = data.source;
     this.title = data.title;
-    this.rig = new Rig(data);
-    this.auto = new AutoExposure(data);
     this.maps = data.envmaps.map(
       (one) => new LatLong(one.name, ...one.size, halvesOf(wordsOf(one.pixels)), one.command, one.path),
     );
     this.headAt = data.head.slice(0, 2);
     this.headRadius = data.head[2];
-    this.view = this.newView(data, images);
+    this.field = new LightField(data, arrays, images, (text) => this.say(text));
+    this.view = this.newView(data, arrays, images);
     this.ball = new Ball(byId("ball"));
     this.drawPhoto(images);
     this.state = readAddress(initialState(), location.hash, this.maps);
@@ -25,13 +24,13 @@ class Page {
     this.frame();
   }
 
-  newView(data, images) {
-    const view = GpuView.create(byId("view"), data, images);
+  newView(data, arrays, images) {
+    const view = GpuView.create(byId("view"), data, arrays, images);
     if (view) return view;
     this.missing = "This browser has no WebGL2: the image is smaller and slower.";
     const fresh = byId("view").cloneNode();
     byId("view").replaceWith(fresh);
-    return new CanvasView(fresh, data, images);
+    return new CanvasView(fresh, data, arrays, images);
   }
 
   drawPhoto(images) {
@@ -52,25 +51,19 @@ class Page {
 
   frame() {
     this.waiting = false;
-    const { state } = this;
-    const lights = state.lights.map((light) => ({ ...light, rgb: rgbOf(light) }));
-    const sums = this.rig.sums(lights, this.mapWeights());
-    this.ev = state.exposure ?? this.auto.ev(sums);
-    this.view.draw(sums, this.ev, state.background);
+    const { state, field } = this;
+    const lights = state.lights.map((light) => ({ toward: directionOf(light.azimuth, light.elevation), rgb: rgbOf(light) }));
+    const lit = field.under(lights, state.map, state.rotate, 2 ** state.mapStops);
+    this.ev = state.exposure ?? lit.ev;
+    this.view.light({ ...lit, gain: 2 ** this.ev });
+    this.view.draw(state.background);
+    document.body.dataset.settled = String(lit.exact);
+    if (!lit.exact) field.refine(lights, state.map, state.rotate, () => this.show());
     this.ball.draw(state, this.ev);
     this.panel.update();
     this.compare(state.compare);
     this.fit();
     this.remember();
-  }
-
-  mapWeights() {
-    const { map, rotate, mapStops } = this.state;
-    if (!map) return null;
-    if (this.weighed?.map !== map || this.weighed.rotate !== rotate) {
-      this.weighed = { map, rotate, weights: this.rig.weights(map, rotate) };
-    }
-    return this.weighed.weights.map((weight) => weight * 2 ** mapStops);
   }
 
   // Show the photo left of a division at so many percent; null: nowhere.
@@ -123,10 +116,10 @@ class Page {
 
 async function start() {
   const data = JSON.parse(byId("data").textContent);
-  const types = { maps: "jpeg", detail: "jpeg", background: "jpeg", photo: "jpeg", matte: "png" };
+  const types = { maps: "jpeg", photo: "webp", fringe: "webp", matte: "png" };
   const images = {};
   for (const [name, type] of Object.entries(types)) images[name] = await imageOf(data[name], `image/${type}`);
-  const page = new Page(data, images);
+  const page = new Page(data, await unpacked(data), images);
   page.say(page.missing ?? "");
 }
 

@@ -1,14 +1,14 @@
-"""A light basis packed for a page: images as JPEG and PNG, tables as base64, in one JSON document."""
+"""A photo's reflectance packed for a page: images, arrays and tables, in one JSON document."""
 
 import base64
 import io
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from scipy.spatial import ConvexHull
 
 from facerf_cli.colour import (
     AUTO_EXPOSURE_PERCENTILE,
@@ -16,15 +16,20 @@ from facerf_cli.colour import (
     linear_to_srgb,
     luminance,
 )
-from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
-from facerf_cli.viewer.basis import ExposureSamples, LightBasis, brightness_of
+from facerf_cli.composite import Composition
+from facerf_cli.face.crop import Crop
+from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait_field import PortraitField
+from facerf_cli.viewer.arrays import ArrayPack
+from facerf_cli.viewer.decoder_arrays import add_decoder
+from facerf_cli.viewer.person_arrays import add_detail, add_person, add_shadow_rays, guide_gain
+from facerf_cli.viewer.stage import StageTextures, atlas
+from facerf_cli.whole_person import WholePerson
 
-_EXPOSURE_RANK = 64  # factors of the samples of exposure
-_PHOTO_QUALITY, _MAP_QUALITY, _STRIP_QUALITY = 93, 90, 82
-_TILE = 8  # a JPEG's blocks: tiles of the atlas begin on them
-_ZERO, _STEPS = 128, 127  # the byte of 0 in a map, and that of its scale above it
+_MAP_QUALITY, _STRIP_QUALITY = 88, 82
 _HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
-_BRIGHTEST = 99.9  # percentile of the detail that is white in its image
+_SURE = 0.5  # share from which on a pixel is skin, or the person's
+_STEPS_16 = 65535
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,79 +42,82 @@ class PageMap:
     path: str  # that the command writes
 
 
-def packed(basis: LightBasis, maps: Sequence[PageMap]) -> dict[str, Any]:
-    """The document of a page: all that its script needs, without names."""
-    gain = max(float(np.percentile(basis.detail[basis.matte > 0.5], _BRIGHTEST)), 1e-6)
-    shown = np.where(basis.matte[..., None] > 0, basis.detail / gain, 0.18)
-    atlas, scales, columns, tile = _atlas(basis.maps)
-    box = basis.box
+def packed(
+    photo: np.ndarray, crop: Crop, field: PortraitField, composition: Composition, maps: Sequence[PageMap]
+) -> dict[str, Any]:
+    """The document of a page: all that its script needs, without names.
+
+    `composition` is that of the photo [H, W, 3], of which the page shows at most 8 bits of sRGB.
+    """
+    whole, detail = composition.surround, composition.detail
+    assert isinstance(whole, WholePerson) and detail is not None
+    pack = ArrayPack()
+    person = add_person(pack, field, whole)
+    add_shadow_rays(pack, field)
+    person |= add_detail(pack, detail, field) | {"guideGain": guide_gain(composition.own)}
+    decoder = add_decoder(pack, field.field)
+    stage = StageTextures.of(field.field)
+    tiles, scales, columns, tile = atlas(stage.maps)
+    matte = composition.matte
     return {
-        "size": [basis.matte.shape[1], basis.matte.shape[0]],
-        "box": [box.left, box.top, box.width, box.height],
-        "mapSize": [basis.maps.shape[2], basis.maps.shape[1]],
-        "tile": tile,
-        "columns": columns,
-        "scales": scales,
-        "gain": gain,
-        "head": _head(basis),
-        "photo": _jpeg(_encoded(basis.photo), _PHOTO_QUALITY),
-        "background": _jpeg(_encoded(basis.background), _PHOTO_QUALITY),
-        "detail": _jpeg(_encoded(shown), _PHOTO_QUALITY),
-        "matte": _png(np.round(basis.matte * 255).astype(np.uint8)),
-        "maps": _jpeg(atlas, _MAP_QUALITY),
-        "directions": _floats(basis.directions),
-        "triangles": _bytes(basis.triangles.astype("<u2").tobytes()),
-        "coefficients": _floats(basis.coefficients),
-        "stage": _floats(rig_directions(RIG_LIGHTS).numpy()),
-        "exposure": _exposure(basis.samples, basis.coefficients),
+        "size": [matte.shape[1], matte.shape[0]],
+        "head": _head(matte, crop),
+        "photo": _lossless(_encoded(photo)),
+        "fringe": _lossless(_fringe(composition.own, matte)),
+        "matte": _png(np.round(matte * 255).astype(np.uint8)),
+        "window": _add_window(pack, composition),
+        "person": person,
+        "decoder": decoder,
+        "exposure": _exposure(field, whole),
+        "stage": {
+            "directions": _floats(stage.directions),
+            "coefficients": _floats(stage.coefficients),
+            "triangles": _bytes(ConvexHull(stage.directions.astype(float)).simplices.astype("<u2").tobytes()),
+            "tile": tile,
+            "columns": columns,
+            "scales": scales,
+        },
+        "maps": _jpeg(tiles, _MAP_QUALITY),
         "envmaps": [_envmap(one) for one in maps],
+        **pack.document(),
     }
 
 
-def _atlas(maps: np.ndarray) -> tuple[np.ndarray, list[float], int, list[int]]:
-    """Maps [K, h, w, 3] as bytes side by side, their scales, tiles in a row, and a tile's size."""
-    count, height, width = maps.shape[:3]
-    tile_h, tile_w = (-(-side // _TILE) * _TILE for side in (height, width))
-    columns = max(1, round(math.sqrt(count * tile_h / tile_w)))
-    atlas = np.full((-(-count // columns) * tile_h, columns * tile_w, 3), _ZERO, np.uint8)
-    scales = [max(float(np.abs(one).max()), 1e-9) for one in maps]
-    for index, (one, scale) in enumerate(zip(maps, scales, strict=True)):
-        data = np.round(_ZERO + _STEPS * one / scale).astype(np.uint8)
-        top, left = index // columns * tile_h, index % columns * tile_w
-        atlas[top : top + tile_h, left : left + tile_w] = np.pad(
-            data, ((0, tile_h - height), (0, tile_w - width), (0, 0)), mode="edge"
-        )
-    return atlas, scales, columns, [tile_w, tile_h]
+def _add_window(pack: ArrayPack, composition: Composition) -> list[int]:
+    """Add where the face is in the photo: (u, v) and its soft mask; return left, top, width, height."""
+    view = composition.view
+    planes = [view.uv[..., 0], view.uv[..., 1], view.mask * view.coverage]
+    steps = [np.round(plane.clamp(0, 1).numpy() * _STEPS_16).astype(np.uint16) for plane in planes]
+    pack.add("window", np.stack(steps), "index")
+    height, width = view.mask.shape
+    return [view.left, view.top, width, height]
 
 
-def _head(basis: LightBasis) -> list[float]:
+def _fringe(own: np.ndarray, matte: np.ndarray) -> np.ndarray:
+    """The person's colours as 8-bit sRGB where they are mixed with the background, black elsewhere."""
+    mixed = (matte > 0) & (matte < 1)
+    return np.where(mixed[..., None], _encoded(own), 0).astype(np.uint8)
+
+
+def _head(matte: np.ndarray, crop: Crop) -> list[float]:
     """The middle of the face as shares of the photo's sides, and the radius of the head in the shorter."""
-    height, width = basis.matte.shape
-    crop = basis.crop
+    height, width = matte.shape
     middle = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
     return [middle[0] / width, middle[1] / height, _HEAD_RADIUS * crop.side_px / min(height, width)]
 
 
-def _exposure(samples: ExposureSamples, coefficients: np.ndarray) -> dict[str, Any]:
-    """Factors [K, n, 3] of the samples as bytes, and what `anchored_exposure_ev` compares them with."""
-    brightness = brightness_of(samples)[:, None]  # by which `factored` weighs the lights
-    inverse = ((coefficients / brightness).T / brightness.T)[:_EXPOSURE_RANK]
+def _exposure(field: PortraitField, whole: WholePerson) -> dict[str, Any]:
+    """Brightness of the photo, with which `anchored_exposure_ev` compares a relit person."""
+    plate = luminance(field.person.image.permute(1, 2, 0).numpy())
+    skin = field.person.classes[class_index("skin")].numpy() > _SURE
 
-    def factors(points: np.ndarray) -> dict[str, Any]:
-        factor = np.einsum("kl,lnc->knc", inverse, points)
-        scales = np.maximum(np.abs(factor).reshape(len(factor), -1).max(1, initial=0), 1e-9)
-        data = np.round(factor / scales[:, None, None] * _STEPS).astype(np.int8)
-        return {"count": points.shape[1], "scales": scales.tolist(), "factors": _bytes(data.tobytes())}
-
-    def brighter(plate: np.ndarray, percentile: float) -> float:
-        return float(np.percentile(luminance(plate), percentile)) if len(plate) else 0.0
+    def brighter(mask: np.ndarray, percentile: float) -> float:
+        return float(np.percentile(plate[mask], percentile)) if mask.any() else 0.0
 
     return {
-        "skin": factors(samples.skin),
-        "person": factors(samples.person),
         "percentiles": [FACE_PERCENTILE, AUTO_EXPOSURE_PERCENTILE],
-        "wanted": brighter(samples.plate_skin, FACE_PERCENTILE),
-        "own": brighter(samples.plate_person, AUTO_EXPOSURE_PERCENTILE),
+        "wanted": brighter(skin, FACE_PERCENTILE),
+        "own": brighter(whole.own.numpy() > _SURE, AUTO_EXPOSURE_PERCENTILE),
     }
 
 
@@ -138,6 +146,12 @@ def _encoded(linear: np.ndarray) -> np.ndarray:
 def _jpeg(data: np.ndarray, quality: int) -> str:
     stream = io.BytesIO()
     Image.fromarray(data).save(stream, "JPEG", quality=quality, subsampling=0, optimize=True)
+    return _bytes(stream.getvalue())
+
+
+def _lossless(data: np.ndarray) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(data).save(stream, "WEBP", lossless=True, quality=60, method=4, exact=True)
     return _bytes(stream.getvalue())
 
 

@@ -16,9 +16,16 @@ _HERE = Path(__file__).parent
 # In the order in which they are joined: each uses those before it.
 SCRIPTS = (
     "bytes.js",
+    "arrays.js",
+    "planes.js",
     "light.js",
     "exposure.js",
+    "rays.js",
+    "portrait.js",
+    "decoder.js",
+    "face.js",
     "readers.js",
+    "whole_person.js",
     "gpu.js",
     "canvas.js",
     "ball.js",

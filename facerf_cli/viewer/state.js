@@ -112,7 +112,6 @@ function commandOf(state, photo, ev) {
   if (state.lights.length) line += ` --light '${state.lights.map(lightText).join(";")}'`;
   const mapStops = state.map && !both ? state.mapStops : 0; // one map alone: its intensity is exposure
   line += ` --exposure ${Number((ev + mapStops).toFixed(2))}`;
-  line += " --view none"; // the page shows the plain sRGB curve
   if (!state.background) line += " --background none";
   lines.push(line + " -o out");
   if (both) {

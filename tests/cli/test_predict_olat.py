@@ -20,6 +20,8 @@ from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, De
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.raster.texture import normal_map
+from facerf_cli.viewer.page import strip_of
+from tests.files.test_relight_web import Decoder
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 SIDES = "70,0;-70,0;0,80"
@@ -97,6 +99,34 @@ def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_
     np.testing.assert_allclose(whole.pixels[:20, -20:], photo[:20, -20:], atol=2e-3)  # the background
     assert main(["relight", str(path), *lit, str(tmp_path / "alone")]) == 0
     assert read_image(tmp_path / "alone/astronaut_olat_light_70_0.exr").alpha is not None
+
+
+def test_the_format_of_web_viewers_has_the_lights_from_in_front(given: Path, tmp_path: Path) -> None:
+    line = ["--lights", "40", "--frame", "photo", "--size", "128", "--format", "relight"]
+    assert predict(given, tmp_path, *line) == 0
+    folder = tmp_path / "astronaut_relight"
+    decoder = Decoder(folder)
+    front = rig_directions(40)[rig_directions(40)[:, 2] > 0.05].numpy()
+    np.testing.assert_allclose(decoder.lights, front, atol=1e-4)
+    assert (decoder.info["width"], decoder.info["height"]) == (128, 128)
+    from_right, from_left = (
+        decoder.image(azel_to_direction(azimuth, 0).numpy())[20:45, 44:68].mean((0, 2))
+        for azimuth in (60, -60)
+    )
+    assert (from_right / from_left.clip(1))[-6:].mean() > (from_right / from_left.clip(1))[:6].mean()
+    assert not (tmp_path / "astronaut_olat.exr").exists() and (tmp_path / "astronaut_olat.png").exists()
+    assert predict(given, tmp_path / "x", "--frame", "uv", "--format", "relight") == 2
+    few = ["--lights", SIDES, "--frame", "photo", "--size", "128", "--format", "relight"]
+    assert predict(given, tmp_path / "few", *few) == 1
+
+
+def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path) -> None:
+    line = ["--lights", SIDES, "--frame", "photo", "--size", "256", "--page"]
+    assert predict(given, tmp_path, *line) == 0
+    made = (tmp_path / "astronaut.html").read_text()
+    assert strip_of(made) and 'id="data"' in made
+    assert (tmp_path / "astronaut_olat.exr").exists()
+    assert predict(given, tmp_path / "x", *line, "--network-alone") == 2
 
 
 def test_the_stack_is_enough_to_render_the_face(given: Path, tmp_path: Path) -> None:

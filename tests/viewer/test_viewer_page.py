@@ -1,60 +1,69 @@
-"""A page's numbers against known answers, by its numpy twin; its text is closed to the network."""
+"""A page's text is closed to the network, and its arrays come back; no browser is needed."""
 
 import base64
 import hashlib
+import json
 import re
+import zlib
+from typing import Any
 
 import numpy as np
 import pytest
 
-from facerf_cli.colour import anchored_exposure_ev
-from facerf_cli.viewer.basis import ExposureSamples, brightness_of, factored
-from facerf_cli.viewer.frame import PersonBox, fitted, resized
-from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
+from facerf_cli.viewer.arrays import ArrayPack
+from facerf_cli.viewer.frame import fitted, resized
+from facerf_cli.viewer.packing import strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
-from tests.oracles.viewer_page import Page, direction, document_of, encoded
-from tests.viewer import toy_basis as toy
-
-WHITE = np.ones(3)
-SKY = PageMap("sky", np.full((4, 8, 3), 0.5, np.float32), "facerf envmap -o maps", "maps/sky.exr")
-
-
-def twin() -> Page:
-    return Page(document_of(text()))
+from facerf_cli.viewer.stage import atlas, factored
 
 
 def text(title: str = "me", photo: str = "me.jpg") -> str:
-    return page(title, photo, packed(toy.basis(), [SKY]), "c3RyaXA=")
+    return page(title, photo, {"size": [4, 3]}, "c3RyaXA=")
 
 
-@pytest.mark.parametrize(
-    ("azimuth", "elevation", "rgb"), [(0, 0, (1, 1, 1)), (75, 20, (1, 0.5, 0.2)), (160, -30, (2, 2, 2))]
-)
-def test_a_light_shades_the_hemisphere_as_in_closed_form(
-    azimuth: float, elevation: float, rgb: tuple[float, ...]
-) -> None:
-    lights = [(direction(azimuth, elevation), np.array(rgb))]
-    drawn = twin().shown(twin().sums(lights), 0.0)
-    error = np.abs(drawn - 255 * encoded(toy.truth(lights, 0.0)))
-    # Steps of 8 bits in detail and maps, and the rig's spacing of 18 degrees.
-    assert error[toy.matte() > 0].mean() < 2.5
-    assert error[toy.matte() == 0].mean() < 1.5
+def document_of(made: str) -> dict[str, Any]:
+    """The JSON document in a page."""
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', made, re.S)
+    assert found
+    document: dict[str, Any] = json.loads(found[1])
+    return document
 
 
-def test_lights_add_up() -> None:
-    one, two = (direction(60, 10), WHITE), (direction(-100, 40), np.array([0.2, 0.4, 1.0]))
-    both = twin().sums([one, two])
-    np.testing.assert_allclose(both, twin().sums([one]) + twin().sums([two]), atol=1e-12)
+def unpacked(document: dict[str, Any], name: str) -> np.ndarray:
+    """An array of a page, as its script reads it."""
+    entry = document["arrays"][name]
+    size = 1 if entry["kind"] == "byte" else 2
+    count = int(np.prod(entry["shape"]))
+    raw = zlib.decompress(base64.b64decode(document["bytes"]))[entry["at"] :][: size * count]
+    words = np.frombuffer(raw, np.uint8).reshape(size, count).T.copy()
+    if entry["kind"] == "half":
+        return words.view("<f2").reshape(entry["shape"]).astype(float)
+    values = words.view("<u1" if size == 1 else "<u2").reshape(-1)
+    if entry["kind"] == "index":
+        return np.cumsum(values, dtype=np.uint16).reshape(entry["shape"])
+    planes = values.reshape(len(entry["low"]), -1).astype(float)
+    found = np.array(entry["low"])[:, None] + np.array(entry["step"])[:, None] * planes
+    return np.asarray(found.reshape(entry["shape"]))
 
 
-def test_exposure_is_that_of_relight() -> None:
-    known = toy.basis().samples
-    light = 17
-    wanted = anchored_exposure_ev(
-        known.skin[light][None], known.plate_skin[None], np.ones((1, 8)), np.ones((1, 8))
-    )
-    ev = twin().exposure_ev(twin().sums([(toy.basis().directions[light], WHITE)]))
-    assert abs(ev - wanted) < 0.03  # factors have 7 bits
+@pytest.mark.parametrize(("kind", "error"), [("half", 5e-3), ("byte", 0.04), ("short", 2e-4)])
+def test_arrays_come_back(kind: Any, error: float) -> None:
+    random = np.random.default_rng(2)
+    one = random.uniform([[-9.0], [3.0]], [[9.0], [4.0]], (2, 50))  # two planes of other ranges
+    pack = ArrayPack()
+    pack.add("first", np.zeros((1, 3)), "byte")
+    pack.add("one", one, kind)
+    found = unpacked(pack.document(), "one")
+    assert np.abs(found - one).max() < error
+    if kind != "half":
+        assert np.abs(found[1] - one[1]).max() < error / 10  # each plane by its own range
+
+
+def test_indices_come_back_exactly() -> None:
+    values = np.array([[0, 65535, 7], [7, 6, 40000]])
+    pack = ArrayPack()
+    pack.add("index", values, "index")
+    np.testing.assert_array_equal(unpacked(pack.document(), "index"), values)
 
 
 def test_factors_of_enough_rank_give_the_images_back() -> None:
@@ -72,10 +81,13 @@ def test_weights_decide_what_a_low_rank_keeps() -> None:
         np.testing.assert_allclose(found[kept], images[kept], atol=1e-6)
 
 
-def test_a_light_from_behind_counts_for_more_than_its_radiance() -> None:
-    points = np.ones((9, 4, 3), np.float32) * np.array([1, 1, 1, 1, 1, 1, 0.1, 0.05, 0])[:, None, None]
-    found = brightness_of(ExposureSamples(points, points, points[0], points[0]))
-    assert found[0] == pytest.approx(1) and 0.1 < found[6] < 0.6 and found[8] > 0.1
+def test_maps_lie_in_tiles() -> None:
+    maps = np.random.default_rng(1).normal(size=(5, 6, 10, 3))
+    data, scales, columns, tile = atlas(maps)
+    assert tile == [16, 8]
+    for k, one in enumerate(maps):
+        part = data[k // columns * 8 :, k % columns * 16 :][:6, :10].astype(float)
+        np.testing.assert_allclose((part - 128) / 127 * scales[k], one, atol=scales[k] / 250)
 
 
 def test_the_page_loads_nothing_and_names_are_escaped() -> None:
@@ -94,18 +106,13 @@ def test_the_page_loads_nothing_and_names_are_escaped() -> None:
 
 def test_an_index_shows_the_strips_of_its_pages() -> None:
     strip = strip_jpeg([np.full((6, 4, 3), 0.5), np.zeros((6, 4, 3))])
-    made = page("me", "me.jpg", packed(toy.basis(), []), strip)
+    made = page("me", "me.jpg", {}, strip)
     assert strip_of(made) == strip and strip_of("no page") == ""
     listed = index_page([IndexEntry("a<b", "dir/a&b.html", strip)])
     assert "a&lt;b" in listed and 'href="dir/a&amp;b.html"' in listed and strip in listed
 
 
 def test_frames() -> None:
-    matte = np.zeros((20, 30))
-    matte[4:9, 10:25] = 1
-    assert PersonBox.around(matte) == PersonBox(10, 4, 15, 5) and PersonBox.around(matte * 0) == PersonBox(
-        0, 0, 30, 20
-    )
     assert fitted(800, 1200, 600) == (400, 600) and fitted(80, 120, 600) == (80, 120)
     ramp = np.broadcast_to(np.arange(12.0)[:, None, None], (12, 8, 3))
     np.testing.assert_allclose(resized(ramp, 6, 4)[1:-1, 0, 0], [2.5, 4.5, 6.5, 8.5], atol=1e-5)

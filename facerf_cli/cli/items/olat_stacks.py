@@ -21,19 +21,27 @@ from facerf_cli.cli.items.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.cli.items.view_photos import write_page
 from facerf_cli.cli.predict_olat import PredictOlat
+from facerf_cli.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.composite import Target
+from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_to_arrays
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.drawings import contact_sheet, mark_light
 from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.viewer.frame import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
+_FRONT, _FEWEST_FRONT = (
+    0.05,
+    9,
+)  # least z of a light from in front; lights below which nothing is interpolated
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
 
 
@@ -44,16 +52,40 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
     faces = fit_faces(item, image, work.photo)
     outputs: list[Path] = []
     for face in reversed(faces):
-        stack, sheet = work.files_of(item, face.tag)
+        stack, sheet, *pages = work.files_of(item, face.tag)
         tiles: list[np.ndarray] = []
         if work.frame == "photo":
             header, olats = _of_person(item, image, face, directions, work, tiles)
         else:
             header, olats = _header(item, face, directions, work), _olats(face, directions, work, tiles)
-        write_olat_stack(stack, header, olats)
+        if work.format == "exr":
+            write_olat_stack(stack, header, olats)
+        else:
+            _write_relight_web(item, stack.parent, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
-        outputs += [stack, sheet]
+        for page in pages:
+            write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
+        outputs += [stack, sheet, *pages]
     return outputs, facts_of(faces) | {"lights": len(directions)}
+
+
+def _write_relight_web(item: Item, folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
+    """Write the images of the lights from in front, exposed alike so that the brightest is well shown."""
+    front = header.directions[:, 2] > _FRONT
+    if front.sum() < _FEWEST_FRONT:
+        raise InputError(
+            f"{item.input_path}: --format relight needs {_FEWEST_FRONT} lights from in front, not "
+            f"{front.sum()}; "
+            "give more --lights"
+        )
+    images = torch.cat([batch.half() for batch in olats])[torch.from_numpy(front)]
+    brightest = np.stack([image.float().mean(0).numpy() for image in images]).max(0)
+    ev = auto_exposure_ev(np.repeat(brightest[..., None], 3, 2), header.seen)
+    shown = np.empty((len(images), *images.shape[2:], 3), np.uint8)
+    for image, half in zip(shown, images, strict=True):
+        exposed = half.float().permute(1, 2, 0).numpy() * np.float32(2.0**ev)
+        image[:] = np.round(encode_display(exposed, SOFT_VIEW) * 255)
+    write_relight_web(folder, shown, header.directions[front], {"exposure_ev": ev})
 
 
 def _of_person(

@@ -7,13 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.photos import facts_of, fit_faces, load_models_once, read_photo
+from facerf_cli.cli.items.photos import FittedFace, facts_of, fit_faces, load_models_once, read_photo
 from facerf_cli.colour import linear_to_srgb
+from facerf_cli.composite import Composition
+from facerf_cli.face.head import Head
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.models import Models
+from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
+from facerf_cli.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
-from facerf_cli.viewer.basis import BasisSettings, LightBasis, light_basis
 from facerf_cli.viewer.frame import fitted, resized, shrunk_photo
 from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
@@ -33,15 +39,24 @@ def write_pages(item: Item, work: "MakePage") -> tuple[list[Path], dict[str, Any
     models = load_models_once(work.photo)
     paths = []
     for face in reversed(faces):  # the first one's page marks the photo as finished
-        photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
-        basis = light_basis(models, photo, head, BasisSettings(lights=work.lights))
         path = item.output(face.tag + ".html")
-        title = Path(item.name).name + face.tag.replace("_", " ")
-        text = page(title, str(item.input_path), packed(basis, page_maps()), _strip(photo, basis))
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        write_page(path, item, models, image.pixels, face, work.size_px)
         paths.append(path)
     return paths[::-1], facts_of(faces)
+
+
+def write_page(
+    path: Path, item: Item, models: Models, photo: np.ndarray, face: FittedFace, size_px: int
+) -> None:
+    """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
+    photo, head = shrunk_photo(photo, face.head, size_px)
+    field = portrait_field_of(models, head, photo)
+    composition = composition_of(models, photo, head, field)
+    document = packed(photo, head.fit.crop, field, composition, page_maps())
+    title = Path(item.name).name + face.tag.replace("_", " ")
+    text = page(title, str(item.input_path), document, _strip(photo, head, field, composition))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def write_index(path: Path, items: Sequence[Item], work: "MakePage") -> None:
@@ -72,13 +87,23 @@ def page_maps() -> tuple[PageMap, ...]:
     return tuple(found)
 
 
-def _strip(photo: np.ndarray, basis: LightBasis) -> str:
+def portrait_field_of(models: Models, head: Head, photo: np.ndarray) -> PortraitField:
+    """The reflectance of a photo's person."""
+    field = reflectance_of(models, head, "portrait", photo=photo)
+    assert isinstance(field, PortraitField)
+    return field
+
+
+def _strip(photo: np.ndarray, head: Head, field: PortraitField, composition: Composition) -> str:
     """The photo and the person under a few lights, small and side by side."""
     height, width = fitted(photo.shape[0], photo.shape[1], _STRIP_PX)
-    images = [resized(photo, height, width)]
-    for azimuth, elevation in _STRIP_LIGHTS:
-        images.append(resized(basis.nearest_image(azimuth, elevation), height, width))
-    return strip_jpeg([linear_to_srgb(image.clip(0, 1)) for image in images])
+    images = [photo]
+    for light in _STRIP_LIGHTS:
+        toward = azel_to_direction(*light)[None].float()
+        relit = next(relit_by(composition, head, field, toward, torch.ones(1, 1, 3)))
+        ev = composition.exposure_ev(relit, "auto")
+        images.append(composition.image(relit, ev).pixels * np.float32(2.0**ev))
+    return strip_jpeg([linear_to_srgb(resized(image.clip(0, 1), height, width)) for image in images])
 
 
 def _escaped(name: str) -> str:

@@ -1,0 +1,61 @@
+"""Draw the images of docs/gallery.md: two people under lights that facerf does well, and that it does badly.
+
+    python examples/gallery.py [GRACE_HOPPER.jpg [DOCS]]
+
+The second photo is matplotlib's sample data (U.S. Navy, public domain); without an argument it is that of
+an installed matplotlib. Each row: the photo, then its lights in the order of `ROWS`.
+"""
+
+import importlib.util
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.main import main
+from facerf_cli.viewer.frame import fitted, resized
+
+HERE = Path(__file__).parent
+HEIGHT_PX = 360
+MAPS = HERE / "maps"
+WELL = ("--light=40,20", "--light=-60,15", "--envmap=overcast.exr", "--envmap=low_sun.exr")
+BADLY = ("--light=90,0", "--light=0,80", "--light=150,20", "--light=0,-60")
+
+
+def hopper() -> Path:
+    """matplotlib's photo of Grace Hopper."""
+    found = importlib.util.find_spec("matplotlib")
+    if found is None or not found.submodule_search_locations:
+        raise SystemExit("gallery: needs matplotlib's sample photo; give the path of grace_hopper.jpg")
+    return Path(found.submodule_search_locations[0]) / "mpl-data" / "sample_data" / "grace_hopper.jpg"
+
+
+def row(photo: Path, lights: tuple[str, ...]) -> np.ndarray:
+    """The photo and its relit images side by side [h, w, 3], linear."""
+    options = []
+    for light in lights:
+        name, value = light.split("=")
+        options += [name, str(MAPS / value) if name == "--envmap" else value]
+    with tempfile.TemporaryDirectory() as folder:
+        if main(["-q", "relight", str(photo), *options, "-o", folder]):
+            raise SystemExit(1)
+        names = [value.split("=")[1].removesuffix(".exr").replace(",", "_") for value in lights]
+        written = [
+            Path(folder, f"{photo.stem}_{'light_' if light.startswith('--light') else ''}{name}.png")
+            for light, name in zip(lights, names, strict=True)
+        ]
+        images = [read_image(path).pixels for path in (photo, *written)]
+    height, width = fitted(*images[0].shape[:2], 10**6)
+    scale = HEIGHT_PX / height
+    return np.concatenate([resized(image, HEIGHT_PX, round(width * scale)) for image in images], 1)
+
+
+if __name__ == "__main__":
+    given = [Path(argument) for argument in sys.argv[1:]]
+    second = given[0] if given else hopper()
+    target = given[1] if given[1:] else HERE.parent / "docs"
+    for name, lights in (("well", WELL), ("badly", BADLY)):
+        for photo in (HERE / "astronaut.jpg", second):
+            write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), 0.0)
