@@ -157,6 +157,6 @@ def test_ctrl_c_outside_of_a_verb_is_one_line(
     def pressed(line: object) -> list[str]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("facerf_cli.main.repeat_options", pressed)
-    assert main(["doctor"]) == 130
+    monkeypatch.setattr(main, "repeat_options", pressed)
+    assert main.main(["doctor"]) == 130
     assert "interrupted" in capsys.readouterr().err
