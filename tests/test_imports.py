@@ -12,7 +12,7 @@ LEVELS = (
     ("cli",),
     ("evaluation", "training", "api"),
     ("dataset",),
-    ("synth", "capture", "viewer"),
+    ("synth", "capture", "viewer", "film"),
     ("pipeline",),
     ("field", "baselines", "composite", "group_photo", "near_textures", "portrait_field", "whole_person"),
     ("models", "portrait"),

@@ -81,3 +81,17 @@ def test_in_order() -> None:
         yield from ((2, "c"), (0, "a"), (1, "b"), (3, "d"))
 
     assert "".join(in_order(early())) == "abcd"
+
+
+def process_of(item: str) -> str:
+    if item == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(0.05)
+    return str(os.getpid())
+
+
+def test_neighbours_go_to_one_process_and_outlive_another() -> None:
+    items = ["a", "b", "c", "d", "e", "die", "f", "g"]
+    found = list(spread(process_of, items, Workers(2, in_a_row=4), broken))
+    assert len(set(found[:4])) == 1 and found[5] == "die: killed by SIGKILL"
+    assert found[4] not in found[:4] and found[6].isdecimal() and found[6] == found[7]

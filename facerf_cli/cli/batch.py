@@ -42,6 +42,8 @@ class BatchOptions:
     overwrite: Overwrite = "changed"
     dry_run: bool = False
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
+    in_a_row: int = 1  # neighbouring items that one of the processes takes
+    print_outputs: bool = True  # on stdout; not those that are to be joined
 
 
 @dataclass(frozen=True)
@@ -175,7 +177,7 @@ def _run_alone(
 def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderIndex | None) -> int:
     """Process the items that are not finished, write their rows, and count failures."""
     failures = 0
-    workers = workers_of(batch.settings, batch.options.jobs)
+    workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
     work = _Work(batch.process, index is not None)
     try:
         with closing(spread(work, todo, workers, _broken)) as results:
@@ -186,7 +188,7 @@ def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderInd
                     index.add(result.made, batch.outputs_of(result.item))
                 with report.open("a", encoding="utf-8") as stream:
                     stream.write(json_line(_report_row(batch.verb, result, batch.options.output)) + "\n")
-                failures += _print_result(result)
+                failures += _print_result(result, batch.options)
     finally:
         if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
             for folder in {path.parent for item in todo for path in batch.outputs_of(item)}:
@@ -397,15 +399,16 @@ def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, An
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
-def _print_result(result: _Result) -> int:
+def _print_result(result: _Result, options: BatchOptions) -> int:
     """Print outputs to stdout, an error to stderr; return 1 for a failure."""
     if result.error:
         log.error("%s", result.error)
         if result.trace:
             log.debug("%s", "\n" + result.trace)
         return 1
-    for path in result.outcome.outputs if result.outcome else ():
-        print_path(path)
+    if result.outcome and options.print_outputs:
+        for path in result.outcome.outputs:
+            print_path(path)
     return 0
 
 

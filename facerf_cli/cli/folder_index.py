@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -38,10 +39,16 @@ def read_row(path: Path) -> Row:
     require_regular(path)
     try:
         state = os.stat(path)
-        digest = file_sha256(path)
+        digest = _digest(path, *_state(state).values())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
     return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
+
+
+@lru_cache(maxsize=8)  # every frame of a film has the film as its input
+def _digest(path: Path, *_: int) -> str:
+    """SHA-256 of a file in a state: its size, time and inode."""
+    return file_sha256(path)
 
 
 class _Rows:

@@ -14,6 +14,7 @@ PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
     | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
 )
+FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 
 
@@ -32,6 +33,7 @@ class Item:
     name: str  # path in the output folder, without suffix; the item's identity there
     mirrored: PurePosixPath | None = None  # of a file: path in its input folder, or name alone
     stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
+    frame: int | None = field(default=None, compare=False)  # of a film, from 0
 
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""

@@ -71,9 +71,9 @@ def settings_of(context: typer.Context) -> Settings:
     return settings
 
 
-def workers_of(settings: Settings, jobs: int) -> Workers:
+def workers_of(settings: Settings, jobs: int, in_a_row: int = 1) -> Workers:
     """The workers that `--jobs`, `--ray` and `--device` ask for."""
-    return Workers(jobs, settings.ray, int(settings.device == "cuda"))
+    return Workers(jobs, settings.ray, int(settings.device == "cuda"), in_a_row)
 
 
 def was_given(context: typer.Context, name: str) -> bool:
