@@ -159,6 +159,8 @@ def main(arguments: Sequence[str]) -> int:
         return _fail(error, str(error), 1)
     except BrokenPipeError:
         return _end_quietly()
+    except KeyboardInterrupt:  # outside of typer, which has its own code for it
+        return _fail(None, "interrupted", 130)
     except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):  # typer turns it into an exit
             return _end_quietly()

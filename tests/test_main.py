@@ -149,3 +149,14 @@ def test_shell_completion(shell: str) -> None:
         "import sys; sys.argv = ['facerf']; from facerf_cli.main import run; run()", env=os.environ | protocol
     )
     assert "doctor" in result.stdout and result.stderr == ""
+
+
+def test_ctrl_c_outside_of_a_verb_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    def pressed(line: object) -> list[str]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(main, "repeat_options", pressed)
+    assert main.main(["doctor"]) == 130
+    assert "interrupted" in capsys.readouterr().err

@@ -1,6 +1,5 @@
 """Runs of a verb in forks of this process, and what they left: nothing half, one row an item."""
 
-import atexit
 import json
 import os
 import shutil
@@ -14,6 +13,7 @@ from pathlib import Path
 from benchmarks._common import ASTRONAUT
 from benchmarks.faults import samples
 from facerf_cli.cli.batch import REPORT_NAME
+from facerf_cli.files import atomic
 
 _OWN = (REPORT_NAME, ".facerf-index.jsonl")
 
@@ -98,9 +98,11 @@ def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -
         before()
         try:
             code = main(line)
+        except KeyboardInterrupt:  # before or after the program itself
+            code = 128 + signal.SIGINT
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
-        atexit._run_exitfuncs()
+        atomic._remove_own()  # as at the exit of a process that is no fork
     finally:
         os._exit(code)
 
@@ -135,6 +137,8 @@ def faults_of(folder: Path, whole: dict[str, bytes], finished: bool) -> list[str
     found += [f"missing: {name}" for name in whole if name not in there]
     found += [f"left: {path.name}" for path in folder.rglob(".*part-*")]
     found += [f"left: {path.name}" for path in folder.rglob(".facerf-lock*")]
+    if not (folder / REPORT_NAME).exists():
+        return [*found, "no report"]
     rows = [json.loads(line) for line in (folder / REPORT_NAME).read_text().split("\n") if line]
     twice = [item for item, count in Counter(row["item"] for row in rows).items() if count > 1]
     found += [f"two rows: {item}" for item in twice]

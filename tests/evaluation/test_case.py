@@ -64,5 +64,5 @@ def test_a_file_that_is_no_array_and_one_cut_short(tmp_path: Path) -> None:
     np.save(tmp_path / "cut.npy", np.zeros(SHAPE))
     (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:200])
     for name in ("text.npy", "cut.npy", "none.npy"):
-        with pytest.raises(InputError, match="not an array"):
+        with pytest.raises(InputError, match=r"not an array|no such file"):
             read_array(tmp_path / name)
