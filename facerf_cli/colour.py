@@ -163,7 +163,15 @@ def named_space(name: str, config: str = "") -> ColourSpace:
 
 
 def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
-    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values."""
+    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values.
+
+    Integers count in steps from 0 to 1; the curve of a space is then looked up.
+    """
+    if pixels.dtype.kind == "u" and space.chromaticities is not None:
+        steps = unit_floats(np.arange(np.iinfo(pixels.dtype).max + 1, dtype=pixels.dtype))
+        table = steps if space.decode is None else space.decode(steps)
+        return _by_matrix(table[pixels], matrix_to_rec709(space.chromaticities))
+    pixels = unit_floats(pixels)
     if space.chromaticities is None:
         for name, matrix in _ocio_bridges():
             found = ocio.converted(pixels, space.name, name, space.config)
@@ -172,6 +180,13 @@ def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
         raise _cannot_convert(space)
     linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
     return _by_matrix(linear, matrix_to_rec709(space.chromaticities))
+
+
+def unit_floats(values: np.ndarray) -> np.ndarray:
+    """Values as float32; unsigned integers count in steps from 0 to 1."""
+    if values.dtype.kind != "u":
+        return values.astype(np.float32, copy=False)
+    return values.astype(np.float32) * (1 / np.float32(np.iinfo(values.dtype).max))  # as OpenImageIO
 
 
 def from_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:

@@ -8,6 +8,7 @@ ends it.
 
 import json
 import logging
+import os
 import sys
 import time
 import traceback
@@ -18,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from facerf_cli import memory
 from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
@@ -135,7 +137,10 @@ def run_items(
         log.warning(kept, len(index.edited))
     failures = 0
     workers = workers_of(settings, options.jobs)
-    with closing(spread(_Work(process, index is not None), todo, workers, _broken)) as results:
+    work = _Work(
+        process, index is not None, settings.job_bytes(min(workers.jobs or os.cpu_count() or 1, len(todo)))
+    )
+    with closing(spread(work, todo, workers, _broken)) as results:
         for result in _with_progress(results, len(todo), verb, settings):
             if result.stops_the_run is not None:
                 raise result.stops_the_run
@@ -212,9 +217,11 @@ class _Work:
 
     process: Callable[[Item], Outcome]
     indexed: bool
+    memory_bytes: int
 
     def __call__(self, item: Item) -> _Result:
         start_s = time.perf_counter()
+        memory.set_limit(self.memory_bytes)
 
         def result(**ends: Any) -> _Result:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)

@@ -1,6 +1,6 @@
 """`facerf predict-olat`: a photo's face under every light of a rig, as an OLAT stack."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +17,6 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
-    MemoryOption,
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
@@ -31,7 +30,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, OneRecipe
+from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import UsageError
 
@@ -50,7 +49,6 @@ class PredictOlat:
     frame: Frame
     size_px: int
     network_alone: bool
-    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     precision: Precision
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -122,7 +120,6 @@ def predict_olat(
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
-    memory: MemoryOption = 2.0,
 ) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
@@ -141,7 +138,7 @@ def predict_olat(
     if frame == "photo" and pose is not None:
         raise UsageError("--pose: turns the head out of its photo; use --frame face or uv with it")
     chosen: Frame = frame or ("photo" if pose is None else "face")
-    work = PredictOlat(photo, lights, pose, chosen, size, network_alone, int(memory * 2**30), precision)
+    work = PredictOlat(photo, lights, pose, chosen, size, network_alone, precision)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
         "predict-olat",

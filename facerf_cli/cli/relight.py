@@ -26,7 +26,6 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
-    MemoryOption,
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
@@ -78,7 +77,6 @@ class Relight:
     aov: tuple[str, ...]
     matte: Path | None
     exposure: Exposure
-    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     asked_for_photo: bool = field(metadata=NOT_IN_RECIPE)  # --composite photo is on the command line
     output: OutputOptions
     reflectance: RelightKind = "portrait"
@@ -355,7 +353,6 @@ def relight(
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
-    memory: MemoryOption = 2.0,
 ) -> None:
     """Relight photos under environment maps and single lights.
 
@@ -409,7 +406,6 @@ def relight(
         aov=parse_aov(aov),
         matte=matte,
         exposure=parse_exposure(exposure),
-        memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
         output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
         reflectance="field" if shown == "face" and reflectance == "portrait" else reflectance,

@@ -46,10 +46,9 @@ def heif_header(path: Path) -> tuple[Any, oiio.ImageSpec]:
 
 
 def decode_heif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
-    """Decode all channels [H, W, C] of the main image, upright, as float32 in 0..1."""
+    """Decode all channels [H, W, C] of the main image, upright, as integers."""
     try:
         values = np.asarray(image)
     except (ValueError, EOFError, SyntaxError, RuntimeError, OSError) as error:
         raise InputError(f"{path}: damaged or cut short; copy it again ({error})") from None
-    most = np.float32(65535 if values.dtype == np.uint16 else 255)
-    return values.reshape(spec.height, spec.width, spec.nchannels).astype(np.float32) / most
+    return values.reshape(spec.height, spec.width, spec.nchannels)

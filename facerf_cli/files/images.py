@@ -27,10 +27,11 @@ from facerf_cli.colour import (
     from_linear_rec709,
     named_space,
     to_linear_rec709,
+    unit_floats,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.decoding import decode, full_frame, pick_channels, upright
+from facerf_cli.files.decoding import decode, full_frame, upright
 from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import (
     OCIO_SPACE,
@@ -43,6 +44,7 @@ from facerf_cli.files.image_metadata import (
     utf8_path,
 )
 from facerf_cli.logs import LOGGER_NAME, one_line
+from facerf_cli.strips import strips
 
 PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
@@ -83,26 +85,37 @@ def read_image(
     colourspace: str | ColourSpace | None = None,
     limit_px: int = PHOTO_LIMIT_PX,
     non_finite: Literal["error", "zero"] = "error",
+    kept_px: int = 0,
 ) -> LinearImage:
     """Read an image of any supported format; `colourspace` overrides the colour space that the file states.
 
-    The size is checked before pixels are decoded. NaN and infinite values raise an InputError, or are set to
-    0 with a warning if `non_finite` is "zero".
+    Before pixels are decoded the size is checked, and the budget of memory asked, for `kept_px` bytes a pixel
+    that the caller makes of it, too. NaN and infinite values raise an InputError, or are set to 0 with a
+    warning if `non_finite` is "zero".
     """
     path = Path(path)
-    values, spec = decode(path, limit_px)
-    colour_at, alpha_at = pick_channels(list(spec.channelnames), spec.alpha_channel)
-    values = values[..., colour_at if alpha_at is None else [*colour_at, alpha_at]]
-    values = upright(full_frame(values, spec), spec.get_int_attribute("Orientation", 1))
-    values = _finite(path, values, non_finite)
-    alpha = None if alpha_at is None else np.clip(values[..., -1], 0, 1)
-    colour = np.broadcast_to(values[..., : len(colour_at)], (*values.shape[:2], 3))
-    if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
-        colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
+    found = decode(path, limit_px, kept_px)
+    spec = found.spec
+    values = upright(full_frame(found.values, spec), spec.get_int_attribute("Orientation", 1))
     space = _space(path, colourspace, spec)
     if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
-    pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
+    premultiplied = not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
+    pixels = np.empty((*values.shape[:2], 3), np.float32)
+    alpha = None if found.alpha is None else np.empty(values.shape[:2], np.float32)
+    bad = 0
+    for rows in strips(*values.shape[:2]):
+        colour = np.broadcast_to(values[rows][..., found.colour], pixels[rows].shape)
+        opaque = None if found.alpha is None else unit_floats(values[rows][..., found.alpha])
+        colour, opaque, wrong = _finite(colour, opaque)
+        bad += wrong
+        if alpha is not None and opaque is not None:
+            alpha[rows] = opaque.clip(0, 1)
+            if premultiplied:
+                colour = unit_floats(colour) / np.where(alpha[rows] > 0, alpha[rows], 1)[..., None]
+        pixels[rows] = to_linear_rec709(colour, space)
+    if bad:
+        _say_non_finite(path, bad, pixels.shape[0] * pixels.shape[1], non_finite)
     return LinearImage(pixels, alpha, space.name, metadata_of(spec))
 
 
@@ -116,17 +129,22 @@ def _space(path: Path, colourspace: str | ColourSpace | None, spec: oiio.ImageSp
     return found
 
 
-def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
+def _finite(colour: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Colour [h, W, 3] and alpha [h, W] with 0 for what is not finite, and the number of such pixels."""
+    bad = ~np.isfinite(colour)
+    bad_alpha = np.zeros(bad.shape[:2], bool) if alpha is None else ~np.isfinite(alpha)
+    pixels = int((bad.any(-1) | bad_alpha).sum())
+    if not pixels:
+        return colour, alpha, 0
+    alpha = None if alpha is None else np.where(bad_alpha, np.float32(0), alpha)
+    return np.where(bad, np.float32(0), colour), alpha, pixels
+
+
+def _say_non_finite(path: Path, count: int, total: int, non_finite: str) -> None:
     """Apply the policy `non_finite` of `read_image`."""
-    bad = ~np.isfinite(values)
-    if not bad.any():
-        return values
-    count = int(bad.any(-1).sum())
     if non_finite == "error":
-        total = bad.shape[0] * bad.shape[1]
         raise InputError(f"{path}: {count} of {total} pixels are NaN or infinite; replace them first")
     log.warning("%s: %d pixels are NaN or infinite; their values are set to 0", path, count)
-    return np.where(bad, np.float32(0), values)
 
 
 def write_exr(

@@ -15,6 +15,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
+from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.appearance_network import AppearanceNetwork
@@ -27,6 +28,7 @@ from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
 FORMAT = "facerf-checkpoint-1"
 _FILLS = (Tensor.uniform_, Tensor.normal_)
+_COPIES = 3  # of a file: its tensors, floats of its halves, and the networks that take them
 _LARGEST_SIDE = 4096  # working side, in a checkpoint that is read
 
 # Classes by the name of a network in a checkpoint, and its form.
@@ -79,6 +81,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     if not path.is_file():
         raise InputError(f"{path}: no such checkpoint; give a .safetensors file that `facerf train` wrote")
     try:
+        memory.require(str(path), _COPIES * path.stat().st_size, "a smaller checkpoint")
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)

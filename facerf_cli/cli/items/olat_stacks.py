@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import (
     FittedFace,
@@ -67,7 +68,7 @@ def _of_person(
     """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
-    reflectance = reflectance_of(models, head, "portrait", work.network_alone, work.memory_bytes, photo)
+    reflectance = reflectance_of(models, head, "portrait", work.network_alone, memory.limit_bytes(), photo)
     composition = composition_of(models, photo, head, reflectance, Target(background="none"))
 
     def olats() -> Iterator[Tensor]:
@@ -115,7 +116,7 @@ def _olats(
         directions,
         rotation_of(work.pose),
         work.network_alone,
-        work.memory_bytes,
+        memory.limit_bytes(),
         work.precision == "bf16",
     )
     for textures in olats:

@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 import torch
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.backdrops import Backdrops
 from facerf_cli.cli.items.companions import companion
@@ -152,7 +153,7 @@ def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) 
     models, head = load_models_once(work.photo), face.head
     target = _target(item, head.fit, image, work)
     reflectance = reflectance_of(
-        models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels
+        models, head, work.reflectance, work.network_alone, memory.limit_bytes(), image.pixels
     )
     composition = composition_of(models, image.pixels, head, reflectance, target)
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
@@ -308,7 +309,7 @@ def _write_setups(
 
 def _parts(shown: _Shown, work: Relight) -> list[slice]:
     """Setups, as many at a time as fit the memory."""
-    at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
+    at_once = max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
     return [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
 
 
