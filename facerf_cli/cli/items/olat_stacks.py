@@ -32,6 +32,7 @@ from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.strips import whole
 from facerf_cli.viewer.frame import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
@@ -75,7 +76,7 @@ def _of_person(
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
             single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
             relit = relit_by(composition, head, reflectance, some, single)
-            layers = np.stack([composition.light_layer(one) for one in relit])
+            layers = np.stack([whole(composition.light_layer(one)) for one in relit])
             batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
             scale = _TILE_PX / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
@@ -90,8 +91,8 @@ def _of_person(
         directions=directions.numpy(),
         rotation=head.fit.rotation.numpy(),
         source=photo,
-        seen=layers["person.A"],
-        normals=layers["normal"],
+        seen=whole(layers["person.A"]),
+        normals=whole(layers["normal"]),
         layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(head.fit),
         metadata=_metadata(item, work),

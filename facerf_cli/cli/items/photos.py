@@ -31,6 +31,7 @@ from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
+_KEPT_PX = 7  # bytes of a pixel beside the photo: an 8-bit copy in which faces are found, and the matte
 _LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
@@ -80,7 +81,7 @@ def face_model(options: PhotoOptions) -> MorphableModel:
 def read_photo(item: Item, options: PhotoOptions) -> LinearImage:
     """The item's image, scene-linear Rec.709."""
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
-    return read_image(item.input_path, space)
+    return read_image(item.input_path, space, kept_px=_KEPT_PX)
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:

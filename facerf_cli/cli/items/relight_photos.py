@@ -37,7 +37,7 @@ from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
 from facerf_cli.colour import ExposureRule
-from facerf_cli.composite import Composition, Relit, RelitImage, Target
+from facerf_cli.composite import Composition, Relit, RelitRows, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
@@ -49,6 +49,7 @@ from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stac
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
+from facerf_cli.strips import Rows
 
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
@@ -60,13 +61,13 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 class Composer(Protocol):
     """A composer of images: `Composition`, `GroupComposition`; of stacks `PersonStack`, `RenderedStack`."""
 
-    def image(self, relit: Any, ev: float, behind: np.ndarray | None) -> RelitImage:
+    def rows(self, relit: Any, ev: float, behind: Rows | None) -> RelitRows:
         """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
 
-    def layers(self, names: Sequence[str], relit: Any) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Any) -> dict[str, Rows]:
         """Layers of the image by the names that they have in a file."""
 
-    def light_layer(self, relit: Any) -> np.ndarray:
+    def light_layer(self, relit: Any) -> Rows:
         """The person under one of several lights, over black."""
 
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
@@ -296,7 +297,7 @@ def _write_setups(
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
-            image, layers = shown.composer.image(relit, ev, behind), shown.composer.layers(work.aov, relit)
+            image, layers = shown.composer.rows(relit, ev, behind), shown.composer.layers(work.aov, relit)
             if setup.names:
                 each = map(shown.composer.light_layer, shown.apart(setup))
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
@@ -314,7 +315,7 @@ def _parts(shown: _Shown, work: Relight) -> list[slice]:
 
 
 def _output(
-    image: RelitImage, layers: Mapping[str, np.ndarray], photo_alpha: np.ndarray | None, work: Relight
+    image: RelitRows, layers: Mapping[str, Rows], photo_alpha: np.ndarray | None, work: Relight
 ) -> OutputImage:
     """The image to write; a soft view leaves what was photographed, and a given background, as it looks."""
     alpha = photo_alpha if image.alpha is None else image.alpha

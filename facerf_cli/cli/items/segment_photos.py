@@ -15,8 +15,9 @@ from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import FoundFace
-from facerf_cli.portrait.matte import person_colours
+from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.strips import whole
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
 _OVERLAY_PX = 1600  # largest side of the overlay
@@ -43,7 +44,7 @@ def _write(
 
     metadata = stamp(item)
     found = segment(display, face.landmarks_px)
-    colours = person_colours(image.pixels, found.matte)
+    colours = whole(PersonColours(image.pixels, found.matte))
     write_exr(path("_segment.exr"), colours, found.matte, found.layers(), metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)
     write_display(path("_overlay.jpg"), _overlay(display, found, face), metadata=metadata)
@@ -55,7 +56,7 @@ def _overlay(display: np.ndarray, found: Segmentation, face: Face) -> np.ndarray
     step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
     shown = display[::step, ::step] / np.float32(255) * (1 - _SHOWN * found.matte[::step, ::step, None])
     for name, colour in zip(CLASSES[1:], _colours(), strict=True):
-        shown += _SHOWN * found.layer(name)[::step, ::step, None] * colour
+        shown += _SHOWN * whole(found.layer(name))[::step, ::step, None] * colour
     half = max(1, round(_DOT * max(shown.shape[:2]) / 2))
     for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
         shown[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)
