@@ -20,6 +20,7 @@ from facerf_cli.strips import Computed, Rows, strips, whole
 _TINY = 1e-8
 _FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
 _BYTES, _PHOTO_BYTES = 32, 16  # of a pixel of the view, and of a photo with its matte around it
+_STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
 
 
@@ -100,6 +101,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
     top, left, window = _window(vertices_camera, camera)
     needed = camera.height_px * camera.width_px * _PHOTO_BYTES + window.height_px * window.width_px * _BYTES
+    needed += needed // _BETWEEN + _STRIP_BYTES
     memory.require(f"a face of {window.width_px} x {window.height_px} pixels", needed, "a smaller photo")
     triangles = grid_triangles()
     size = window.height_px, window.width_px
