@@ -156,7 +156,10 @@ def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) 
     reflectance = reflectance_of(
         models, head, work.reflectance, work.network_alone, memory.limit_bytes(), image.pixels
     )
-    composition = composition_of(models, image.pixels, head, reflectance, target)
+    try:
+        composition = composition_of(models, image.pixels, head, reflectance, target)
+    except InputError as error:
+        raise InputError(f"{item.input_path}: {error}") from None
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
     def relit(rows: slice) -> list[Relit]:

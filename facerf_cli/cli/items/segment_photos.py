@@ -20,6 +20,7 @@ from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.strips import whole
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
+_KEPT_PX = 26  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the colours, a class
 _OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 # Hues of the classes but the background, in the order of CLASSES; near ones differ.
@@ -28,7 +29,7 @@ _HUES = np.array([0.07, 0.6, 0.5, 0.95, 0.9, 0.78, 0.7, 0.33, 0.14, 0.45, 0.85, 
 
 def write_segments(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, Any]]:
     """Segment and write each chosen person of a photo; their tags, and facts for the report."""
-    image = read_photo(item, options)
+    image = read_photo(item, options, _KEPT_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     for tag, face in reversed(people):
