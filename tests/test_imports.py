@@ -12,13 +12,13 @@ LEVELS = (
     ("cli",),
     ("evaluation", "training", "api"),
     ("dataset",),
-    ("synth", "capture", "viewer"),
+    ("synth", "capture", "viewer", "film"),
     ("pipeline",),
     ("field", "baselines", "composite", "group_photo", "near_textures", "portrait_field", "whole_person"),
     ("models", "portrait"),
     ("network", "face"),
     ("raster", "light", "files", "metrics"),
-    ("workers", "ray_workers", "colour", "memory", "ocio", "logs", "strips", "errors"),
+    ("workers", "ray_workers", "colour", "memory", "ocio", "logs", "stopping", "strips", "errors"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 STRANGERS = (("network", "face"), ("raster", "light"))  # what one needs of the other is handed in

@@ -12,6 +12,7 @@ import typer
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import BackgroundChoice, parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
@@ -24,10 +25,8 @@ from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
-    InputsArgument,
     JobsOption,
     NetworkAloneOption,
-    OutputOption,
     OverwriteOption,
     refuse_given,
     settings_of,
@@ -55,7 +54,17 @@ from facerf_cli.cli.photo_options import (
     check_companion,
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.cli.values import Exposure, parse_exposure, parse_lights, parse_pose
+from facerf_cli.cli.shots import (
+    FRAMES_IN_A_ROW,
+    PhotosArgument,
+    SequenceOption,
+    Shot,
+    check_shots,
+    collect_frames,
+    follow_all,
+    recipe_of_shots,
+)
+from facerf_cli.cli.values import Exposure, is_sweep, parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError, UsageError
 
 Composite = Literal["photo", "face"]
@@ -85,6 +94,7 @@ class Relight:
     exposure_group: ExposureGroup = "photo"
     photo_of_stack: Path | None = None
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
+    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
@@ -134,6 +144,7 @@ class Relight:
         shared = recipe_of(self, digest_of)
         if self.leaders:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
+        shared |= recipe_of_shots(self.shots, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
@@ -147,6 +158,7 @@ class Relight:
 
         check_output(self.output)
         self.photo.preparation(dry_run)()
+        follow_all(self.shots, self.photo, dry_run)
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self
         setups = readable(self.setups)
@@ -155,7 +167,7 @@ class Relight:
         return replace(self, setups=setups)
 
     def __call__(self, item: Item) -> Outcome:
-        """Relight a photo or a stack."""
+        """Relight a photo, a frame or a stack."""
         from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self.for_stale(item))
@@ -166,8 +178,8 @@ class Relight:
 
 def relight(
     context: typer.Context,
-    inputs: InputsArgument,
-    output: OutputOption,
+    inputs: PhotosArgument,
+    output: FilmOrFolderOption,
     envmap: Annotated[
         list[str] | None,
         typer.Option(
@@ -327,12 +339,14 @@ def relight(
         ),
     ] = False,
     envmap_sampling: Annotated[
-        Sampling,
+        Sampling | None,
         typer.Option(
-            help="Give each light the map's integral over its cell, or, as in the paper, one pixel.",
+            help="Give each light the map's integral over its cell; share it smoothly among lights; or, "
+            "as in the paper, one pixel.",
+            show_default="cell; smooth for --rotate FROM:TO:N",
             rich_help_panel=LIGHT,
         ),
-    ] = "cell",
+    ] = None,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
     face: FaceOption = "largest",
@@ -341,6 +355,7 @@ def relight(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    fps: FpsOption = None,
     name: Annotated[
         str | None,
         typer.Option(
@@ -350,6 +365,7 @@ def relight(
             rich_help_panel=BATCH,
         ),
     ] = None,
+    sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -361,12 +377,20 @@ def relight(
     serves all maps and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the
     end.
 
+    A film, or images with --sequence, is one shot: one identity, and one light by which the field is
+    corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or FILE.mov joins
+    frames to a film, with the sound of the film that they come from.
+
     An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
     the nearest of them.
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
-    formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
+    film = film_output(output, fps)
+    if film is not None:
+        refuse_given(context, ("format_", "ball", "name"), f"is not for -o {output}; leave it out")
+        output = film.folder
+    formats = film.formats if film else parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
     refuse_unused(context, formats)
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
@@ -389,6 +413,8 @@ def relight(
     behind = parse_background(background)
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+    if film and (behind.kind == "none" or composite == "face" or pose is not None):
+        raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
     check_companion(matte, "--matte")
     check_companion(photo_of_stack, "--photo")
     shown: Composite = composite or ("photo" if pose is None else "face")
@@ -398,7 +424,7 @@ def relight(
         photo=photo,
         setups=collect_setups(envmap or (), rotate, light or (), output, settings.seed, lit),
         rig=lights,
-        sampling=envmap_sampling,
+        sampling=envmap_sampling or ("smooth" if rotate and is_sweep(rotate) else "cell"),
         pose=pose,
         composite=shown,
         background=behind,
@@ -418,10 +444,14 @@ def relight(
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
         _write_to_stdout(inputs, work)
         return
-    options = BatchOptions(output, overwrite, dry_run, jobs)
-    items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
-    work = work.with_leaders(items)
+    items, shots = collect_frames(inputs, output, settings, sequence, pattern)
+    check_shots(shots, photo)
+    in_a_row = FRAMES_IN_A_ROW if shots else 1
+    options = BatchOptions(output, overwrite, dry_run, jobs, in_a_row, print_outputs=film is None)
+    work = replace(work.with_leaders(items), shots=shots)
     work.refuse_meeting(items)
+    if film is not None:
+        raise typer.Exit(run_to_film(film, items, shots, work, options, settings))
     finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
     usable = work if finished else work.readable(dry_run)
     code = run_files("relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of)

@@ -12,6 +12,7 @@ from typing import Any
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Row
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import json_line
 
 FORMAT = "facerf-evaluation-2"
@@ -57,6 +58,7 @@ def write_figures(path: Path, figures: ItemFigures) -> None:
 
 def read_figures(path: Path) -> ItemFigures:
     """Read an item's figures; null becomes NaN. Raises InputError for any other file."""
+    require_regular(path, "give --overwrite always")
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
@@ -64,7 +66,7 @@ def read_figures(path: Path) -> ItemFigures:
         rows = tuple(_row(entry) for entry in content["rows"])
         strips = tuple(_strip(entry) for entry in content["strips"])
         return ItemFigures(content["key"], rows, strips, tuple(map(str, content["pictures"])))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise InputError(
             f"{path}: no figures of an evaluation ({error}); remove it, or give --overwrite always"
         ) from None
@@ -72,6 +74,9 @@ def read_figures(path: Path) -> ItemFigures:
 
 def _row(entry: Mapping[str, Any]) -> Row:
     values = {name: math.nan if value is None else float(value) for name, value in entry["values"].items()}
+    facts = entry["facts"].items() if isinstance(entry["facts"], dict) else ()
+    if len(facts) != len(entry["facts"]) or not all(isinstance(fact, str | int | float) for _, fact in facts):
+        raise ValueError("its facts are not names and values")
     return Row(**{**entry, "values": values})
 
 

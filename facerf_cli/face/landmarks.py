@@ -14,6 +14,7 @@ import numpy as np
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, check_landmarks
+from facerf_cli.files.regular import require_regular
 from facerf_cli.strips import strips
 
 _MAX_BYTES = 1 << 20  # of a landmark file
@@ -100,6 +101,7 @@ def read_landmarks(path: Path) -> np.ndarray:
     The file is iBUG's `.pts`, whose pixels count from 1, or JSON with pixel centres at index + 0.5: a list of
     68 [x, y], or an object with this list as "landmarks".
     """
+    require_regular(path, "give 68 landmarks as .pts or JSON")
     try:
         size = path.stat().st_size
         text = path.read_text(encoding="utf-8") if size <= _MAX_BYTES else ""
@@ -112,7 +114,7 @@ def read_landmarks(path: Path) -> np.ndarray:
     try:
         points = _parse_pts(text) if path.suffix.lower() == ".pts" else _parse_json(text)
         return check_landmarks(points)
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise InputError(
             f"{path}: no landmarks ({_reason(error)}); give 68 landmarks as .pts or JSON"
         ) from None

@@ -10,8 +10,9 @@ import OpenImageIO as oiio
 
 from facerf_cli import memory
 from facerf_cli.errors import InputError
-from facerf_cli.files.heif import decode_heif, heif_header, is_heif
-from facerf_cli.files.image_metadata import require_whole_png, utf8_path
+from facerf_cli.files.heif import decode_heif, is_heif
+from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
+from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
@@ -20,6 +21,7 @@ log = logging.getLogger(LOGGER_NAME)
 _INTEGERS = (oiio.TypeDesc(oiio.UINT8), oiio.TypeDesc(oiio.UINT16))
 _LINEAR_BYTES = 12  # of a pixel that is read: three floats, and
 _ALPHA_BYTES = 4
+_HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +43,13 @@ def decode(path: Path, limit_px: int, kept_px: int = 0) -> Decoded:
     Before pixels are decoded their number is checked, and the budget of memory is asked for the channels, a
     linear image, and `kept_px` bytes a pixel that the caller makes of it once the channels are gone.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not an image; give an image file")
-    if not path.is_file() or not path.stat().st_size:
-        raise InputError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
+    require_regular(path, "give an image file")
+    if not path.stat().st_size:
+        raise InputError(f"{path}: the file is empty; give an image file")
     if is_heif(path):
-        image, spec = heif_header(path)
-        _check_size(path, spec, limit_px)
-        _ask_for(path, spec, 2 * spec.nchannels * spec.format.size(), kept_px)
-        return Decoded(decode_heif(path, image, spec), spec, *pick_channels(list(spec.channelnames), -1))
+        most_px = memory.limit_bytes() // (_LINEAR_BYTES + max(_HEIF_BYTES, kept_px))
+        values, spec = decode_heif(path, min(limit_px, most_px))
+        return Decoded(values, spec, *pick_channels(list(spec.channelnames), -1))
     require_whole_png(path)
     return _decode_by_oiio(path, limit_px, kept_px)
 
@@ -59,7 +59,7 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(utf8_path(path), settings)
     if stream is None:
-        advice = f"save it again as EXR, PNG or JPEG ({_reason(path, oiio.geterror())})"
+        advice = f"save it again as EXR, PNG or JPEG ({_reason(path, oiio_error())})"
         raise InputError(f"{path}: not a readable image; {advice}")
     try:
         spec = stream.spec()
@@ -72,7 +72,7 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
         kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
         _ask_for(path, spec, (past - first) * kind.size(), kept_px)
         values = stream.read_image(0, 0, first, past, kind)
-        message = _reason(path, stream.geterror())
+        message = _reason(path, oiio_error(stream))
     finally:
         stream.close()
     if values is None or "premature end" in message.lower():  # a JPEG cut short decodes to grey

@@ -8,6 +8,7 @@ import logging
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,11 +64,22 @@ class Header:
     metadata: dict[str, Any]
 
 
+def oiio_error(stream: Any = oiio) -> str:
+    """Take the pending error of OpenImageIO, or of one of its streams, which need not be UTF-8.
+
+    OpenImageIO prints an error that nobody took when the program ends.
+    """
+    try:
+        return str(stream.geterror())
+    except UnicodeDecodeError as error:
+        return error.object.decode(errors="replace")
+
+
 def read_header(path: Path) -> Header | None:
     """Read the header of an image's first part; return None if the file is not a readable image."""
     stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
     if stream is None:
-        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        oiio_error()
         return None
     spec = stream.spec()
     stream.close()
@@ -92,7 +104,11 @@ def utf8_path(path: Path) -> str:
 def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
     """Return the attributes that are text, numbers or tuples, without the orientation."""
     plain = (str, int, float, tuple)
-    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
+    attributes = {}
+    for entry in spec.extra_attribs:
+        with suppress(UnicodeDecodeError):  # of a text in another encoding
+            if isinstance(entry.value, plain):
+                attributes[entry.name] = entry.value
     attributes.pop("Orientation", None)  # `read_image` turns the image upright
     return attributes
 
@@ -150,6 +166,7 @@ def require_whole_png(path: Path) -> None:
 
     OpenImageIO does not report such damage reliably.
     """
+    size = path.stat().st_size
     with path.open("rb") as stream:
         if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
             return
@@ -157,7 +174,7 @@ def require_whole_png(path: Path) -> None:
         while kind != b"IEND":
             head = stream.read(8)
             length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
-            body, checksum = stream.read(length), stream.read(4)
+            body, checksum = stream.read(min(length, size)), stream.read(4)  # a length may be 4 GiB
             if len(body) != length or len(checksum) != 4:
                 raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
             if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):

@@ -29,10 +29,11 @@ from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
+from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
 _KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
-_LANDMARK_SUFFIXES = (".pts", ".json")
+LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -43,6 +44,7 @@ class FittedFace:
     tag: str
     found: FaceBox
     head: Head
+    steady: SteadyFrame | None = None  # of a frame of a shot
 
     @property
     def fit(self) -> FaceFit:
@@ -166,7 +168,7 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
 
 def _given(item: Item, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
-    return face_at(read_landmarks(companion(item, landmarks, _LANDMARK_SUFFIXES, "--landmarks")))
+    return face_at(read_landmarks(companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")))
 
 
 def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:

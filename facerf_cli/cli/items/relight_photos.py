@@ -33,13 +33,15 @@ from facerf_cli.cli.items.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.cli.items.shot_frames import seen_frame, view_of
 from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
+from facerf_cli.cli.shots import shot_of
 from facerf_cli.colour import ExposureRule
 from facerf_cli.composite import Composition, Relit, RelitRows, Target
 from facerf_cli.errors import InputError
-from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
@@ -93,10 +95,9 @@ def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
-    image = read_photo(item, work.photo)
-    faces = fit_faces(item, image, work.photo)
+    image, faces = _seen(item, work)
     metadata = _metadata(item, work)
-    leader = work.leader_of(item)
+    leader = _leader_of(item, work)
     chosen_ev = None if leader is None or leader == item else _exposures_of(leader, work)
     written: Written = {}
     if work.composite == "photo":
@@ -108,11 +109,30 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     return written, facts_of(faces)
 
 
+def _seen(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
+    """The image of an item and its faces; those of a frame of a shot steadied by the frames around it."""
+    if place := shot_of(work.shots, item):
+        image, face = seen_frame(*place, work.photo, work.reflectance == "portrait")
+        return image, [face]
+    image = read_photo(item, work.photo)
+    return image, fit_faces(item, image, work.photo)
+
+
+def _leader_of(item: Item, work: Relight) -> Item | None:
+    """The photo whose exposure an item shares; of a shot a frame of its middle."""
+    place = shot_of(work.shots, item)
+    if place is None:
+        return work.leader_of(item)
+    return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
+
+
 @cache
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of the first photo of a group, which the others share; found once a process."""
-    image = read_photo(leader, work.photo)
-    shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
+    """Exposures of a photo that others share; found once a process."""
+    if isinstance(work.exposure, float):
+        return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
+    image, faces = _seen(leader, work)
+    shown = _together(leader, image, faces, work)
     parts = _parts(shown, work)
     return _exposures_ev(parts, shown.relit, shown.composer, work)
 
@@ -152,9 +172,15 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
 
 def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> _Shown:
     models, head = load_models_once(work.photo), face.head
-    target = _target(item, head.fit, image, work)
+    target = _target(item, face, image, work)
     reflectance = reflectance_of(
-        models, head, work.reflectance, work.network_alone, memory.limit_bytes(), image.pixels
+        models,
+        head,
+        work.reflectance,
+        work.network_alone,
+        memory.limit_bytes(),
+        image.pixels,
+        face.steady,
     )
     try:
         composition = composition_of(models, image.pixels, head, reflectance, target)
@@ -184,13 +210,15 @@ def _each_light(setup: LightSetup) -> tuple[LightSetup, ...]:
     return tuple(replace(setup, lights=(light,)) for light in setup.lights)
 
 
-def _target(item: Item, fit: FaceFit, image: LinearImage, work: Relight) -> Target:
+def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> Target:
     """The head in the pose of `--pose`, composed as the options choose."""
     rotation = rotation_of(work.pose)
-    posed = None if rotation is None else replace(fit, rotation=rotation)
+    posed = None if rotation is None else replace(face.fit, rotation=rotation)
     if work.composite != "photo":
         return Target(posed, work.composite)
     matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
+    if matte is None and face.steady is not None:
+        matte = face.steady.segmentation.matte
     kind = work.background.kind
     return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
 
@@ -306,7 +334,7 @@ def _write_setups(
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
-            if work.output.shown_suffix:
+            if work.output.shown_suffix and not chosen_ev:
                 log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.shown_suffix), ev)
             yield path, ev
 
