@@ -163,7 +163,13 @@ def named_space(name: str, config: str = "") -> ColourSpace:
 
 
 def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
-    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values."""
+    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values.
+
+    Integers count in steps from 0 to 1; the curve of a space is then looked up.
+    """
+    if pixels.dtype.kind == "u" and space.chromaticities is not None:
+        return _by_matrix(_looked_up(pixels, space), matrix_to_rec709(space.chromaticities))
+    pixels = unit_floats(pixels)
     if space.chromaticities is None:
         for name, matrix in _ocio_bridges():
             found = ocio.converted(pixels, space.name, name, space.config)
@@ -172,6 +178,24 @@ def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
         raise _cannot_convert(space)
     linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
     return _by_matrix(linear, matrix_to_rec709(space.chromaticities))
+
+
+def _looked_up(integers: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Decode unsigned integers [H, W, 3] by the curves of a space, each computed once for each value."""
+    values = unit_floats(np.arange(np.iinfo(integers.dtype).max + 1, dtype=integers.dtype))
+    grey = np.repeat(values[:, None, None], 3, -1)  # a profile has a curve for each channel
+    table = (grey if space.decode is None else space.decode(grey))[:, 0]
+    linear = np.empty(integers.shape, np.float32)
+    for channel in range(3):
+        linear[..., channel] = table[:, channel][integers[..., channel]]
+    return linear
+
+
+def unit_floats(values: np.ndarray) -> np.ndarray:
+    """Values as float32; unsigned integers count in steps from 0 to 1."""
+    if values.dtype.kind != "u":
+        return values.astype(np.float32, copy=False)
+    return values.astype(np.float32) * (1 / np.float32(np.iinfo(values.dtype).max))  # as OpenImageIO
 
 
 def from_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:

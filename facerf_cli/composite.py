@@ -14,7 +14,7 @@ undershoot of the surround, which is clipped, and for the photo's background, wh
 with negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -29,12 +29,14 @@ from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
+from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
-from facerf_cli.portrait.matte import person_colours
+from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
+from facerf_cli.strips import Computed, Rows, whole
 
 _DARK = 0.08  # e above, a share of the source's mean
 _OWN_REGIONS = ("eyes", "mouth", "brows")  # keep the photo's own detail, scaled as the skin around them
@@ -98,6 +100,18 @@ class RelitImage:
     alpha: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class RelitRows:
+    """A `RelitImage` whose rows are computed when they are read."""
+
+    pixels: Rows
+    alpha: Rows | None = None
+
+    def whole(self) -> RelitImage:
+        """The image as arrays."""
+        return RelitImage(whole(self.pixels), None if self.alpha is None else whole(self.alpha))
+
+
 class AroundFace(Protocol):
     """Surroundings of the face that are relit: `Surround`, or the whole person of a portrait field."""
 
@@ -105,8 +119,8 @@ class AroundFace(Protocol):
     def nbytes(self) -> int:
         """Size of one light's tensor."""
 
-    def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
-        """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]."""
+    def over_photo(self, photo: Rows, lit: Tensor, display_ev: float) -> Rows:
+        """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]; `display_ev` shows it well."""
 
 
 class PersonAround(AroundFace, Protocol):
@@ -114,7 +128,7 @@ class PersonAround(AroundFace, Protocol):
 
     matte: np.ndarray  # the person's share of the photo [H, W]
 
-    def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
+    def layer(self, name: str, lit: Tensor) -> dict[str, Rows]:
         """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
@@ -142,60 +156,90 @@ class Composition:
         crop = Crop(0.0, 0.0, float(fit.crop.size_px), fit.crop.size_px) if photo is None else fit.crop
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
         self._photo = photo if target.composite == "photo" else None
+        self.own: Rows
         self._face, self._target = head.face, target
         self.detail: PhotoDetail | None = None
         self.surround: AroundFace | None = None
         self._person = person
-        self._mask = self.view.full(self.view.mask)
         if self._photo is not None:
-            matte = target.matte
-            self.matte = np.ones(size_px, np.float32) if matte is None else matte.astype(np.float32)
-            self.own = self._photo if matte is None else _own_colours(self._photo, self.matte)
-            self.detail = PhotoDetail(self.own, head.face, self.view)
-            self.surround = person or Surround(vertices, crop, head.face.texture, *size_px)
+            matte, self.own = target.matte, self._photo
+            self.matte = np.broadcast_to(np.float32(1), size_px)
+            if matte is not None:
+                self.matte = matte.astype(np.float32, copy=False)
+                self.own = PersonColours(self._photo, self.matte)
+            seen = self.own.small if isinstance(self.own, PersonColours) else self._photo
+            self.guide_ev = display_ev(seen)
+            self.detail = PhotoDetail(head.face, self.view)
+            self.surround = person or Surround(vertices, crop, head.face.texture, size_px[1])
 
-    def image(self, relit: Relit, ev: float = 0.0, behind: np.ndarray | None = None) -> RelitImage:
+    def image(self, relit: Relit, ev: float = 0.0, behind: Rows | None = None) -> RelitImage:
+        """`rows` as arrays."""
+        return self.rows(relit, ev, behind).whole()
+
+    def rows(self, relit: Relit, ev: float = 0.0, behind: Rows | None = None) -> RelitRows:
         """The head in its frame as relit, scene-linear.
 
         The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
-        if self._photo is None:
-            return RelitImage(self.view.full(self.view.render(relit.texture)), self._mask)
+        photo = self._photo
+        if photo is None:
+            return RelitRows(self._rendered(relit), self._mask)
         person = self._relit_person(relit)
-        matte = self.matte[..., None]
         if self._target.background == "none":
-            return RelitImage(person, self.matte)
-        if behind is not None:
-            return RelitImage(behind + matte * (person - behind))
-        behind = (self._photo - matte * self.own) * np.float32(2.0**-ev)
-        return RelitImage(behind + matte * person)
+            return RelitRows(person, self.matte)
+        gain = np.float32(2.0**-ev)
 
-    def _relit_person(self, relit: Relit) -> np.ndarray:
+        def of(rows: slice) -> np.ndarray:
+            pixels, matte = person[rows], self.matte[rows][..., None]
+            if behind is not None:
+                return behind[rows] + matte * (pixels - behind[rows])
+            return (photo[rows] - matte * self.own[rows]) * gain + matte * pixels
+
+        return RelitRows(Computed(photo.shape, of))
+
+    def _rendered(self, relit: Relit) -> Rows:
+        return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
+
+    @property
+    def _mask(self) -> Rows:
+        return self.view.in_frame(lambda rows: self.view.mask[rows])
+
+    def _relit_person(self, relit: Relit) -> Rows:
         """Pixels [H, W, 3] of the person, also where the matte leaves none of them."""
         assert self.surround is not None and self.detail is not None and relit.surround is not None
-        person = self.surround.over_photo(self.own, relit.surround)
-        mask = self.view.mask.numpy()[..., None]
-        person[self.view.window] += mask * (self.detail.relit(relit.texture) - person[self.view.window])
-        return person
+        around = self.surround.over_photo(self.own, relit.surround, self.guide_ev)
+        detail, view = self.detail.relit(self.own, relit.texture), self.view
 
-    def person(self, relit: Relit) -> tuple[np.ndarray, np.ndarray]:
+        def of(rows: slice) -> np.ndarray:
+            person = around[rows]
+            inside = view.rows_inside(rows)
+            if inside.start < inside.stop:
+                part = person[view.rows_of(inside, rows), view.window[1]]
+                part += view.mask[inside].numpy()[..., None] * (detail(inside) - part)
+            return person
+
+        return Computed(around.shape, of)
+
+    def person(self, relit: Relit) -> tuple[Rows, Rows]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
         own = self._mask if self._person is None else self._person.matte
-        return self._relit_person(relit), np.minimum(self.matte, own)
+        share = Computed(own.shape, lambda rows: np.minimum(self.matte[rows], own[rows]))
+        return self._relit_person(relit), share
 
-    def light_layer(self, relit: Relit) -> np.ndarray:
+    def light_layer(self, relit: Relit) -> Rows:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""
-        if self._photo is None:
-            return self.view.full(self.view.render(relit.texture)) * self._mask[..., None]
-        return self._relit_person(relit) * self.matte[..., None]
+        pixels, share = self._rendered(relit), self._mask
+        if self._photo is not None:
+            pixels, share = self._relit_person(relit), self.matte
+        return Computed(pixels.shape, lambda rows: pixels[rows] * share[rows][..., None])
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
 
         `names` are of `PERSON_LAYERS` where a whole person is relit; else, and for what only the face has, of
         `FACE_LAYERS`. Raises UsageError for others.
         """
-        found = {} if self._photo is None else {"person.A": self.matte}
+        found: dict[str, Rows] = {} if self._photo is None else {"person.A": self.matte}
         for name in names:
             if self._person is not None and relit.surround is not None and name in PERSON_LAYERS:
                 found |= self._person.layer(name, relit.surround)
@@ -205,17 +249,17 @@ class Composition:
                 raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
         return found
 
-    def _face_layer(self, name: str) -> dict[str, np.ndarray]:
+    def _face_layer(self, name: str) -> dict[str, Rows]:
         if name == "face":
             return {"face.A": self._mask}
         view = self.view
-        values = {
-            "normal": view.normal,
-            "position": view.position_m,
-            "depth": -view.position_m[..., 2:],
-            "uv": view.uv,
+        of, channels = {
+            "normal": (lambda rows: view.surface(rows)[..., :3], 3),
+            "position": (lambda rows: view.surface(rows)[..., 3:], 3),
+            "depth": (lambda rows: -view.surface(rows)[..., 5:], 1),
+            "uv": (lambda rows: view.uv[rows], 2),
         }[name]
-        return {name: view.full(values)}
+        return {name: view.in_frame(of, channels)}
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV of a relit head, by a rule."""
@@ -227,46 +271,41 @@ class Composition:
         return chosen_exposure_ev(rule, lit, plate, seen, seen)
 
 
-def _own_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The person's colours [H, W, 3], of which the photo's mixtures hold no more than they have."""
-    share = matte[..., None]
-    most = np.divide(photo, share, out=np.zeros_like(photo), where=share > 0)
-    return np.minimum(person_colours(photo, matte), most)
-
-
 class PhotoDetail:
     """The photo's own detail, added to relit textures in the window [h, w] of a view (formula above).
 
     Eyes, brows and teeth stay the photo's: they are scaled as the skin around them.
     """
 
-    def __init__(self, photo: np.ndarray, face: FaceTexture, view: FaceView) -> None:
+    def __init__(self, face: FaceTexture, view: FaceView) -> None:
         self._view, self._texture = view, face.texture
         own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
         side = face.texture.shape[1:]
-        self.own_texture = own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[
-            0, 0
-        ]
+        own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[0, 0]
+        self.own_texture = own
         self.trusted = face.visible * (1 - own)
         self.mean_source = _mean(face.texture, self.trusted)
-        self.floor = floor = _DARK * float(self.mean_source.mean()) + _TINY
-        self._around_source = inpaint(face.texture, self.trusted).clamp(min=floor)
-        rendered = view.render(torch.cat([face.texture, own[None]])).numpy()
-        source, self._own = rendered[..., :3], rendered[..., 3:]
-        self._pixels = photo[view.window].clip(min=0)
-        finer = self._pixels >= source
-        self._gain = np.where(
-            finer, (self._pixels + floor) / (source + floor), self._pixels / source.clip(min=_TINY)
-        )
-        self._bias = np.where(finer, floor * (self._pixels - source) / (source + floor), 0)
+        self.floor = _DARK * float(self.mean_source.mean()) + _TINY
+        self._around_source = inpaint(face.texture, self.trusted).clamp(min=self.floor)
+        self._source = torch.cat([face.texture, own[None]])
 
-    def relit(self, texture: Tensor) -> np.ndarray:
-        """The photo's pixels [h, w, 3] under the light of a relit texture [3, T, T]."""
-        mean_change = _mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)
+    def relit(self, photo: Rows, texture: Tensor) -> Callable[[slice], np.ndarray]:
+        """The photo's pixels in rows [h, w, 3] of the window under the light of a relit texture [3, T, T]."""
+        mean_change = (_mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)).numpy()
         around = inpaint(texture, self.trusted) / self._around_source
-        rendered = self._view.render(torch.cat([texture, around])).numpy()
-        skin = rendered[..., :3] * self._gain + mean_change.numpy() * self._bias
-        return skin + self._own * (rendered[..., 3:] * self._pixels - skin)
+        textures, floor = torch.cat([texture, around, self._source]), self.floor
+
+        def of(rows: slice) -> np.ndarray:
+            pixels = photo[self._view.in_photo(rows)][:, self._view.window[1]].clip(min=0)
+            rendered = self._view.render(textures, rows).numpy()
+            skin, change, source, own = np.split(rendered, [3, 6, 9], -1)
+            finer = pixels >= source
+            gain = np.where(finer, (pixels + floor) / (source + floor), pixels / source.clip(min=_TINY))
+            bias = np.where(finer, floor * (pixels - source) / (source + floor), 0)
+            skin = skin * gain + mean_change * bias
+            return np.asarray(skin + own * (change * pixels - skin))
+
+        return of
 
 
 def _mean(texture: Tensor, weight: Tensor) -> Tensor:
@@ -281,9 +320,7 @@ class Surround:
     there looks like a glow. The bounds apply to each light, so sums over lights stay linear.
     """
 
-    def __init__(
-        self, vertices_camera: Tensor, crop: Crop, source: Tensor, height_px: int, width_px: int
-    ) -> None:
+    def __init__(self, vertices_camera: Tensor, crop: Crop, source: Tensor, width_px: int) -> None:
         side = _SURROUND * _SURROUND_PX
         camera = Camera(CROP_FOCAL_PER_SIDE * _SURROUND_PX, side, side, side / 2, side / 2)
         self._view = view_face(vertices_camera, camera, _SURROUND_PX)
@@ -291,7 +328,7 @@ class Surround:
         outside = (self._mask < 0.5).numpy()
         away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
         self._near = 1 - smooth(away_px / (_REACH * _SURROUND_PX))
-        self._grid = _photo_grid(crop, height_px, width_px)
+        self._crop, self._width_px = crop, width_px
         self._mean_source, self._around_source = self._mean_and_blur(source[None])
 
     def changes(self, olats: Tensor) -> Tensor:
@@ -308,12 +345,18 @@ class Surround:
         """Size of one change of light."""
         return 3 * self._mask.nbytes
 
-    def over_photo(self, photo: np.ndarray, change: Tensor) -> np.ndarray:
+    def over_photo(self, photo: Rows, change: Tensor, display_ev: float) -> Rows:
         """The photo [H, W, 3] under a change of light [3, s, s]."""
-        over = F.grid_sample(
-            change[None], self._grid, mode="bicubic", padding_mode="border", align_corners=False
-        )
-        return photo * over[0].permute(1, 2, 0).clamp(min=0).numpy()  # bicubic weights undershoot a little
+
+        def of(rows: slice) -> np.ndarray:
+            grid = _photo_grid(self._crop, rows, self._width_px)
+            over = F.grid_sample(
+                change[None], grid, mode="bicubic", padding_mode="border", align_corners=False
+            )
+            # bicubic weights undershoot a little
+            return np.asarray(photo[rows] * over[0].permute(1, 2, 0).clamp(min=0).numpy())
+
+        return Computed(photo.shape, of)
 
     def _mean_and_blur(self, textures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean colours [N, 3, 1, 1] of textures [N, 3, T, T] on the face, and their blur [N, 3, s, s]."""
@@ -326,8 +369,10 @@ class Surround:
         return mean.view(*shape, 1, 1), torch.from_numpy(blurred).view(*shape, *self._mask.shape)
 
 
-def _photo_grid(crop: Crop, height_px: int, width_px: int) -> Tensor:
-    """The place of each photo pixel in the surround's square, for grid_sample [1, H, W, 2]."""
+def _photo_grid(crop: Crop, rows: slice, width_px: int) -> Tensor:
+    """The place of pixels of the photo's rows in the surround's square, for grid_sample [1, h, W, 2]."""
     x = ((torch.arange(width_px) + PIXEL_CENTRE - crop.x0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
-    y = ((torch.arange(height_px) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (2 / _SURROUND)
-    return torch.stack([x.expand(height_px, -1), y[:, None].expand(-1, width_px)], -1)[None].float()
+    y = ((torch.arange(rows.start, rows.stop) + PIXEL_CENTRE - crop.y0_px) / crop.side_px - 0.5) * (
+        2 / _SURROUND
+    )
+    return torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, width_px)], -1)[None].float()

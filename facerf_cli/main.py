@@ -8,6 +8,7 @@ the work of a verb is in `cli/items/`, behind a deferred import. A test checks i
 
 import io
 import logging
+import math
 import os
 import signal
 import sys
@@ -17,7 +18,7 @@ from typing import Annotated, Any
 
 import typer
 
-from facerf_cli import __version__
+from facerf_cli import __version__, memory
 from facerf_cli.cli import evaluate, face_model
 from facerf_cli.cli.check import check
 from facerf_cli.cli.config import config, read_config
@@ -55,7 +56,7 @@ GROUPS: dict[str, tuple[typer.Typer, str]] = {
 
 # Global options, which are moved before the verb wherever they stand.
 FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version", "-0", "--null"})
-VALUED = frozenset({"--device", "--checkpoint", "--seed", "--config"})
+VALUED = frozenset({"--device", "--checkpoint", "--memory", "--seed", "--config"})
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
@@ -97,6 +98,17 @@ def _global_options(
         ),
     ] = Settings.checkpoint,
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = Settings.seed,
+    memory_gb: Annotated[
+        float | None,
+        typer.Option(
+            "--memory",
+            metavar="GB",
+            min=0.1,
+            help="Take no more memory than this for each job, over what it holds at rest; refuse what needs "
+            "more.",
+            show_default="half of all",
+        ),
+    ] = None,
     null: Annotated[
         bool,
         typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0."),
@@ -120,7 +132,11 @@ def _global_options(
         raise UsageError("-v and -q: contradict each other; leave one out")
     verbosity = int(verbose) - int(quiet)
     configure_logging(verbosity, log_json)
-    context.obj = Settings(verbosity, log_json, device, checkpoint, seed, null)
+    if memory_gb is not None and not math.isfinite(memory_gb):
+        raise UsageError(f"--memory {memory_gb}: not a size; give a number of GB")
+    limit_bytes = None if memory_gb is None else int(memory_gb * 2**30)
+    context.obj = Settings(verbosity, log_json, device, checkpoint, seed, null, memory_bytes=limit_bytes)
+    memory.set_limit(context.obj.job_bytes(1))
 
 
 for _panel, _verbs in VERBS.items():

@@ -4,7 +4,7 @@ The field's maps are coarse. Its gain is enlarged with the photo as a guide, so 
 light keeps every pore and hair; shading and highlights of a light are smooth and enlarged as they are.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -14,15 +14,15 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.colour import ExposureRule, chosen_exposure_ev
-from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import inpaint
+from facerf_cli.strips import Computed, Rows
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
-_BAND_PX = 1 << 20  # pixels of the photo that are computed at a time
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _FEATHER = 0.12  # border of the square where the change of light takes over, in halves of its side
 _CHANGE_PX, _DARK = 14.0, 1e-3  # of that change: its blur, and what keeps it finite, as a share of the photo
@@ -37,6 +37,7 @@ class WholePerson:
     def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
         self.matte = field.person.segmentation.matte
         self._field, self._photo = field, photo
+        self._display_ev = display_ev(photo)
         self.own = (1 - field.person.classes[0] > _SURE).float()
         hair = field.person.classes[[class_index("hair"), class_index("beard")]].sum(0, keepdim=True)
         self.hair_maps = torch.cat([self._filled(field.maps.albedo[0].mean(0, keepdim=True)), hair])
@@ -47,20 +48,26 @@ class WholePerson:
         """Size of one light's maps."""
         return 3 * self._field.person.image.nbytes
 
-    def over_photo(self, photo: np.ndarray, lit: Tensor) -> np.ndarray:
-        """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S]."""
-        result = np.empty_like(photo)
+    def over_photo(self, photo: Rows, lit: Tensor, display_ev: float) -> Rows:
+        """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S].
+
+        `display_ev` is the exposure at which the photo is shown to the guided filter.
+        """
         highlights = _blurred(self._filled(lit[3:6]), _GLOSS_PX)
         maps = [self.albedo_maps, self._filled(lit[:3]), highlights, self._change(lit), self.hair_maps]
-        for rows, wide, inside in self._bands(torch.cat(maps)):
+        stacked = torch.cat(maps)
+
+        def of(rows: slice) -> np.ndarray:
+            pixels, (wide, inside) = photo[rows], self._enlarged(stacked, rows)
             shading, shine, change, hair = torch.split(wide[_ALBEDO_MAPS:], [3, 3, 3, 2])
-            albedo = self._albedo(photo[rows], wide)
+            albedo = self._albedo(pixels, wide, display_ev)
             finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
             shine = shine * torch.lerp(torch.ones_like(finer), finer, hair[1])
             radiance = (albedo * shading + shine) * self._field.exposure
-            beyond = torch.from_numpy(photo[rows].clip(min=0)).permute(2, 0, 1) * change
-            result[rows] = torch.lerp(beyond, radiance, inside).permute(1, 2, 0).numpy()
-        return result
+            beyond = torch.from_numpy(pixels.clip(min=0)).permute(2, 0, 1) * change
+            return torch.lerp(beyond, radiance, inside).permute(1, 2, 0).numpy()
+
+        return Computed(photo.shape, of)
 
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
@@ -83,7 +90,7 @@ class WholePerson:
         """The person in the square [3, S, S], as coarse as the maps."""
         return (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
 
-    def layer(self, name: str, lit: Tensor) -> dict[str, np.ndarray]:
+    def layer(self, name: str, lit: Tensor) -> dict[str, Rows]:
         """A layer of an image under the light of maps [9, S, S], by the name or names that it has in a file.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
@@ -94,7 +101,7 @@ class WholePerson:
             layers = self._field.person.segmentation.layers()
             return {key: layers[key] for key in layers if key.startswith("class.")}
         if name == "albedo":
-            return {name: self._masked(self._albedo_map())}
+            return {name: self._masked(self._albedo_map)}
         person = self._field.person
         maps = {
             "specular": lit[3:6].clamp_min(0) * self._field.exposure,
@@ -103,26 +110,30 @@ class WholePerson:
             "position": person.maps.positions_m,
             "depth": -person.maps.positions_m[2:],
         }[name]
-        parts = [part.permute(1, 2, 0).numpy() for _, part, _ in self._bands(self._filled(maps))]
-        wide = np.concatenate(parts)
-        if name == "normal":
-            wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
-        return {name: self._masked(wide)}
+        filled = self._filled(maps)
 
-    def _masked(self, layer: np.ndarray) -> np.ndarray:
-        return layer * (self.matte > 0)[..., None]
+        def of(rows: slice) -> np.ndarray:
+            wide: np.ndarray = self._enlarged(filled, rows)[0].permute(1, 2, 0).numpy()
+            if name == "normal":
+                wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
+            return wide
 
-    def _albedo_map(self) -> np.ndarray:
-        albedo = np.empty_like(self._photo)
-        for rows, wide, _ in self._bands(self.albedo_maps):
-            part = self._albedo(self._photo[rows], wide) * self._field.exposure
-            albedo[rows] = part.permute(1, 2, 0).numpy()
-        return albedo
+        return {name: self._masked(of, len(filled))}
 
-    def _albedo(self, photo: np.ndarray, wide: Tensor) -> Tensor:
+    def _masked(self, of: Callable[[slice], np.ndarray], channels: int = 3) -> Rows:
+        """A layer [H, W, C] whose rows a function gives, without what lies off the person."""
+        shape = (*self.matte.shape, channels)
+        return Computed(shape, lambda rows: of(rows) * (self.matte[rows] > 0)[..., None])
+
+    def _albedo_map(self, rows: slice) -> np.ndarray:
+        wide, _ = self._enlarged(self.albedo_maps, rows)
+        albedo = self._albedo(self._photo[rows], wide, self._display_ev) * self._field.exposure
+        return albedo.permute(1, 2, 0).numpy()
+
+    def _albedo(self, photo: np.ndarray, wide: Tensor, exposure_ev: float) -> Tensor:
         """The photo without its light [3, h, W] in some rows [h, W, 3], from the maps over them."""
         pixels = torch.from_numpy(photo.clip(min=0)).permute(2, 0, 1)
-        guide = torch.from_numpy(to_display(photo)).permute(2, 0, 1).float() / 255
+        guide = torch.from_numpy(to_display(photo, exposure_ev)).permute(2, 0, 1).float() / 255
         slopes, offset, bias = torch.split(wide[:_ALBEDO_MAPS], [9, 3, 3])
         log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
         log_gain = log_gain.clamp(self.gain_range[0], self.gain_range[1])
@@ -141,19 +152,16 @@ class WholePerson:
         """Maps [C, S, S] with the person's values continued over the background."""
         return inpaint(maps, self.own)
 
-    def _bands(self, maps: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
-        """Rows of the photo, the maps [C, h, W] over them, and the weight [h, W] of the square there."""
+    def _enlarged(self, maps: Tensor, rows: slice) -> tuple[Tensor, Tensor]:
+        """Maps [C, h, W] over some rows of the photo, and the weight [h, W] of the square there."""
         height, width = self._photo.shape[:2]
         square = self._field.person.square
         x = 2 * (torch.arange(width) + PIXEL_CENTRE - square.x0_px) / square.side_px - 1
-        y = 2 * (torch.arange(height) + PIXEL_CENTRE - square.y0_px) / square.side_px - 1
-        step = max(1, _BAND_PX // width)
-        for first in range(0, height, step):
-            rows = slice(first, min(height, first + step))
-            grid = torch.stack([x.expand(rows.stop - first, -1), y[rows, None].expand(-1, width)], -1)[None]
-            wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
-            inside = ((1 - grid[0].abs().amax(-1)) / _FEATHER).clamp(0, 1)
-            yield rows, wide[0], inside.float()
+        y = 2 * (torch.arange(height)[rows] + PIXEL_CENTRE - square.y0_px) / square.side_px - 1
+        grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, width)], -1)[None]
+        wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
+        inside = ((1 - grid[0].abs().amax(-1)) / _FEATHER).clamp(0, 1)
+        return wide[0], inside.float()
 
 
 def _blurred(maps: Tensor, sigma_px: float) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli import memory
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
@@ -52,3 +53,9 @@ def _seeded() -> None:
     """What a test draws does not depend on the tests before it."""
     torch.manual_seed(0)
     np.random.seed(0)
+
+
+@pytest.fixture(autouse=True)
+def _with_all_memory() -> None:
+    """A budget that an earlier test set is gone."""
+    memory.set_limit(memory.default_limit())

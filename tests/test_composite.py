@@ -228,7 +228,7 @@ def test_a_bright_rim_does_not_glow_beside_the_face() -> None:
     _, source, _ = unwrapped()
     model = load_face_model("builtin")
     vertices = model.mean @ ROTATION.T + TRANSLATION_M
-    surround = Surround(vertices, CROP, source, HEIGHT_PX, WIDTH_PX)
+    surround = Surround(vertices, CROP, source, WIDTH_PX)
     rim = torch.zeros_like(source)
     rim[..., : TEXTURE // 6] = 9.0
     changes = surround.changes(torch.stack([rim, source]))
@@ -244,9 +244,7 @@ def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
     centres = (torch.arange(side) + 0.5) / side
     uv = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1)
     whole = torch.ones(side, side)
-    screen = FaceView(
-        side, side, 0, 0, uv, torch.zeros(side, side, 3), torch.zeros(side, side, 3), whole, whole
-    )
+    screen = FaceView(side, side, 0, 0, uv, whole, whole, lambda rows: torch.zeros(side, side, 6)[rows])
     return FaceTexture(source, whole, source), screen, screen.render(source).numpy()
 
 
@@ -255,7 +253,7 @@ def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
     source[:, 16:19, 22:25] = 1e-6  # a cheek's
     face, screen, shown = flat_face(source)
     photo = shown + np.float32(1e-3)  # noise of the photo over the texture
-    relit = PhotoDetail(photo, face, screen).relit(torch.full((3, 32, 32), 0.3))
+    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 32, 32), 0.3))(slice(0, 32))
     np.testing.assert_allclose(relit, 0.3, atol=0.02)  # the quotient would be 300
 
 
@@ -263,14 +261,16 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
     noise = torch.Generator().manual_seed(2)
     face, screen, shown = flat_face(0.01 + torch.rand(3, 48, 48, generator=noise))
     photo = (shown * np.random.default_rng(0).uniform(0, 2, shown.shape)).astype(np.float32)
-    detail = PhotoDetail(photo, face, screen)
+    detail, rows = PhotoDetail(face, screen), slice(0, 48)
     own_region = (region_mask("eyes", 128) + region_mask("mouth", 128) + region_mask("brows", 128)).clamp(
         max=1
     )
     skin = torch.nn.functional.interpolate(own_region[None, None], (48, 48), mode="bilinear")[0, 0] < 1e-3
-    np.testing.assert_allclose(detail.relit(face.texture)[skin], photo[skin], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(
+        detail.relit(photo, face.texture)(rows)[skin], photo[skin], rtol=1e-4, atol=1e-6
+    )
     one_sided = face.texture * (torch.arange(48) > 24)
-    assert detail.relit(one_sided).min() >= 0
+    assert detail.relit(photo, one_sided)(rows).min() >= 0
 
 
 def test_eyes_keep_their_detail() -> None:
@@ -278,7 +278,7 @@ def test_eyes_keep_their_detail() -> None:
     eyes = region_mask("eyes", 128) > 0.99
     source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
     face, screen, photo = flat_face(source)
-    relit = PhotoDetail(photo, face, screen).relit(torch.full((3, 128, 128), 0.2))
+    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 128, 128), 0.2))(slice(0, 128))
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 

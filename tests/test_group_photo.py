@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.composite import RelitImage
+from facerf_cli.composite import RelitRows
 from facerf_cli.group_photo import GroupComposition
+from facerf_cli.strips import whole
 
 SIZE = (4, 6)
 
@@ -27,12 +28,12 @@ class Plain:
     def person(self, relit: float) -> tuple[np.ndarray, np.ndarray]:
         return np.full((*SIZE, 3), relit), self.matte()
 
-    def image(self, relit: float, ev: float, behind: Any) -> RelitImage:
+    def rows(self, relit: float, ev: float, behind: Any) -> RelitRows:
         person, matte = self.person(relit)
         if self.keeps_alpha:
-            return RelitImage(person, matte)
+            return RelitRows(person, matte)
         share = matte[..., None]
-        return RelitImage(share * person + (1 - share) * 0.5 * 2**-ev)
+        return RelitRows(share * person + (1 - share) * 0.5 * 2**-ev)
 
     def light_layer(self, relit: float) -> np.ndarray:
         person, matte = self.person(relit)
@@ -54,13 +55,13 @@ def group(keeps_alpha: bool = False) -> Any:
 
 
 def test_each_person_is_relit_and_the_background_is_the_first_ones() -> None:
-    image = group().image([2.0, 8.0], 1.0, None)
+    image = group().rows([2.0, 8.0], 1.0, None).whole()
     assert image.alpha is None
     np.testing.assert_allclose(image.pixels[0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
 
 
 def test_alpha_holds_all_people() -> None:
-    image = group(keeps_alpha=True).image([2.0, 8.0], 0.0, None)
+    image = group(keeps_alpha=True).rows([2.0, 8.0], 0.0, None).whole()
     np.testing.assert_allclose(image.alpha[0], [1, 1, 0, 0.5, 0.5, 0])
     np.testing.assert_allclose((image.pixels * image.alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
     assert image.pixels[0, 3, 0] == 8  # not premultiplied
@@ -68,14 +69,14 @@ def test_alpha_holds_all_people() -> None:
 
 def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
     people = group()
-    apart = people.light_layer([1.0, 3.0]) + people.light_layer([1.0, 5.0])
+    apart = whole(people.light_layer([1.0, 3.0])) + whole(people.light_layer([1.0, 5.0]))
     np.testing.assert_allclose(apart, people.light_layer([2.0, 8.0]))
 
 
 def test_layers_hold_all_people() -> None:
     layers = group().layers(["albedo"], [2.0, 8.0])
-    np.testing.assert_allclose(layers["person.A"][0], [1, 1, 0, 0.5, 0.5, 0])
-    np.testing.assert_allclose(layers["albedo"][0, :, 0], [2, 2, 0, 4, 4, 0])
+    np.testing.assert_allclose(whole(layers["person.A"])[0], [1, 1, 0, 0.5, 0.5, 0])
+    np.testing.assert_allclose(whole(layers["albedo"])[0, :, 0], [2, 2, 0, 4, 4, 0])
 
 
 def test_the_exposure_is_the_first_ones() -> None:

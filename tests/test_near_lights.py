@@ -18,6 +18,7 @@ from facerf_cli.models import Models, load_models
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField
+from facerf_cli.strips import whole
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 TARGET = Target(background="none")
@@ -56,7 +57,7 @@ class Person:
     def _shown(self, directions: Tensor, weights: Tensor, near: NearLights | None) -> np.ndarray:
         given = (self.composition, self.head, self.field, directions, weights, TARGET, near)
         relit = next(relit_by(*given))
-        return self.composition.light_layer(relit)
+        return whole(self.composition.light_layer(relit))
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Pers
     for distance_m in (0.3, 3000.0):
         x, y, z = (distance_m * place).tolist()
         image = person.image(StudioLight(at_m=(x, y, z))).mean(-1)
-        skin = person.field.person.segmentation.layer("skin") > 0.9
+        skin = person.field.person.segmentation.layer("skin")[:] > 0.9
         middle = person.field.person.square.x0_px + person.field.person.square.side_px / 2
         right = np.arange(image.shape[1]) > middle
         shares.append(image[skin & right].mean() / image[skin & ~right].mean())
@@ -112,7 +113,7 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Person
 
 
 def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Person) -> None:
-    skin = person.field.person.segmentation.layer("skin") > 0.9
+    skin = person.field.person.segmentation.layer("skin")[:] > 0.9
     means = [person.image(StudioLight(at_m=(0.0, 0.0, z)))[skin].mean() for z in (1.0, 4.0)]
     assert means[0] == pytest.approx(
         means[1], rel=0.1
@@ -152,13 +153,13 @@ def test_other_models_have_near_lights_too(person: Person, kind: str) -> None:
     def image(*lights: StudioLight) -> np.ndarray:
         near = NearLights(lights, torch.ones(1, len(lights), 3))
         relit = next(relit_by(composition, person.head, reflectance, *DARK, TARGET, near))
-        return composition.light_layer(relit)
+        return whole(composition.light_layer(relit))
 
     both, key, rim = image(KEY, RIM), image(KEY), image(RIM)
     np.testing.assert_allclose(
         both, key + rim, atol=2e-3 * both.max()
     )  # the surround's undershoot is clipped
-    skin = person.field.person.segmentation.layer("skin") > 0.9
+    skin = person.field.person.segmentation.layer("skin")[:] > 0.9
     columns = np.flatnonzero(skin.any(0))
     middle = int(columns.mean())
     assert key[:, middle:][skin[:, middle:]].mean() > 1.2 * key[:, :middle][skin[:, :middle]].mean()

@@ -16,6 +16,7 @@ from facerf_cli.models import Models, load_models
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, portrait_network
+from facerf_cli.strips import strips, whole
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 
@@ -69,7 +70,7 @@ def test_a_lamp_lights_the_side_that_it_is_on(
     matte = field.person.segmentation.matte > 0.5
     columns = np.arange(photo.shape[1])
     middle = field.person.square.x0_px + field.person.square.side_px / 2
-    hair = field.person.segmentation.layer("hair") > 0.5
+    hair = field.person.segmentation.layer("hair")[:] > 0.5
     for region in (matte, hair):
         on_right = region & (columns > middle + 15)
         on_left = region & (columns < middle - 15)
@@ -84,7 +85,7 @@ def test_a_lamp_behind_leaves_the_face_dark(
     behind, ahead = (
         relight(models, photo, head, lamp(azimuth, 10), target, field).pixels for azimuth in (180, 0)
     )
-    skin = field.person.segmentation.layer("skin") > 0.9
+    skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
 
@@ -97,13 +98,33 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
     layers = composition.layers(names, relit)
     assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
-    for name, layer in layers.items():
+    for name, rows in layers.items():
+        layer = whole(rows)
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= -0.01  # the correction may darken a highlight
     assert composition.image(relit).pixels.min() >= -0.01
     face_alone = composition_of(models, None, head, field)
     with pytest.raises(UsageError, match="--aov albedo"):
         face_alone.layers(("albedo",), relit)
+
+
+def test_no_pixel_depends_on_the_strip_that_it_is_in(
+    models: Models, photo: np.ndarray, head: Head, field: PortraitField, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Image and layers of a photo are the same in one strip and in strips of 32 rows."""
+    light = lamp(40, 30)
+    names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
+
+    def shown() -> list[np.ndarray]:
+        composition = composition_of(models, photo, head, field)
+        relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
+        return [composition.image(relit).pixels, *map(whole, composition.layers(names, relit).values())]
+
+    at_once = shown()
+    monkeypatch.setattr("facerf_cli.strips.STRIP_PX", 1)
+    assert len(list(strips(photo.shape))) > 4
+    for one, other in zip(at_once, shown(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))
 
 
 def test_without_light_all_is_black(field: PortraitField) -> None:

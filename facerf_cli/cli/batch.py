@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from facerf_cli import memory
 from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
@@ -178,7 +179,8 @@ def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderInd
     """Process the items that are not finished, write their rows, and count failures."""
     failures = 0
     workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
-    work = _Work(batch.process, index is not None)
+    at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+    work = _Work(batch.process, index is not None, batch.settings.job_bytes(at_once))
     try:
         with closing(spread(work, todo, workers, _broken)) as results:
             for result in _with_progress(results, len(todo), batch.verb, batch.settings):
@@ -260,9 +262,11 @@ class _Work:
 
     process: Callable[[Item], Outcome]
     indexed: bool
+    memory_bytes: int
 
     def __call__(self, item: Item) -> _Result:
         start_s = time.perf_counter()
+        memory.set_limit(self.memory_bytes)
 
         def result(**ends: Any) -> _Result:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)

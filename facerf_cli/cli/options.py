@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from facerf_cli import memory
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
@@ -16,8 +17,8 @@ from facerf_cli.workers import Workers
 T = TypeVar("T")
 _SHARE = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 EPILOG = (
-    "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
-    "the verb."
+    "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help') may stand before "
+    "or after the verb."
 )
 HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 
@@ -62,6 +63,11 @@ class Settings:
     null_separated: bool = field(default=False, metadata=NOT_IN_RECIPE)  # names on standard input
     shard: Shard = field(default=Shard(), metadata=NOT_IN_RECIPE)
     ray: str | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: this machine, without Ray
+    memory_bytes: int | None = field(default=None, metadata=NOT_IN_RECIPE)  # of a job; None: a share of all
+
+    def job_bytes(self, jobs: int) -> int:
+        """The budget of memory of each of so many jobs."""
+        return memory.default_limit(jobs) if self.memory_bytes is None else self.memory_bytes
 
 
 def settings_of(context: typer.Context) -> Settings:
@@ -178,16 +184,6 @@ NetworkAloneOption = Annotated[
         "--network-alone",
         help="Use the network's own field, without the correction by the photo's quotient.",
         rich_help_panel=METHOD,
-    ),
-]
-MemoryOption = Annotated[
-    float,
-    typer.Option(
-        "--memory",
-        metavar="GB",
-        min=0.1,
-        help="Limit the memory of the prediction, roughly.",
-        rich_help_panel=BATCH,
     ),
 ]
 FaceModelOption = Annotated[

@@ -1,6 +1,6 @@
 """`facerf predict-olat`: a photo's face under every light of a rig, as an OLAT stack."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +17,6 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
-    MemoryOption,
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
@@ -31,7 +30,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, OneRecipe
+from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import UsageError
 
@@ -51,7 +50,6 @@ class PredictOlat:
     frame: Frame
     size_px: int
     network_alone: bool
-    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     precision: Precision
     format: StackFormat = "exr"
     page: bool = False
@@ -139,7 +137,6 @@ def predict_olat(
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
-    memory: MemoryOption = 2.0,
 ) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
@@ -164,10 +161,7 @@ def predict_olat(
         raise UsageError(
             "--page: shows the photo's own pose and light; give neither --pose nor --network-alone"
         )
-    memory_bytes = int(memory * 2**30)
-    work = PredictOlat(
-        photo, lights, pose, chosen, size, network_alone, memory_bytes, precision, format_, page
-    )
+    work = PredictOlat(photo, lights, pose, chosen, size, network_alone, precision, format_, page)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     code = run_batch(
         "predict-olat",

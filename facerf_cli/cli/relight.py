@@ -26,7 +26,6 @@ from facerf_cli.cli.options import (
     FaceModelOption,
     InputColourspaceOption,
     JobsOption,
-    MemoryOption,
     NetworkAloneOption,
     OverwriteOption,
     refuse_given,
@@ -87,7 +86,6 @@ class Relight:
     aov: tuple[str, ...]
     matte: Path | None
     exposure: Exposure
-    memory_bytes: int = field(metadata=NOT_IN_RECIPE)
     asked_for_photo: bool = field(metadata=NOT_IN_RECIPE)  # --composite photo is on the command line
     output: OutputOptions
     reflectance: RelightKind = "portrait"
@@ -371,7 +369,6 @@ def relight(
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
-    memory: MemoryOption = 2.0,
 ) -> None:
     """Relight photos under environment maps and single lights.
 
@@ -435,7 +432,6 @@ def relight(
         aov=parse_aov(aov),
         matte=matte,
         exposure=parse_exposure(exposure),
-        memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
         output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
         reflectance="field" if shown == "face" and reflectance == "portrait" else reflectance,

@@ -1,6 +1,5 @@
 """`facerf relight-dataset`: relight a prepared dataset under environment maps, into pairs to train on."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,7 +7,6 @@ from typing import Annotated
 import typer
 
 from facerf_cli.cli.options import BATCH, DryRunOption, Overwrite, OverwriteOption, Settings, settings_of
-from facerf_cli.errors import UsageError
 
 _PAIRS = "Pairs"
 
@@ -21,7 +19,6 @@ class RelightDataset:
     envmaps: str
     per_subject: int
     lazy: bool
-    memory_bytes: int
     overwrite: Overwrite
     dry_run: bool
     jobs: int
@@ -71,12 +68,6 @@ def relight_dataset(
             "--jobs", "-j", min=1, help="Relight this many subjects at a time.", rich_help_panel=BATCH
         ),
     ] = 1,
-    memory: Annotated[
-        float,
-        typer.Option(
-            metavar="GB", min=0.1, help="Limit the memory of each job, roughly.", rich_help_panel=BATCH
-        ),
-    ] = 2.0,
 ) -> None:
     """Relight a prepared dataset under environment maps, into the pairs of `facerf train --dataset`.
 
@@ -90,12 +81,8 @@ def relight_dataset(
     the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
     and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
     """
-    if not math.isfinite(memory):
-        raise UsageError(f"--memory {memory}: not a size; give a number of GB")
     from facerf_cli.cli.items.relight_pairs import relight_subjects
 
-    settings, memory_bytes = settings_of(context), int(memory * 2**30)
-    work = RelightDataset(
-        dataset, envmaps, per_subject, lazy, memory_bytes, overwrite, dry_run, jobs, settings
-    )
+    settings = settings_of(context)
+    work = RelightDataset(dataset, envmaps, per_subject, lazy, overwrite, dry_run, jobs, settings)
     raise typer.Exit(relight_subjects(work))

@@ -12,6 +12,7 @@ from scipy.sparse import csr_array
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LANDMARKS_M, TOP_M
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
+from facerf_cli.strips import strips
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's pixels
 # A detector's box in `from_landmarks` crops (benchmarks/crop_boxes.py): the crop's side in sides of the box,
@@ -68,12 +69,17 @@ class Crop:
         columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)
         top, bottom = _used(rows)
         left, right = _used(columns)
-        region = image[top:bottom, left:right].astype(np.float32)
-        height, width, channels = region.shape
-        tall = rows[:, top:bottom] @ region.reshape(height, -1)  # [size, W C]
+        region = image[top:bottom, left:right]
+        width, channels = region.shape[1:]
+        tall = np.zeros((self.size_px, width * channels), np.float32)
+        low, high = np.full(channels, np.inf, np.float32), np.full(channels, -np.inf, np.float32)
+        for part in strips(region.shape):
+            values = np.ascontiguousarray(region[part], np.float32)
+            tall += rows[:, top + part.start : top + part.stop] @ values.reshape(len(values), -1)
+            low, high = np.minimum(low, values.min((0, 1))), np.maximum(high, values.max((0, 1)))
         tall = tall.reshape(self.size_px, width, channels).transpose(1, 0, 2).reshape(width, -1)
         cut = (columns[:, left:right] @ tall).reshape(self.size_px, self.size_px, channels)
-        bounded = np.clip(cut.transpose(1, 0, 2), region.min((0, 1)), region.max((0, 1)))
+        bounded = np.clip(cut.transpose(1, 0, 2), low, high)
         return np.ascontiguousarray(bounded, np.float32)
 
     def valid(self, height_px: int, width_px: int) -> np.ndarray:

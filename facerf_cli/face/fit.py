@@ -27,7 +27,7 @@ from facerf_cli.face.gauss_newton import (
     minimise,
     residuals,
 )
-from facerf_cli.face.morphable import BUILTIN, NPZ_ERRORS, MorphableModel
+from facerf_cli.face.morphable import BUILTIN, NPZ_ERRORS, MorphableModel, check_npz_sizes
 from facerf_cli.face.silhouette import CONTOUR_RAYS, NOSE, POINTS_PER_RAY
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
 from facerf_cli.files.regular import require_regular
@@ -38,6 +38,7 @@ IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)]))
 _INVISIBLE_M = 1e-4  # a shape direction that moves every landmark by less at one deviation is left out
 _BORDER = 0.01  # share of the crop's side: contour landmarks closer to the photo's border are guesses
 _LARGEST_CROP_PX = 8192
+_MOST_ARRAY_BYTES = 1 << 16  # of a fit in a file
 _TENSORS = ("rotation", "translation_m", "alpha", "beta", "landmarks_px")  # of a FaceFit, in its file
 
 Quality = Literal["good", "fair", "poor", "unknown"]
@@ -269,6 +270,7 @@ def load_fit(path: Path) -> FaceFit:
     """Read a fit that `save_fit` wrote; raises InputError for any other file."""
     require_regular(path, "fit the photo again")
     try:
+        check_npz_sizes(path, _MOST_ARRAY_BYTES)
         with np.load(path, allow_pickle=False) as file:
             return fit_from_arrays({key: file[key] for key in file.files})
     except NPZ_ERRORS as error:

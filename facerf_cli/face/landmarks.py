@@ -15,8 +15,10 @@ from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, check_landmarks
 from facerf_cli.files.regular import require_regular
+from facerf_cli.strips import strips
 
 _MAX_BYTES = 1 << 20  # of a landmark file
+_BLOCK_PX = 1 << 16  # converted at a time, so that they stay in the processor's cache
 _PTS_FIRST_PIXEL = 0.5  # .pts counts pixels from 1: the first pixel's centre is 1.0 there and 0.5 here
 
 
@@ -71,15 +73,20 @@ def choose_face(faces: list[Found], which: str, name: str) -> list[Found]:
     return [faces[int(which)]]
 
 
-def to_display(pixels_linear: np.ndarray) -> np.ndarray:
-    """Convert a scene-linear image [H, W, 3] to sRGB uint8 at automatic exposure, in strips of rows."""
-    stride = max(1, max(pixels_linear.shape[:2]) // 1024)
-    gain = np.float32(2.0 ** auto_exposure_ev(pixels_linear[::stride, ::stride]))
+def to_display(pixels_linear: np.ndarray, exposure_ev: float | None = None) -> np.ndarray:
+    """Convert a scene-linear image [H, W, 3] to sRGB uint8, at `display_ev` where no exposure is given."""
+    gain = np.float32(2.0 ** (display_ev(pixels_linear) if exposure_ev is None else exposure_ev))
     display = np.empty(pixels_linear.shape, np.uint8)
-    for row in range(0, len(display), 256):
-        encoded = linear_to_srgb((pixels_linear[row : row + 256] * gain).clip(0, 1))
-        display[row : row + 256] = np.round(encoded * 255)
+    for rows in strips(display.shape, _BLOCK_PX):
+        encoded = linear_to_srgb((pixels_linear[rows] * gain).clip(0, 1))
+        display[rows] = np.round(encoded * 255)
     return display
+
+
+def display_ev(pixels_linear: np.ndarray) -> float:
+    """The automatic exposure of an image [H, W, 3] in EV, by some of its pixels."""
+    stride = max(1, max(pixels_linear.shape[:2]) // 1024)
+    return auto_exposure_ev(pixels_linear[::stride, ::stride])
 
 
 def check_display(image_srgb: np.ndarray) -> None:

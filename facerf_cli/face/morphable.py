@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
 from facerf_cli.logs import one_line
@@ -36,6 +37,8 @@ _HEAD_PREFIX = "head_"  # of the head's arrays in a face model's file
 _MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head
 _MAX_COEFFICIENTS = 500
 _MAX_LETTERS = 2000  # of a name or a licence
+MAX_ARRAYS = 64  # of a file
+_COPIES = 3  # of its arrays: as read, as floats of halves, and in between
 _MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
 
 
@@ -222,9 +225,15 @@ def _require_indices(found: dict[str, np.ndarray]) -> None:
             raise ValueError(f"{_HEAD_PREFIX}{key} holds indices out of range")
 
 
-def check_npz_sizes(path: Path) -> None:
-    """Check the array sizes in an .npz before memory is allocated; raises ValueError for too large ones."""
+def check_npz_sizes(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> None:
+    """Check the number and sizes of the arrays in an .npz, and ask the budget for all of them, before a read.
+
+    Raises ValueError for too many or too large ones.
+    """
+    total = 0
     with zipfile.ZipFile(path) as archive:
+        if len(archive.infolist()) > MAX_ARRAYS:
+            raise ValueError(f"it holds {len(archive.infolist())} arrays; at most {MAX_ARRAYS} are read")
         for entry in archive.infolist():
             with archive.open(entry) as file:
                 version = np.lib.format.read_magic(file)
@@ -232,8 +241,11 @@ def check_npz_sizes(path: Path) -> None:
                 if read is None:
                     raise ValueError(f"{entry.filename} is not an array of version 1.0")
                 shape, _, dtype = read(file)
-            if max(entry.file_size, math.prod(shape) * dtype.itemsize) > _MAX_ARRAY_BYTES:
+            size = max(entry.file_size, math.prod(shape) * dtype.itemsize)
+            if size > most_bytes:
                 raise ValueError(f"{entry.filename} is too large")
+            total += size
+    memory.require(str(path), _COPIES * total, "a smaller file")
 
 
 def _printable(array: np.ndarray) -> str:

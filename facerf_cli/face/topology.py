@@ -211,15 +211,19 @@ def _smooth(points: np.ndarray, steps: int = 6) -> np.ndarray:
 
 def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     """Distance [...] of `points` [..., 2] to the closed `outline` [N, 2], positive inside (even-odd rule)."""
-    distance = np.full(points.shape[:-1], np.inf)
-    inside = np.zeros(points.shape[:-1], bool)
+    x, y = (np.ascontiguousarray(points[..., axis]) for axis in (0, 1))  # four times as fast as pairs
+    nearest = np.full(x.shape, np.inf)  # squared
+    inside = np.zeros(x.shape, bool)
     for start, end in zip(outline, np.roll(outline, -1, 0), strict=True):
-        along, offset = end - start, points - start
-        fraction = np.clip(offset @ along / max(along @ along, 1e-12), 0, 1)
-        distance = np.minimum(distance, np.linalg.norm(offset - fraction[..., None] * along, axis=-1))
+        along = end - start
+        right, down = x - start[0], y - start[1]
+        fraction = ((right * along[0] + down * along[1]) / max(along @ along, 1e-12)).clip(0, 1)
+        aside, below = right - fraction * along[0], down - fraction * along[1]
+        nearest = np.minimum(nearest, aside * aside + below * below)
         if start[1] != end[1]:
-            crosses = (points[..., 1] < start[1]) != (points[..., 1] < end[1])
-            inside ^= crosses & (offset[..., 0] < offset[..., 1] * along[0] / along[1])
+            crosses = (y < start[1]) != (y < end[1])
+            inside ^= crosses & (right < down * along[0] / along[1])
+    distance = np.sqrt(nearest)
     return np.where(inside, distance, -distance)
 
 

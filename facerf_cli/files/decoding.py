@@ -2,11 +2,13 @@
 
 import logging
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 
+from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.heif import decode_heif, is_heif
 from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
@@ -16,21 +18,43 @@ from facerf_cli.logs import LOGGER_NAME, one_line
 log = logging.getLogger(LOGGER_NAME)
 
 
-def decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """Decode all channels [H, W, C] of the first part as float32; integers are scaled to 0..1.
+_INTEGERS = (oiio.TypeDesc(oiio.UINT8), oiio.TypeDesc(oiio.UINT16))
+_LINEAR_BYTES = 12  # of a pixel that is read: three floats, and
+_ALPHA_BYTES = 4
+_HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 
-    The size is checked before pixels are decoded.
+
+@dataclass(frozen=True, eq=False)
+class Decoded:
+    """Some channels [H, W, C] of a file's first part: integers as they are stored, or float32.
+
+    `colour` has one channel or three; they and `alpha` count from the first channel of `values`.
+    """
+
+    values: np.ndarray
+    spec: oiio.ImageSpec
+    colour: list[int]
+    alpha: int | None
+
+
+def decode(path: Path, limit_px: int, kept_px: int = 0) -> Decoded:
+    """Decode the channels of the first part that `pick_channels` chooses, and those between them.
+
+    Before pixels are decoded their number is checked, and the budget of memory is asked for the channels, a
+    linear image, and `kept_px` bytes a pixel that the caller makes of it once the channels are gone.
     """
     require_regular(path, "give an image file")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; give an image file")
     if is_heif(path):
-        return decode_heif(path, limit_px)
+        most_px = memory.limit_bytes() // (_LINEAR_BYTES + max(_HEIF_BYTES, kept_px))
+        values, spec = decode_heif(path, min(limit_px, most_px))
+        return Decoded(values, spec, *pick_channels(list(spec.channelnames), -1))
     require_whole_png(path)
-    return _decode_by_oiio(path, limit_px)
+    return _decode_by_oiio(path, limit_px, kept_px)
 
 
-def _decode_by_oiio(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
+def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(utf8_path(path), settings)
@@ -42,7 +66,12 @@ def _decode_by_oiio(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSp
         _check_size(path, spec, limit_px)
         if stream.format_name() == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5:
             raise InputError(f"{path}: a DPX file that lies on its side is not read; save it upright")
-        values = stream.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
+        colour, alpha = pick_channels(list(spec.channelnames), spec.alpha_channel)
+        used = colour if alpha is None else [*colour, alpha]
+        first, past = min(used), max(used) + 1
+        kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
+        _ask_for(path, spec, (past - first) * kind.size(), kept_px)
+        values = stream.read_image(0, 0, first, past, kind)
         message = _reason(path, oiio_error(stream))
     finally:
         stream.close()
@@ -50,15 +79,27 @@ def _decode_by_oiio(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSp
         raise InputError(f"{path}: damaged or cut short; copy it again ({message or 'no pixels in it'})")
     if message:
         log.warning("%s: %s", path, message)
-    return np.asarray(values, np.float32).reshape(spec.height, spec.width, spec.nchannels), spec
+    shown = [channel - first for channel in colour]
+    values = np.asarray(values).reshape(spec.height, spec.width, past - first)
+    return Decoded(values, spec, shown, None if alpha is None else alpha - first)
 
 
 def _check_size(path: Path, spec: oiio.ImageSpec, limit_px: int) -> None:
-    if max(spec.width * spec.height, spec.full_width * spec.full_height) > limit_px:
+    if _pixels(spec) > limit_px:
         raise InputError(
             f"{path}: {spec.width} x {spec.height} pixels; at most {limit_px / 1e6:.0f} megapixels are "
             "read, so make it smaller"
         )
+
+
+def _pixels(spec: oiio.ImageSpec) -> int:
+    return int(max(spec.width * spec.height, spec.full_width * spec.full_height))
+
+
+def _ask_for(path: Path, spec: oiio.ImageSpec, stored_px: int, kept_px: int) -> None:
+    alpha = _ALPHA_BYTES * (spec.alpha_channel >= 0)
+    needed = _pixels(spec) * (_LINEAR_BYTES + alpha + max(stored_px, kept_px))
+    memory.require(f"{path}: {spec.width} x {spec.height} pixels", needed, "make it smaller")
 
 
 def _reason(path: Path, message: str) -> str:
@@ -89,7 +130,7 @@ def full_frame(values: np.ndarray, spec: oiio.ImageSpec) -> np.ndarray:
     x, y = spec.x - spec.full_x, spec.y - spec.full_y
     if (x, y, spec.width, spec.height) == (0, 0, spec.full_width, spec.full_height):
         return values
-    frame = np.zeros((spec.full_height, spec.full_width, values.shape[2]), np.float32)
+    frame = np.zeros((spec.full_height, spec.full_width, values.shape[2]), values.dtype)
     top, left = max(y, 0), max(x, 0)
     room = slice(max(spec.full_height - top, 0)), slice(max(spec.full_width - left, 0))
     part = values[max(-y, 0) :, max(-x, 0) :][room]

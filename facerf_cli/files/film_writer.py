@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from facerf_cli.colour import unit_floats
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode
@@ -121,11 +122,12 @@ def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, P
 
 def _pixels(path: Path, form: _Form) -> np.ndarray:
     """An image's first three channels [H, W, 3], uint8 or uint16."""
-    values, _ = decode(path, PHOTO_LIMIT_PX)
-    if values.shape[2] < 3:
+    found = decode(path, PHOTO_LIMIT_PX)
+    if len(found.colour) < 3:
         raise InputError(f"{path}: is not an image of a film; remove it and make it again")
     kind = np.uint16 if form.source == "rgb48le" else np.uint8
-    return np.round(values[..., :3] * np.iinfo(kind).max).astype(kind)
+    values = unit_floats(found.values[..., found.colour])
+    return np.round(values * np.iinfo(kind).max).astype(kind)
 
 
 def _even(pixels: np.ndarray) -> np.ndarray:

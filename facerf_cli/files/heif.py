@@ -24,7 +24,7 @@ def is_heif(path: Path) -> bool:
 
 
 def decode_heif(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """Decode the main image [H, W, C], upright, as float32 in 0..1; and its size and colour space.
+    """Decode the main image [H, W, C], upright, as integers; and its size and colour space.
 
     The size is checked before pixels are decoded.
     """
@@ -46,4 +46,4 @@ def decode_heif(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
     elif CODES in arrays:
         key = tuple(arrays[CODES].tolist())
         spec.attribute("oiio:ColorSpace", _SPACES.get(key, f"CICP {key[0]}-{key[1]}"))
-    return values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max), spec
+    return values, spec

@@ -5,7 +5,7 @@ that tools which want four channels find four.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -27,10 +27,11 @@ from facerf_cli.colour import (
     from_linear_rec709,
     named_space,
     to_linear_rec709,
+    unit_floats,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.decoding import decode, full_frame, pick_channels, upright
+from facerf_cli.files.decoding import decode, full_frame, upright
 from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import (
     OCIO_SPACE,
@@ -44,6 +45,7 @@ from facerf_cli.files.image_metadata import (
     utf8_path,
 )
 from facerf_cli.logs import LOGGER_NAME, one_line
+from facerf_cli.strips import Rows, strips, whole
 
 PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
@@ -84,26 +86,37 @@ def read_image(
     colourspace: str | ColourSpace | None = None,
     limit_px: int = PHOTO_LIMIT_PX,
     non_finite: Literal["error", "zero"] = "error",
+    kept_px: int = 0,
 ) -> LinearImage:
     """Read an image of any supported format; `colourspace` overrides the colour space that the file states.
 
-    The size is checked before pixels are decoded. NaN and infinite values raise an InputError, or are set to
-    0 with a warning if `non_finite` is "zero".
+    Before pixels are decoded the size is checked, and the budget of memory asked, for `kept_px` bytes a pixel
+    that the caller makes of it, too. NaN and infinite values raise an InputError, or are set to 0 with a
+    warning if `non_finite` is "zero".
     """
     path = Path(path)
-    values, spec = decode(path, limit_px)
-    colour_at, alpha_at = pick_channels(list(spec.channelnames), spec.alpha_channel)
-    values = values[..., colour_at if alpha_at is None else [*colour_at, alpha_at]]
-    values = upright(full_frame(values, spec), spec.get_int_attribute("Orientation", 1))
-    values = _finite(path, values, non_finite)
-    alpha = None if alpha_at is None else np.clip(values[..., -1], 0, 1)
-    colour = np.broadcast_to(values[..., : len(colour_at)], (*values.shape[:2], 3))
-    if alpha is not None and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
-        colour = colour / np.where(alpha > 0, alpha, 1)[..., None]
+    found = decode(path, limit_px, kept_px)
+    spec = found.spec
+    values = upright(full_frame(found.values, spec), spec.get_int_attribute("Orientation", 1))
     space = _space(path, colourspace, spec)
     if colourspace and space.decode is not None and is_floating(spec):
         log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
-    pixels = np.ascontiguousarray(to_linear_rec709(np.ascontiguousarray(colour), space))
+    premultiplied = not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
+    pixels = np.empty((*values.shape[:2], 3), np.float32)
+    alpha = None if found.alpha is None else np.empty(values.shape[:2], np.float32)
+    bad = 0
+    for rows in strips(values.shape):
+        colour = np.broadcast_to(values[rows][..., found.colour], pixels[rows].shape)
+        opaque = None if found.alpha is None else unit_floats(values[rows][..., found.alpha])
+        colour, opaque, wrong = _finite(colour, opaque)
+        bad += wrong
+        if alpha is not None and opaque is not None:
+            alpha[rows] = opaque.clip(0, 1)
+            if premultiplied:
+                colour = unit_floats(colour) / np.where(alpha[rows] > 0, alpha[rows], 1)[..., None]
+        pixels[rows] = to_linear_rec709(colour, space)
+    if bad:
+        _say_non_finite(path, bad, pixels.shape[0] * pixels.shape[1], non_finite)
     return LinearImage(pixels, alpha, space.name, metadata_of(spec))
 
 
@@ -117,24 +130,29 @@ def _space(path: Path, colourspace: str | ColourSpace | None, spec: oiio.ImageSp
     return found
 
 
-def _finite(path: Path, values: np.ndarray, non_finite: str) -> np.ndarray:
+def _finite(colour: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, int]:
+    """Colour [h, W, 3] and alpha [h, W] with 0 for what is not finite, and the number of such pixels."""
+    bad = ~np.isfinite(colour)
+    bad_alpha = np.zeros(bad.shape[:2], bool) if alpha is None else ~np.isfinite(alpha)
+    pixels = int((bad.any(-1) | bad_alpha).sum())
+    if not pixels:
+        return colour, alpha, 0
+    alpha = None if alpha is None else np.where(bad_alpha, np.float32(0), alpha)
+    return np.where(bad, np.float32(0), colour), alpha, pixels
+
+
+def _say_non_finite(path: Path, count: int, total: int, non_finite: str) -> None:
     """Apply the policy `non_finite` of `read_image`."""
-    bad = ~np.isfinite(values)
-    if not bad.any():
-        return values
-    count = int(bad.any(-1).sum())
     if non_finite == "error":
-        total = bad.shape[0] * bad.shape[1]
         raise InputError(f"{path}: {count} of {total} pixels are NaN or infinite; replace them first")
     log.warning("%s: %d pixels are NaN or infinite; their values are set to 0", path, count)
-    return np.where(bad, np.float32(0), values)
 
 
 def write_exr(
     path: Path,
-    pixels: np.ndarray,
-    alpha: np.ndarray | None = None,
-    layers: Mapping[str, np.ndarray] | None = None,
+    pixels: Rows,
+    alpha: Rows | None = None,
+    layers: Mapping[str, Rows] | None = None,
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
     compression: str = "zip",
@@ -146,13 +164,10 @@ def write_exr(
     G, B in half. Each name before the dot is a part. Values beyond the range of half floats (65504) are
     clamped with a warning.
     """
-    converted = from_linear_rec709(pixels, space)
-    parts = [_exr_image(converted, alpha), *_exr_layers(layers or {}, space)]
-    specs, arrays, count = [], [], 0
+    parts = [_exr_image(pixels, alpha, space), *_exr_layers(layers or {}, space)]
+    specs, counts = [], [0] * len(parts)
     for part in parts:
-        data, beyond = _exr_data(path, part)
-        count += beyond
-        spec = _spec(data, part.kind)
+        spec = _spec((*pixels.shape[:2], len(part.channels)), part.kind)
         spec.channelnames = tuple(part.channels)
         spec.alpha_channel = part.alpha_channel
         if len(parts) > 1:
@@ -164,49 +179,66 @@ def write_exr(
         else:  # the same in all parts, as OpenEXR requires
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
-        arrays.append(data)
-    if count:
+
+    def values(number: int, rows: slice) -> np.ndarray:
+        data, beyond = _exr_data(path, parts[number], rows)
+        counts[number] += beyond
+        return data
+
+    _write(path, specs, values, metadata)
+    if count := sum(counts):
         log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
-    _write(path, specs, arrays, metadata)
     return count
 
 
 @dataclass(frozen=True, eq=False)
 class _ExrPart:
-    """A part of an EXR: its channels [H, W] by name, all of one number format."""
+    """A part of an EXR: its channels by name, all of one number format.
+
+    `of` are images [H, W] or [H, W, C] of its rows, which together have a value for each channel.
+    """
 
     name: str
     kind: str
-    channels: dict[str, np.ndarray]
+    channels: list[str]
+    of: list[Callable[[slice], np.ndarray]]
     alpha_channel: int = -1
 
 
-def _exr_image(pixels: np.ndarray, alpha: np.ndarray | None) -> _ExrPart:
+def _exr_image(pixels: Rows, alpha: Rows | None, space: ColourSpace) -> _ExrPart:
     """Return the image itself, R, G, B and A, premultiplied."""
-    colour = pixels if alpha is None else pixels * alpha[..., None]
-    channels = {letter: colour[..., index] for index, letter in enumerate("RGB")}
     if alpha is None:
-        return _ExrPart("rgba", "half", channels)
-    return _ExrPart("rgba", "half", {**channels, "A": alpha}, alpha_channel=3)
+        return _ExrPart("rgba", "half", list("RGB"), [lambda rows: from_linear_rec709(pixels[rows], space)])
+
+    def colour(rows: slice) -> np.ndarray:
+        return from_linear_rec709(pixels[rows], space) * alpha[rows][..., None]
+
+    return _ExrPart("rgba", "half", list("RGBA"), [colour, lambda rows: alpha[rows]], alpha_channel=3)
 
 
-def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterator[_ExrPart]:
+def _exr_layers(layers: Mapping[str, Rows], space: ColourSpace) -> Iterator[_ExrPart]:
     """Yield a part for the layers of each name before the dot; colours are converted to the space."""
     grouped: dict[str, _ExrPart] = {}
     for layer, values in layers.items():
         letters, kind = _LAYER_CHANNELS.get(layer, ("RGB", "half"))
-        group = grouped.setdefault(layer.split(".")[0], _ExrPart(layer.split(".")[0], kind, {}))
-        if values.ndim == 2:
-            group.channels[layer] = values
-            continue
-        shown = from_linear_rec709(values, space) if letters == "RGB" else values
-        group.channels.update({f"{layer}.{letters[k]}": shown[..., k] for k in range(values.shape[2])})
+        name = layer.split(".")[0]
+        group = grouped.setdefault(name, _ExrPart(name, kind, [], []))
+        single = len(values.shape) == 2
+        group.channels.extend([layer] if single else [f"{layer}.{x}" for x in letters[: values.shape[-1]]])
+        group.of.append(_in_space(values, None if single or letters != "RGB" else space))
     yield from grouped.values()
 
 
-def _exr_data(path: Path, part: _ExrPart) -> tuple[np.ndarray, int]:
-    """Return a part's values [H, W, C], and how many were beyond the range of half floats."""
-    values = np.stack(list(part.channels.values()), -1)
+def _in_space(values: Rows, space: ColourSpace | None) -> Callable[[slice], np.ndarray]:
+    """Rows of colours in a space, or as they are."""
+    if space is None:
+        return lambda rows: values[rows]
+    return lambda rows: from_linear_rec709(values[rows], space)
+
+
+def _exr_data(path: Path, part: _ExrPart, rows: slice) -> tuple[np.ndarray, int]:
+    """Return values [h, W, C] of a part's rows, and how many were beyond the range of half floats."""
+    values = np.dstack([of(rows) for of in part.of])
     with np.errstate(over="ignore"):
         data = values.astype(np.float16 if part.kind == "half" else np.float32, copy=False)
     if np.isfinite(data).all():
@@ -218,8 +250,8 @@ def _exr_data(path: Path, part: _ExrPart) -> tuple[np.ndarray, int]:
 
 def write_tiff(
     path: Path,
-    pixels: np.ndarray,
-    alpha: np.ndarray | None = None,
+    pixels: Rows,
+    alpha: Rows | None = None,
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
 ) -> None:
@@ -227,25 +259,28 @@ def write_tiff(
 
     The colour must not be premultiplied, and is not in the file.
     """
-    colour = from_linear_rec709(pixels, space).astype(np.float32, copy=False)
-    data = colour if alpha is None else np.dstack([colour, alpha.astype(np.float32)])
-    spec = _spec(data, "float")
+
+    def values(_: int, rows: slice) -> np.ndarray:
+        colour = from_linear_rec709(pixels[rows], space)
+        return np.dstack([colour] if alpha is None else [colour, alpha[rows]]).astype(np.float32, copy=False)
+
+    spec = _spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
     spec.attribute("compression", "zip")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if space.is_linear:
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
-    _write(path, [spec], [data], metadata)
+    _write(path, [spec], values, metadata)
 
 
 def write_display(
     path: Path,
-    pixels: np.ndarray,
+    pixels: Rows,
     exposure: float | Literal["auto"] = 0.0,
-    alpha: np.ndarray | None = None,
+    alpha: Rows | None = None,
     metadata: Attributes | None = None,
     view: View = PLAIN_VIEW,
-    share: np.ndarray | None = None,
+    share: Rows | None = None,
     bits: Literal[8, 16] = 8,
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
@@ -254,33 +289,48 @@ def write_display(
     is not premultiplied; JPEG has no alpha and shows the image over black. `view` and `share` are those of
     `colour.encode_display`; `bits` are of a PNG.
     """
-    chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
+    if exposure == "auto":
+        pixels, mask = whole(pixels), None if alpha is None else whole(alpha)
+        chosen_ev = auto_exposure_ev(pixels, mask)
+    else:
+        chosen_ev = float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
-    seen = pixels * alpha[..., None] if alpha is not None and jpeg else pixels
-    data = encode_display(np.nan_to_num(seen * np.float32(2.0**chosen_ev)), view, share)
-    if alpha is not None and not jpeg:
-        data = np.dstack([data, alpha.astype(np.float32)])
-    spec = _spec(data, f"uint{8 if jpeg else bits}")
+
+    def values(_: int, rows: slice) -> np.ndarray:
+        seen = pixels[rows]
+        if alpha is not None and jpeg:
+            seen = seen * alpha[rows][..., None]
+        exposed = np.nan_to_num(seen * np.float32(2.0**chosen_ev))
+        data = encode_display(exposed, view, None if share is None else share[rows])
+        return data if alpha is None or jpeg else np.dstack([data, alpha[rows].astype(np.float32)])
+
+    spec = _spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if view.is_srgb:
         spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("CompressionQuality", JPEG_QUALITY)
     spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
-    _write(path, [spec], [data], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
+    _write(path, [spec], values, {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
     return chosen_ev
 
 
-def _spec(data: np.ndarray, kind: str) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(data.shape[1], data.shape[0], data.shape[2], kind)
+def _spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
+    spec = oiio.ImageSpec(shape[1], shape[0], shape[2], kind)
     spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
     return spec
 
 
 def _write(
-    path: Path, specs: Sequence[oiio.ImageSpec], parts: Sequence[np.ndarray], metadata: Attributes | None
+    path: Path,
+    specs: Sequence[oiio.ImageSpec],
+    values: Callable[[int, slice], np.ndarray],
+    metadata: Attributes | None,
 ) -> None:
-    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP."""
+    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP.
+
+    `values` gives rows [h, W, C] of a part by its number; they are written in strips as they come.
+    """
     for name, value in (metadata or {}).items():
         specs[0].attribute(name, value)
     with atomic_path(path) as temporary:
@@ -290,9 +340,11 @@ def _write(
             raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
         name = str(temporary)
         good = stream.open(name, tuple(specs)) if len(specs) > 1 else stream.open(name, specs[0])
-        for number, (spec, part) in enumerate(zip(specs, parts, strict=True)):
+        for number, spec in enumerate(specs):
             good = good and (number == 0 or stream.open(name, spec, "AppendSubimage"))
-            good = good and stream.write_image(np.ascontiguousarray(part))
+            for rows in strips((spec.height, spec.width)) if good else ():
+                part = np.ascontiguousarray(values(number, rows))
+                good = good and stream.write_scanlines(rows.start, rows.stop, 0, part)
         message = oiio_error(stream)
         if not (stream.close() and good):
             raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")

@@ -19,6 +19,7 @@ import OpenImageIO as oiio
 import torch
 from torch import Tensor
 
+from facerf_cli import memory
 from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
@@ -29,7 +30,8 @@ from facerf_cli.logs import one_line
 
 FORMAT = "facerf-olat-1"
 COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
-STACK_LIMIT_BYTES = 16 << 30  # half floats of a whole stack in memory
+_LIGHT_BYTES = 6  # of a pixel: half floats
+_SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
 _MOST_PARTS = 4097  # 4096 lights and the source
 _MOST_HEADER_BYTES = 1 << 20  # of the JSON
 _MOST_CHANNELS = 16  # of a part; other programs may add some
@@ -148,23 +150,30 @@ def _text_of(spec: oiio.ImageSpec) -> str:
         return ""
 
 
-def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
-    """Read a stack; counts and sizes are checked before pixels are decoded."""
+def read_olat_stack(path: Path) -> OlatStack:
+    """Read a stack; the budget of memory is asked for its lights and source before pixels are decoded."""
     with _opened(path) as stream:
-        content = _header_of(path, stream.spec(), limit_bytes)
+        content = _header_of(path, stream.spec())
+        _ask_for(path, stream.spec(), content["lights"])
         return OlatStack(_read_header(path, stream, content), _read_lights(path, stream, content))
 
 
 def read_olat_header(path: Path) -> StackHeader:
-    """Read a stack without its OLATs; their size is not limited."""
+    """Read a stack without its OLATs, for which memory is not asked."""
     with _opened(path) as stream:
-        return _read_header(path, stream, _header_of(path, stream.spec()))
+        content = _header_of(path, stream.spec())
+        _ask_for(path, stream.spec(), 0)
+        return _read_header(path, stream, content)
 
 
 def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
     """Read some lights' OLATs [l, 3, h, W] float16, or some of their rows, from a stack of any size."""
     with _opened(path) as stream:
-        return _read_lights(path, stream, _header_of(path, stream.spec()), lights, rows)
+        content = _header_of(path, stream.spec())
+        height = content["shape"][0]
+        share = len(range(height)[rows]) / max(1, height)
+        _ask_for(path, stream.spec(), len(range(content["lights"])[lights]), share)
+        return _read_lights(path, stream, content, lights, rows)
 
 
 @contextmanager
@@ -221,16 +230,18 @@ def _is_provenance(name: str) -> bool:
     )
 
 
-def _header_of(path: Path, spec: oiio.ImageSpec, limit_bytes: int | None = None) -> dict[str, Any]:
+def _ask_for(path: Path, spec: oiio.ImageSpec, lights: int, share: float = 1.0) -> None:
+    """Ask the budget for some lights, or a share of their rows, and for the source, decoded and as floats."""
+    needed = spec.height * spec.width * (share * lights * _LIGHT_BYTES + _SOURCE_BYTES)
+    what = f"{path}: {lights} lights of {spec.width} x {spec.height} pixels"
+    memory.require(what, int(needed), "a stack of fewer lights or pixels")
+
+
+def _header_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
     """Return the first part's JSON with its types checked, and the parts' shape (H, W)."""
     content = _json_of(path, spec)
-    lights = content["lights"]
-    held_bytes = 0 if limit_bytes is None else 6 * lights * spec.height * spec.width
-    if not 1 <= lights < _MOST_PARTS or held_bytes > (limit_bytes or 0):
-        raise InputError(
-            f"{path}: {lights} lights of {spec.width} x {spec.height} pixels are more than can be read "
-            f"({(limit_bytes or STACK_LIMIT_BYTES) >> 20} MiB); give a stack of fewer lights or pixels"
-        )
+    if not 1 <= content["lights"] < _MOST_PARTS:
+        raise InputError(f"{path}: {content['lights']} lights; a stack has from 1 to {_MOST_PARTS - 1}")
     return content | {"shape": (spec.height, spec.width)}
 
 

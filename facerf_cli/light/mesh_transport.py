@@ -11,7 +11,15 @@ from embreex import rtcore_scene
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from facerf_cli.light.transport import OFFSET_M, BakeSettings, build_scene, occluded, on_disc, over_hemisphere
+from facerf_cli.light.transport import (
+    OFFSET_M,
+    BakeSettings,
+    build_scene,
+    occluded,
+    on_disc,
+    over_hemisphere,
+    places_on_disc,
+)
 
 # Rays start off a vertex by `_MESH_OFFSET_M` plus this share of the rise of its neighbours, up to `OFFSET_M`.
 _MESH_OFFSET_M = 3e-5
@@ -248,7 +256,7 @@ def _visible_by_one_ray(
     """Share of light [N] that reaches each chosen vertex along a ray: 0, 1, or what hair lets through."""
     side = np.where(facing[chosen] < 0, np.float32(-1), np.float32(1))[:, None]  # of hair
     origins = surface.vertices[chosen] + surface.normals[chosen] * (side * surface.offset_m[chosen])
-    rays = on_disc(direction, settings.light_radius_deg, *numbers)
+    rays = on_disc(direction, places_on_disc(settings.light_radius_deg, *numbers))
     blocked = occluded(surface.scene, origins, rays)
     passed = (~blocked).astype(np.float32)
     if surface.two_sided.any():

@@ -93,7 +93,7 @@ def _light_visibility(
 
 def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.random.Generator) -> np.ndarray:
     """Random unit directions [count, 3], uniform over the disc of an area light; radius 0 is a point."""
-    return on_disc(axis, radius_deg, random.random((count, 1)), random.random((count, 1)))
+    return on_disc(axis, places_on_disc(radius_deg, random.random((count, 1)), random.random((count, 1))))
 
 
 def _one_bounce(
@@ -156,16 +156,25 @@ def hits_within(
     return np.asarray((hits["primID"] >= 0) & (hits["tfar"] < reach_m))
 
 
-def on_disc(axis: np.ndarray, radius_deg: float, share: np.ndarray, around: np.ndarray) -> np.ndarray:
-    """Unit directions [N, 3] to points on the disc of an area light, from two numbers [N, 1] in 0..1.
+PlacesOnDisc = tuple[np.ndarray, np.ndarray, np.ndarray]  # radius, cosine and sine [N, 1]
+
+
+def places_on_disc(radius_deg: float, share: np.ndarray, around: np.ndarray) -> PlacesOnDisc:
+    """Points on the disc of an area light, from two numbers [N, 1] in 0..1; the same for all lights."""
+    radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
+    turn = 2 * np.pi * around
+    return radius, np.cos(turn), np.sin(turn)
+
+
+def on_disc(axis: np.ndarray, places: PlacesOnDisc) -> np.ndarray:
+    """Unit directions [N, 3] to points on the disc of an area light.
 
     `axis` is the direction to its middle, [3], or [N, 3] of a near one.
     """
     axis = axis.astype(np.float32)
     tangent, bitangent = (side.astype(np.float32) for side in _tangents(np.atleast_2d(axis)))
-    radius = np.float32(np.tan(np.radians(radius_deg))) * np.sqrt(share)
-    turn = 2 * np.pi * around
-    rays = axis + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
+    radius, cosine, sine = places
+    rays = axis + radius * (cosine * tangent + sine * bitangent)
     return (rays / np.sqrt((rays * rays).sum(-1, keepdims=True))).astype(np.float32)
 
 

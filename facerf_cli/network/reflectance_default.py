@@ -62,7 +62,8 @@ class DefaultReflectanceNetwork(nn.Module):
         super().__init__()
         self.settings = settings
         enc, dec, rig_lights = settings.encoder_widths, settings.decoder_widths, settings.rig_lights
-        self.template = nn.Parameter(0.1 * torch.randn(settings.template_channels, 32, 32))
+        self.template = nn.Parameter(torch.empty(settings.template_channels, 32, 32))
+        nn.init.normal_(self.template, std=0.1)
         widths = (7 + settings.template_channels, *enc)
         self.down = nn.ModuleList(
             Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip(widths, enc, strict=False))

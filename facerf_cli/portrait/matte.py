@@ -1,10 +1,15 @@
 """The matte of a person at the photo's own resolution, and the person's colours without the background's."""
 
+import math
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
+from scipy.sparse import csr_array
 from torch import Tensor
+
+from facerf_cli.strips import Rows, strips
 
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
@@ -24,12 +29,15 @@ def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarr
     reach = max(1, round(_REACH * max(matte.shape)))
     slope, offset = local_lines(matte, guide_srgb, reach, _SMOOTHNESS)
     size = photo_srgb.shape[:2]
-    lines = enlarged(np.concatenate([slope.transpose(2, 0, 1), offset[None]]), size)
-    refined = lines[3]
-    for channel in range(3):
-        refined += lines[channel] * photo_srgb[..., channel] / np.float32(255)
-    refined = ((refined - _STRETCH) / (1 - 2 * _STRETCH)).clip(0, 1)
-    return np.asarray(refined)
+    maps = np.concatenate([slope.transpose(2, 0, 1), offset[None]])
+    refined = np.empty(size, np.float32)
+    for rows in strips(size):
+        lines = enlarged(maps, size, rows)
+        found = lines[3]
+        for channel in range(3):
+            found += lines[channel] * photo_srgb[rows, :, channel] / np.float32(255)
+        refined[rows] = ((found - _STRETCH) / (1 - 2 * _STRETCH)).clip(0, 1)
+    return refined
 
 
 def local_lines(
@@ -57,30 +65,80 @@ def local_lines(
     return mean(slope), mean(offset)
 
 
-def person_colours(photo: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """The person's own colours [H, W, 3] where a matte [H, W] mixes them with the background's.
+class PersonColours:
+    """The person's own colours [H, W, 3] where a matte [H, W] mixes them with the background's, by rows.
 
     Means of sure colours nearby, corrected by the mixture that the photo shows (Forte, *Approximate fast
-    foreground colour estimation*, 2021). The means are those of a photo of at most `_COLOURS_PX`.
+    foreground colour estimation*, 2021). The means are those of a photo of at most `_COLOURS_PX`. A colour is
+    no brighter than it must be for the mixture.
     """
-    height, width = matte.shape
-    scale = min(1.0, _COLOURS_PX / max(matte.shape))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
-    both = torch.from_numpy(np.dstack([photo, matte]).astype(np.float32)).permute(2, 0, 1)[None]
-    small = F.interpolate(both, size, mode="area")[0].permute(1, 2, 0).numpy()
-    seen, share = small[..., :3], small[..., 3]
-    person = background = seen
-    for reach in _COLOUR_REACH:
-        span = max(3, 2 * round(reach * max(size)) + 1)
-        own = _weighted_mean(person, share, span)
-        background = _weighted_mean(background, 1 - share, span)
-        person = _unmixed(seen, share, own, background)
-    if scale < 1:
-        own, background = (
-            enlarged(x.transpose(2, 0, 1), matte.shape).transpose(1, 2, 0) for x in (own, background)
-        )
-        person = _unmixed(photo, matte, own, background)
-    return np.where(matte[..., None] > 0, person, 0).astype(np.float32)
+
+    def __init__(self, photo: np.ndarray, matte: np.ndarray) -> None:
+        self.shape = photo.shape
+        self._photo, self._matte = photo, matte
+        height, width = matte.shape
+        scale = min(1.0, _COLOURS_PX / max(matte.shape))
+        size = max(1, round(height * scale)), max(1, round(width * scale))
+        seen, share = shrunk(photo, size), shrunk(matte, size)
+        person = own = background = seen
+        for reach in _COLOUR_REACH:
+            span = max(3, 2 * round(reach * max(size)) + 1)
+            own = _weighted_mean(person, share, span)
+            background = _weighted_mean(background, 1 - share, span)
+            person = _unmixed(seen, share, own, background)
+        self._means = np.concatenate([own, background], -1)
+        self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        photo, matte = self._photo[rows], self._matte[rows]
+        found = photo * (matte > 0)[..., None]
+        mixed = np.nonzero((matte > 0) & (matte < 1))
+        if len(mixed[0]):
+            y = mixed[0] + range(self.shape[0])[rows].start
+            own, background = np.split(_looked_up(self._means, y, mixed[1], self.shape), 2, -1)
+            seen, share = photo[mixed], matte[mixed]
+            found[mixed] = np.minimum(_unmixed(seen, share, own, background), seen / share[:, None])
+        return found
+
+
+def _looked_up(maps: np.ndarray, y: np.ndarray, x: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """Values [N, C] of maps [h, w, C], enlarged to `size` as by `enlarged`, at rows y and columns x."""
+    (top, bottom, down), (left, right, along) = (
+        _between(at, small, large) for at, small, large in zip((y, x), maps.shape, size, strict=False)
+    )
+    along = along[:, None]
+    above = maps[top, left] + along * (maps[top, right] - maps[top, left])
+    below = maps[bottom, left] + along * (maps[bottom, right] - maps[bottom, left])
+    return np.asarray(above + down[:, None] * (below - above))
+
+
+def _between(at: np.ndarray, small: int, large: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Neighbours of large pixels among small ones, and the weight of the second one."""
+    place = ((at + 0.5) * (small / large) - 0.5).clip(0, small - 1)
+    first = place.astype(np.int64)
+    return first, (first + 1).clip(max=small - 1), (place - first).astype(np.float32)
+
+
+def shrunk(image: Rows, size: tuple[int, int]) -> np.ndarray:
+    """Means of the pixels of an image [H, W] or [H, W, C] at another size, float32."""
+    across, down = (_averages(*pair) for pair in zip(image.shape, size, strict=False))
+    flat = np.zeros((size[0], math.prod(image.shape[1:])), np.float32)
+    for rows in strips(image.shape):
+        part = np.ascontiguousarray(image[rows], np.float32)
+        flat += across[:, rows] @ part.reshape(len(part), -1)
+    sides = np.moveaxis(flat.reshape(size[0], *image.shape[1:]), 1, 0)
+    found = down @ np.ascontiguousarray(sides).reshape(image.shape[1], -1)
+    return np.ascontiguousarray(np.moveaxis(found.reshape(size[1], size[0], *image.shape[2:]), 0, 1))
+
+
+def _averages(large: int, small: int) -> csr_array:
+    """Weights [small, large] of the mean over the pixels that each smaller one touches."""
+    starts = np.arange(small) * large // small
+    ends = -(-(np.arange(1, small + 1) * large) // small)
+    counts = ends - starts
+    columns = np.concatenate([np.arange(*pair) for pair in zip(starts, ends, strict=True)])
+    weights = np.repeat(1 / counts, counts).astype(np.float32)
+    return csr_array((weights, columns, np.concatenate([[0], counts.cumsum()])), shape=(small, large))
 
 
 def _unmixed(seen: np.ndarray, matte: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -96,8 +154,10 @@ def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.nda
     return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))
 
 
-def enlarged(maps: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
-    """Maps [C, h, w] at another size [C, H, W]."""
-    tensor: Tensor = torch.from_numpy(np.ascontiguousarray(maps, np.float32))[None]
-    wide = F.interpolate(tensor, size=tuple(size), mode="bilinear", align_corners=False)
+def enlarged(maps: np.ndarray, size: tuple[int, ...], rows: slice = slice(None)) -> np.ndarray:
+    """Maps [C, h, w] at another size [C, H, W], or some rows of that."""
+    above, below, share = _between(np.arange(size[0])[rows], maps.shape[1], size[0])
+    tall = maps[:, above] + share[:, None] * (maps[:, below] - maps[:, above])
+    tensor: Tensor = torch.from_numpy(np.ascontiguousarray(tall, np.float32))[None]
+    wide = F.interpolate(tensor, size=(len(share), size[1]), mode="bilinear", align_corners=False)
     return np.asarray(wide[0].numpy())

@@ -17,6 +17,7 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.strips import STRIP_PX, strips
 
 SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -68,9 +69,12 @@ def _averaged(region: np.ndarray, step: int) -> np.ndarray:
     height, width = (max(1, length // step) for length in region.shape[:2])
     if step == 1 or min(region.shape[:2]) < step:
         return region.astype(np.float32)
-    rows = np.add.reduceat(region, np.arange(height) * step, axis=0, dtype=np.float32)
-    blocks = np.add.reduceat(rows, np.arange(width) * step, axis=1)
-    return np.asarray(blocks / step**2)
+    blocks = np.empty((height, width, 3), np.float32)
+    for rows in strips((height, region.shape[1]), STRIP_PX // step):
+        part = region[rows.start * step : rows.stop * step if rows.stop < height else None]
+        tall = np.add.reduceat(part, np.arange(rows.stop - rows.start) * step, axis=0, dtype=np.float32)
+        blocks[rows] = np.add.reduceat(tall, np.arange(width) * step, axis=1)
+    return blocks / np.float32(step**2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,15 +17,14 @@ from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.portrait.proxy import (
     Proxy,
     ProxyMaps,
+    Shadows,
     proxy_maps,
     proxy_of,
     square_camera,
-    visibility,
-    visibility_of_points,
 )
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.portrait.square import SIDE_PX, portrait_square
-from facerf_cli.raster.camera import PIXEL_CENTRE, Camera
+from facerf_cli.raster.camera import PIXEL_CENTRE
 
 VISIBILITY_PX = SIDE_PX // 2  # side at which shadow rays are cast
 
@@ -49,17 +48,17 @@ class SeenPerson:
 
     def visibility(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights [L, 3] that reaches the person, on `VISIBILITY_PX`."""
-        return visibility(self.proxy, self.small_camera, directions)
+        return self.shadows.along(directions)
 
     def visibility_of_points(self, places_m: Tensor) -> Tensor:
         """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
-        return visibility_of_points(self.proxy, self.small_camera, places_m)
+        return self.shadows.toward(places_m)
 
-    @property
-    def small_camera(self) -> Camera:
-        """The camera of the square at `VISIBILITY_PX`."""
+    @cached_property
+    def shadows(self) -> Shadows:
+        """The lights that reach each pixel, on `VISIBILITY_PX`."""
         square = Crop(self.square.x0_px, self.square.y0_px, self.square.side_px, VISIBILITY_PX)
-        return square_camera(self.fit, square)
+        return Shadows(self.proxy, square_camera(self.fit, square))
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""

@@ -21,7 +21,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera
-from facerf_cli.light.transport import build_scene, occluded, on_disc
+from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
@@ -82,28 +82,6 @@ class ProxyMaps:
     covered: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class ShadowRays:
-    """The rays by which a light's visibility is found in a camera's pixels that a proxy covers [s, s].
-
-    They begin at origins [N, 3] and end on the disc of a light, by numbers [rays, 2, N, 1] in 0..1.
-    """
-
-    covered: Tensor
-    origins: np.ndarray
-    numbers: np.ndarray
-
-    @staticmethod
-    def of(proxy: Proxy, camera: Camera) -> "ShadowRays":
-        """Begin rays a little off the surface that the camera sees."""
-        maps = proxy_maps(proxy, camera)
-        inside = maps.covered.numpy() > 0
-        normals, points = (field.numpy()[:, inside].T for field in (maps.normals, maps.positions_m))
-        origins = (points + _OFF_M * normals).astype(np.float32)
-        numbers = np.random.default_rng(_SEED).random((_RAYS, 2, len(origins), 1)).astype(np.float32)
-        return ShadowRays(maps.covered, origins, numbers)
-
-
 def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop) -> Proxy:
     """Shape the proxy of a fitted face; classes [C, S, S] are what is seen in the square around it."""
     person = _person()
@@ -141,17 +119,42 @@ def proxy_maps(proxy: Proxy, camera: Camera) -> ProxyMaps:
     return ProxyMaps(F.normalize(filled[:3], dim=0), filled[3:], covered)
 
 
-def visibility(proxy: Proxy, camera: Camera, directions: Tensor) -> Tensor:
-    """Share [L, s, s] of lights from camera-space directions [L, 3] that reaches each pixel of a camera.
+class Shadows:
+    """Lights that reach each pixel of a camera, where a proxy shades itself.
 
-    The proxy shades itself; a surface that faces away is not reached.
+    A surface that faces away is not reached. What all lights share is computed once: the pixels that are
+    covered [s, s], the rays' origins [N, 3], and numbers [rays, 2, N, 1] in 0..1, which place their ends on
+    the disc of a light.
     """
-    return _reached(proxy, camera, [partial(_along, direction) for direction in directions.numpy()])
 
+    def __init__(self, proxy: Proxy, camera: Camera) -> None:
+        maps = proxy_maps(proxy, camera)
+        self.covered, self._inside = maps.covered, maps.covered.numpy() > 0
+        normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
+        self.origins = (points + _OFF_M * normals).astype(np.float32)
+        self._scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
+        count = len(self.origins)
+        self.numbers = np.random.default_rng(_SEED).random((_RAYS, 2, count, 1)).astype(np.float32)
+        self._places = [places_on_disc(_RADIUS_DEG, *pair) for pair in self.numbers]
 
-def visibility_of_points(proxy: Proxy, camera: Camera, places_m: Tensor) -> Tensor:
-    """Share [P, s, s] of lights at camera-space places [P, 3] that reaches each pixel; see `visibility`."""
-    return _reached(proxy, camera, [partial(_toward, place) for place in places_m.numpy()])
+    def along(self, directions: Tensor) -> Tensor:
+        """Share [L, s, s] of lights from camera-space directions [L, 3] that arrives."""
+        return self._reached([partial(_along, direction) for direction in directions.numpy()])
+
+    def toward(self, places_m: Tensor) -> Tensor:
+        """Share [P, s, s] of lights at camera-space places [P, 3] that arrives."""
+        return self._reached([partial(_toward, place) for place in places_m.numpy()])
+
+    def _reached(self, lights: Sequence[_Light]) -> Tensor:
+        """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
+        found = np.zeros((len(lights), *self._inside.shape), np.float32)
+        for number, light in enumerate(lights):
+            axis, reach_m = light(self.origins)
+            rays = (on_disc(axis, places) for places in self._places)
+            blocked = [occluded(self._scene, self.origins, ray, reach_m) for ray in rays]
+            found[number, self._inside] = 1 - np.mean(blocked, 0)
+        filled = inpaint(torch.from_numpy(found), self.covered)
+        return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
 
 
 def _along(direction: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, None]:
@@ -163,21 +166,6 @@ def _toward(place_m: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, np.nd
     offsets = place_m - origins
     distances_m = np.linalg.norm(offsets, axis=1)
     return offsets / distances_m[:, None].clip(min=1e-6), distances_m
-
-
-def _reached(proxy: Proxy, camera: Camera, lights: Sequence[_Light]) -> Tensor:
-    """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
-    rays = ShadowRays.of(proxy, camera)
-    scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
-    inside, origins = rays.covered.numpy() > 0, rays.origins
-    found = np.zeros((len(lights), *inside.shape), np.float32)
-    for number, light in enumerate(lights):
-        axis, reach_m = light(origins)
-        directions = (on_disc(axis, _RADIUS_DEG, *pair) for pair in rays.numbers)
-        blocked = [occluded(scene, origins, some, reach_m) for some in directions]
-        found[number, inside] = 1 - np.mean(blocked, 0)
-    filled = inpaint(torch.from_numpy(found), rays.covered)
-    return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
 
 
 def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) -> Tensor:

@@ -14,9 +14,10 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.matte import enlarged, refine_matte
+from facerf_cli.portrait.matte import enlarged, refine_matte, shrunk
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.strips import Computed, Rows
 
 # Sides of the squares around the head and around the body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of squares of several sizes are averaged.
@@ -35,10 +36,10 @@ class Segmentation:
     classes: Tensor
     matte: np.ndarray
 
-    def layer(self, name: str) -> np.ndarray:
+    def layer(self, name: str) -> Rows:
         """Share [H, W] float32 of a class; those of all classes but the background sum to the matte."""
-        share = self._shares[class_index(name) - 1]
-        return enlarged(share[None].numpy(), self.matte.shape)[0] * self.matte
+        share, size = self._shares[class_index(name) - 1][None].numpy(), self.matte.shape
+        return Computed(size, lambda rows: enlarged(share, size, rows)[0] * self.matte[rows])
 
     @cached_property
     def _shares(self) -> Tensor:
@@ -48,18 +49,18 @@ class Segmentation:
         person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
         return person / person.sum(0).clamp_min(1e-6)
 
-    def layers(self) -> Mapping[str, np.ndarray]:
+    def layers(self) -> Mapping[str, Rows]:
         """The matte and all classes of the person by the names that they have in an EXR file."""
         return _Layers(self)
 
 
 @dataclass(frozen=True, eq=False)
-class _Layers(Mapping[str, np.ndarray]):
-    """Layers by name, each made when it is asked for: large photos have more of them than fit in memory."""
+class _Layers(Mapping[str, Rows]):
+    """Layers by name, each made when it is asked for."""
 
     of: Segmentation
 
-    def __getitem__(self, name: str) -> np.ndarray:
+    def __getitem__(self, name: str) -> Rows:
         return self.of.matte if name == _MATTE else self.of.layer(name.removeprefix("class."))
 
     def __iter__(self) -> Iterator[str]:
@@ -99,8 +100,8 @@ def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:
 
 def small_image(image_srgb: np.ndarray) -> Tensor:
     """An sRGB uint8 image at the size of its classes [3, h, w], in 0..1."""
-    image = torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255
-    return F.interpolate(image, size=_small_size(*image_srgb.shape[:2]), mode="area")[0]
+    small = shrunk(image_srgb, _small_size(*image_srgb.shape[:2])) / np.float32(255)
+    return torch.from_numpy(small).permute(2, 0, 1)
 
 
 def _small_size(height: int, width: int) -> tuple[int, int]:

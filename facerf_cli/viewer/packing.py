@@ -22,7 +22,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.viewer.arrays import ArrayPack
 from facerf_cli.viewer.decoder_arrays import add_decoder
-from facerf_cli.viewer.person_arrays import add_detail, add_person, add_shadow_rays, guide_gain
+from facerf_cli.viewer.person_arrays import add_detail, add_person, add_shadow_rays
 from facerf_cli.viewer.stage import StageTextures, atlas
 from facerf_cli.whole_person import WholePerson
 
@@ -54,7 +54,7 @@ def packed(
     pack = ArrayPack()
     person = add_person(pack, field, whole)
     add_shadow_rays(pack, field)
-    person |= add_detail(pack, detail, field) | {"guideGain": guide_gain(composition.own)}
+    person |= add_detail(pack, detail, field) | {"guideGain": float(2.0**composition.guide_ev)}
     decoder = add_decoder(pack, field.field)
     stage = StageTextures.of(field.field)
     tiles, scales, columns, tile = atlas(stage.maps)
@@ -63,7 +63,7 @@ def packed(
         "size": [matte.shape[1], matte.shape[0]],
         "head": _head(matte, crop),
         "photo": _lossless(_encoded(photo)),
-        "fringe": _lossless(_fringe(composition.own, matte)),
+        "fringe": _lossless(_fringe(np.asarray(composition.own), matte)),
         "matte": _png(np.round(matte * 255).astype(np.uint8)),
         "window": _add_window(pack, composition),
         "person": person,

@@ -14,7 +14,6 @@ from torch import Tensor
 from facerf_cli.composite import PhotoDetail
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.proxy import ShadowRays
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.viewer.arrays import ArrayPack, Kind
 from facerf_cli.whole_person import WholePerson
@@ -61,19 +60,12 @@ def add_person(pack: ArrayPack, field: PortraitField, whole: WholePerson) -> dic
 
 def add_shadow_rays(pack: ArrayPack, field: PortraitField) -> None:
     """Add the proxy's mesh and the rays that find what reaches each pixel."""
-    rays = ShadowRays.of(field.person.proxy, field.person.small_camera)
+    rays = field.person.shadows
     pack.add("vertices", field.person.proxy.vertices.T.contiguous(), "short")
     pack.add("triangles", field.person.proxy.triangles.flatten().numpy(), "index")
     pack.add("covered", rays.covered[None].float(), "byte")
     pack.add("origins", np.ascontiguousarray(rays.origins.T), "short")
     pack.add("disc", rays.numbers[..., 0].reshape(-1, len(rays.origins)), "short")
-
-
-def guide_gain(own: np.ndarray) -> float:
-    """Exposure by which `to_display` shows an image, as a factor."""
-    from facerf_cli.colour import auto_exposure_ev
-
-    return float(2.0 ** auto_exposure_ev(own))
 
 
 def add_detail(pack: ArrayPack, detail: PhotoDetail, field: PortraitField) -> dict[str, Any]:

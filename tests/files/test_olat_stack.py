@@ -11,10 +11,18 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
+from facerf_cli import memory
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files import olat_stack
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_stack, write_olat_stack
+from facerf_cli.files.olat_stack import (
+    StackHeader,
+    is_olat_stack,
+    read_olat_header,
+    read_olat_stack,
+    read_olats,
+    write_olat_stack,
+)
 
 LIGHTS, HEIGHT, WIDTH = 5, 24, 17  # not square
 DRAW = np.random.default_rng(3)
@@ -110,7 +118,7 @@ def rewritten(path: Path, **changes: object) -> Path:
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({}, "part 1 is missing"), ({"lights": 10**9}, "more than can be read"), ({"lights": 0}, "more than"),
+    ({}, "part 1 is missing"), ({"lights": 10**9}, "lights; a stack has"), ({"lights": 0}, "0 lights"),
     ({"lights": "many"}, "damaged"), ({"kind": "sound"}, "damaged"), ({"format": "x-9"}, "damaged"),
     ({"rotation": [1, 2]}, "damaged"), ({"rotation": [[float("nan")] * 3] * 3}, "damaged"),
     ({"fit": 7}, "damaged"), ({"layout_version": None}, "damaged"),
@@ -132,9 +140,20 @@ def test_what_is_no_stack_is_refused(path: Path, tmp_path: Path) -> None:
     assert is_olat_stack(path)
 
 
-def test_the_size_is_bounded(path: Path) -> None:
-    with pytest.raises(InputError, match="more than can be read"):
-        read_olat_stack(path, limit_bytes=1000)
+def test_the_budget_of_memory_bounds_lights_and_source(path: Path) -> None:
+    """Lights of 6 bytes a pixel and a source of 100; rows and single lights take their part of that."""
+    lights, (_, height, width) = len(read_olats(path)), read_olats(path).shape[1:]
+    needed = height * width * (6 * lights + 100)
+    memory.set_limit(needed)
+    assert len(read_olat_stack(path).olats) == lights
+    memory.set_limit(needed - 1)
+    with pytest.raises(InputError, match=f"{lights} lights of {width} x {height} pixels: needs .* --memory"):
+        read_olat_stack(path)
+    assert len(read_olats(path, slice(0, 1))) == 1 and read_olat_header(path).kind
+    memory.set_limit(height * width * 100 - 1)
+    for read in (read_olat_header, read_olats):
+        with pytest.raises(InputError, match="of memory"):
+            read(path)
 
 
 def test_a_part_without_direction_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

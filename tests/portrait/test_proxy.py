@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -11,14 +12,15 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.transport import build_scene
+from facerf_cli.portrait import proxy as module
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.proxy import (
     Proxy,
+    Shadows,
     proxy_maps,
     proxy_of,
     square_camera,
-    visibility,
-    visibility_of_points,
 )
 from facerf_cli.raster.camera import pose_to_rotation
 
@@ -89,7 +91,7 @@ def test_heads_cast_shadows() -> None:
     camera = square_camera(fit(), SQUARE)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
     maps = proxy_maps(proxy(), camera)
-    visible = visibility(proxy(), camera, lights)
+    visible = Shadows(proxy(), camera).along(lights)
     assert visible.shape == (3, SIDE, SIDE) and visible.min() >= 0 and visible.max() <= 1
     face = (maps.covered > 0) & (torch.arange(SIDE)[:, None] > 36) & (torch.arange(SIDE)[:, None] < 60)
     left = face & (torch.arange(SIDE) < 44) & (torch.arange(SIDE) > 34)
@@ -104,14 +106,26 @@ def test_shadows_of_points_are_cast_toward_their_places() -> None:
     """A point far away is a far light; what stands behind a point casts no shadow."""
     camera = square_camera(fit(), SQUARE)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 75.0))])
-    far = visibility_of_points(proxy(), camera, 3000 * lights)
-    torch.testing.assert_close(far, visibility(proxy(), camera, lights), atol=0.5, rtol=0)
-    assert (far - visibility(proxy(), camera, lights)).abs().mean() < 2e-3  # rays that graze
+    far = Shadows(proxy(), camera).toward(3000 * lights)
+    torch.testing.assert_close(far, Shadows(proxy(), camera).along(lights), atol=0.5, rtol=0)
+    assert (far - Shadows(proxy(), camera).along(lights)).abs().mean() < 2e-3  # rays that graze
     points = torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -1.6]])
-    before, behind = visibility_of_points(proxy(), camera, points)
+    before, behind = Shadows(proxy(), camera).toward(points)
     face = slice(40, 56), slice(42, 54)
     assert before[face].mean() > 0.9 and behind[face].mean() < 0.01
     neck, above = proxy_maps(proxy(), camera).positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
     places = torch.stack([neck + length_m * above for length_m in (0.02, 0.5)])
-    below_chin, over_head = visibility_of_points(proxy(), camera, places)[:, 72, 48]
+    below_chin, over_head = Shadows(proxy(), camera).toward(places)[:, 72, 48]
     assert below_chin > 0.9 and over_head < 0.1  # the chin is behind the first
+
+
+def test_all_lights_share_one_scene_and_one_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    monkeypatch.setattr(module, "build_scene", lambda *given: calls.append("scene") or build_scene(*given))
+    monkeypatch.setattr(module, "proxy_maps", lambda *given: calls.append("view") or proxy_maps(*given))
+    shadows = Shadows(proxy(), square_camera(fit(), SQUARE))
+    lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
+    at_once = shadows.along(lights)
+    assert calls == ["view", "scene"]
+    torch.testing.assert_close(at_once, torch.cat([shadows.along(light[None]) for light in lights]))
+    assert len(calls) == 2

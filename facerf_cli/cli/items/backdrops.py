@@ -10,6 +10,7 @@ from facerf_cli.cli.lights import LightSetup
 from facerf_cli.files.images import read_image
 from facerf_cli.light.backdrop import backdrop
 from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays
+from facerf_cli.strips import Computed, Rows
 
 
 class Backdrops:
@@ -19,16 +20,17 @@ class Backdrops:
         self._choice, self._blur, self._camera = choice, blur, camera
         self._fixed = _fixed(choice, camera.height_px, camera.width_px)
 
-    def behind(self, setup: LightSetup, ev: float) -> np.ndarray | None:
+    def behind(self, setup: LightSetup, ev: float) -> Rows | None:
         """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
 
         A file and a colour look as they are at an exposure of `ev`. A map is as bright as its light; single
         lights have a black surrounding.
         """
+        fixed, gain = self._fixed, np.float32(2.0**-ev)
         if self._choice.kind != "envmap":
-            return None if self._fixed is None else self._fixed * np.float32(2.0**-ev)
+            return None if fixed is None else Computed(fixed.shape, lambda rows: fixed[rows] * gain)
         if setup.envmap is None:
-            return np.zeros((self._camera.height_px, self._camera.width_px, 3), np.float32)
+            return np.broadcast_to(np.float32(0), (self._camera.height_px, self._camera.width_px, 3))
         rays = pixel_rays(pixel_centres_px(self._camera), self._camera)
         seen: np.ndarray = backdrop(read_map(setup.envmap), rays, setup.rotate_deg, self._blur).numpy()
         return seen

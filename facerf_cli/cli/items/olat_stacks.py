@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import (
     FittedFace,
@@ -35,6 +36,7 @@ from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.strips import whole
 from facerf_cli.viewer.frame import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
@@ -99,14 +101,14 @@ def _of_person(
     """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
-    reflectance = reflectance_of(models, head, "portrait", work.network_alone, work.memory_bytes, photo)
+    reflectance = reflectance_of(models, head, "portrait", work.network_alone, memory.limit_bytes(), photo)
     composition = composition_of(models, photo, head, reflectance, Target(background="none"))
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
             single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
             relit = relit_by(composition, head, reflectance, some, single)
-            layers = np.stack([composition.light_layer(one) for one in relit])
+            layers = np.stack([whole(composition.light_layer(one)) for one in relit])
             batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
             scale = _TILE_PX / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
@@ -121,8 +123,8 @@ def _of_person(
         directions=directions.numpy(),
         rotation=head.fit.rotation.numpy(),
         source=photo,
-        seen=layers["person.A"],
-        normals=layers["normal"],
+        seen=whole(layers["person.A"]),
+        normals=whole(layers["normal"]),
         layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(head.fit),
         metadata=_metadata(item, work),
@@ -147,7 +149,7 @@ def _olats(
         directions,
         rotation_of(work.pose),
         work.network_alone,
-        work.memory_bytes,
+        memory.limit_bytes(),
         work.precision == "bf16",
     )
     for textures in olats:

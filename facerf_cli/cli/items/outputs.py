@@ -1,21 +1,25 @@
 """Images written in every format of the options."""
 
 import logging
+import math
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from facerf_cli import memory
 from facerf_cli.cli.output_options import SUFFIXES, Format, OutputOptions
 from facerf_cli.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.strips import Rows, whole
 
 Exposure = float | Literal["auto"]
+_HELD = 3  # of an image: beside the photo, its matte and what else is as large
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -26,10 +30,10 @@ class OutputImage:
     `share` [H, W] is how far a soft view applies to each pixel (`colour.encode_display`); None: to all.
     """
 
-    pixels: np.ndarray
-    alpha: np.ndarray | None = None
-    layers: Mapping[str, np.ndarray] = field(default_factory=dict)
-    share: np.ndarray | None = None
+    pixels: Rows
+    alpha: Rows | None = None
+    layers: Mapping[str, Rows] = field(default_factory=dict)
+    share: Rows | None = None
 
 
 def check_output(options: OutputOptions) -> None:
@@ -47,6 +51,8 @@ def write_output(
 ) -> None:
     """Write an image in every format, at the same time, under `path` with the suffix of each."""
     space, view = _space_of(options), _view_of(options)
+    if len(options.formats) > 1:
+        image = _held(image)
 
     def write(name: Format) -> None:
         target = path.with_suffix(SUFFIXES[name])
@@ -59,8 +65,15 @@ def write_output(
             shown = {"facerf:view": view.name, **(metadata or {})}
             write_display(target, image.pixels, exposure, image.alpha, shown, view, image.share, bits)
 
-    with ThreadPoolExecutor(len(options.formats)) as pool:
+    at_once = len(options.formats) if isinstance(image.pixels, np.ndarray) else 1
+    with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(write, options.formats))
+
+
+def _held(image: OutputImage) -> OutputImage:
+    """The image with its pixels computed once for all formats, where that fits the budget of memory."""
+    bytes_each = 4 * math.prod(image.pixels.shape)
+    return replace(image, pixels=whole(image.pixels)) if memory.limit_bytes() > _HELD * bytes_each else image
 
 
 def _space_of(options: OutputOptions) -> ColourSpace:

@@ -32,6 +32,7 @@ from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
 from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
+_KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
 LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
@@ -79,10 +80,10 @@ def face_model(options: PhotoOptions) -> MorphableModel:
     return load_face_model(options.face_model)
 
 
-def read_photo(item: Item, options: PhotoOptions) -> LinearImage:
-    """The item's image, scene-linear Rec.709."""
+def read_photo(item: Item, options: PhotoOptions, kept_px: int = _KEPT_PX) -> LinearImage:
+    """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
-    return read_image(item.input_path, space)
+    return read_image(item.input_path, space, kept_px=kept_px)
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.progress import track
 
+from facerf_cli import memory
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_items
 from facerf_cli.cli.inputs import Item, collect_items
 from facerf_cli.cli.lights import MAP_SUFFIXES
@@ -37,7 +38,7 @@ def relight_subjects(options: RelightDataset) -> int:
     if options.lazy:
         print(pairs_path(dataset))
         return 0
-    work = _Relight(dataset, options.per_subject, options.memory_bytes, options.overwrite == "always")
+    work = _Relight(dataset, options.per_subject, options.overwrite == "always")
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     items = [Item(options.dataset / "olat" / name, output / name, name) for name in subjects]
     batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)
@@ -61,7 +62,6 @@ class _Relight:
 
     dataset: Dataset
     per_subject: int
-    memory_bytes: int
     overwrite: bool
 
     def outputs_of(self, item: Item) -> list[Path]:
@@ -71,7 +71,7 @@ class _Relight:
     def __call__(self, item: Item) -> Outcome:
         """Write the sources that are missing."""
         pairs, weights = load_pairs(self.dataset)[item.name]
-        made = relight_subject(self.dataset, pairs, weights, self.memory_bytes, self.overwrite)
+        made = relight_subject(self.dataset, pairs, weights, memory.limit_bytes(), self.overwrite)
         return Outcome(self.outputs_of(item), {"pictures": len(pairs), "made": made})
 
 

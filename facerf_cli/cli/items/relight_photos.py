@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 import torch
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.backdrops import Backdrops
 from facerf_cli.cli.items.companions import companion
@@ -38,7 +39,7 @@ from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight import Relight
 from facerf_cli.cli.shots import shot_of
 from facerf_cli.colour import ExposureRule
-from facerf_cli.composite import Composition, Relit, RelitImage, Target
+from facerf_cli.composite import Composition, Relit, RelitRows, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
@@ -50,6 +51,7 @@ from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stac
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
+from facerf_cli.strips import Rows
 
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
@@ -61,13 +63,13 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 class Composer(Protocol):
     """A composer of images: `Composition`, `GroupComposition`; of stacks `PersonStack`, `RenderedStack`."""
 
-    def image(self, relit: Any, ev: float, behind: np.ndarray | None) -> RelitImage:
+    def rows(self, relit: Any, ev: float, behind: Rows | None) -> RelitRows:
         """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
 
-    def layers(self, names: Sequence[str], relit: Any) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Any) -> dict[str, Rows]:
         """Layers of the image by the names that they have in a file."""
 
-    def light_layer(self, relit: Any) -> np.ndarray:
+    def light_layer(self, relit: Any) -> Rows:
         """The person under one of several lights, over black."""
 
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
@@ -172,9 +174,18 @@ def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) 
     models, head = load_models_once(work.photo), face.head
     target = _target(item, face, image, work)
     reflectance = reflectance_of(
-        models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels, face.steady
+        models,
+        head,
+        work.reflectance,
+        work.network_alone,
+        memory.limit_bytes(),
+        image.pixels,
+        face.steady,
     )
-    composition = composition_of(models, image.pixels, head, reflectance, target)
+    try:
+        composition = composition_of(models, image.pixels, head, reflectance, target)
+    except InputError as error:
+        raise InputError(f"{item.input_path}: {error}") from None
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
 
     def relit(rows: slice) -> list[Relit]:
@@ -317,7 +328,7 @@ def _write_setups(
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
-            image, layers = shown.composer.image(relit, ev, behind), shown.composer.layers(work.aov, relit)
+            image, layers = shown.composer.rows(relit, ev, behind), shown.composer.layers(work.aov, relit)
             if setup.names:
                 each = map(shown.composer.light_layer, shown.apart(setup))
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
@@ -330,12 +341,12 @@ def _write_setups(
 
 def _parts(shown: _Shown, work: Relight) -> list[slice]:
     """Setups, as many at a time as fit the memory."""
-    at_once = max(1, work.memory_bytes // (_HELD * shown.bytes_each))
+    at_once = max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
     return [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
 
 
 def _output(
-    image: RelitImage, layers: Mapping[str, np.ndarray], photo_alpha: np.ndarray | None, work: Relight
+    image: RelitRows, layers: Mapping[str, Rows], photo_alpha: np.ndarray | None, work: Relight
 ) -> OutputImage:
     """The image to write; a soft view leaves what was photographed, and a given background, as it looks."""
     alpha = photo_alpha if image.alpha is None else image.alpha

@@ -18,10 +18,12 @@ from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import FoundFace
-from facerf_cli.portrait.matte import person_colours
+from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.strips import whole
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
+_KEPT_PX = 26  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the colours, a class
 _OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 # Hues of the classes but the background, in the order of CLASSES; near ones differ.
@@ -39,7 +41,7 @@ def write_segments(
         image, face, found = segmented_frame(*place, options)
         _write(item, "", image, to_display(image.pixels), face, found)
         return [""], {}
-    image = read_photo(item, options)
+    image = read_photo(item, options, _KEPT_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     for tag, face in reversed(people):
@@ -54,7 +56,7 @@ def _write(
         return item.output(tag + ending)
 
     metadata = stamp(item)
-    colours = person_colours(image.pixels, found.matte)
+    colours = whole(PersonColours(image.pixels, found.matte))
     write_exr(path("_segment.exr"), colours, found.matte, found.layers(), metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)
     write_display(path("_overlay.jpg"), _overlay(display, found, face), metadata=metadata)
@@ -66,7 +68,7 @@ def _overlay(display: np.ndarray, found: Segmentation, face: Face) -> np.ndarray
     step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
     shown = display[::step, ::step] / np.float32(255) * (1 - _SHOWN * found.matte[::step, ::step, None])
     for name, colour in zip(CLASSES[1:], _colours(), strict=True):
-        shown += _SHOWN * found.layer(name)[::step, ::step, None] * colour
+        shown += _SHOWN * whole(found.layer(name))[::step, ::step, None] * colour
     half = max(1, round(_DOT * max(shown.shape[:2]) / 2))
     for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
         shown[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)

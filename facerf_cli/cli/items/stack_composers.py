@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
-from facerf_cli.composite import Relit, RelitImage
+from facerf_cli.composite import Relit, RelitRows
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
+from facerf_cli.strips import Rows, whole
 from facerf_cli.viewer.frame import resized
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
@@ -21,15 +22,15 @@ class RenderedStack:
     seen: np.ndarray
     normals: np.ndarray  # [H, W, 3]
 
-    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+    def rows(self, relit: Relit, ev: float, behind: Rows | None) -> RelitRows:
         """The face as relit, with its coverage as alpha."""
-        return RelitImage(_pixels(relit), self.seen)
+        return RelitRows(_pixels(relit), self.seen)
 
     def light_layer(self, relit: Relit) -> np.ndarray:
         """The face under one of several lights, over black."""
         return np.asarray(_pixels(relit) * self.seen[..., None])
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
         """The layer of normals; raises UsageError for others."""
         return _only_normals(names, self.normals)
 
@@ -51,21 +52,20 @@ class PersonStack:
     photo: np.ndarray | None = None
     keeps_background: bool = True
 
-    def image(self, relit: Relit, ev: float, behind: np.ndarray | None) -> RelitImage:
+    def rows(self, relit: Relit, ev: float, behind: Rows | None) -> RelitRows:
         """The person before the photo's background at `ev`, before another, or with alpha."""
         person, matte = self._person(relit)
         if behind is None and (self.photo is None or not self.keeps_background):
-            return RelitImage(person, matte)
-        shown = self.photo * np.float32(2.0**-ev) if behind is None and self.photo is not None else behind
-        assert shown is not None
-        return RelitImage(shown + matte[..., None] * (person - shown))
+            return RelitRows(person, matte)
+        shown = whole(behind) if behind is not None else np.float32(2.0**-ev) * np.asarray(self.photo)
+        return RelitRows(shown + matte[..., None] * (person - shown))
 
     def light_layer(self, relit: Relit) -> np.ndarray:
         """The person under one of several lights, over black."""
         person, matte = self._person(relit)
         return np.asarray(person * matte[..., None])
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, np.ndarray]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
         """The matte and the layer of normals; raises UsageError for others."""
         normals = resized(self.header.normals, *self._size())
         return {"person.A": self._matte()} | _only_normals(names, normals)
@@ -104,7 +104,7 @@ def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
     return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
 
 
-def _only_normals(names: Sequence[str], normals: np.ndarray) -> dict[str, np.ndarray]:
+def _only_normals(names: Sequence[str], normals: np.ndarray) -> dict[str, Rows]:
     if other := [name for name in names if name != "normal"]:
         raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
     return {"normal": normals} if names else {}

@@ -33,7 +33,7 @@ def lit(radiance: float) -> Relit:
 
 
 def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
-    image = PersonStack(header(), header().seen).image(lit(0.6), 0.0, None)
+    image = PersonStack(header(), header().seen).rows(lit(0.6), 0.0, None).whole()
     assert image.alpha is not None and image.alpha.mean() == 0.5
     np.testing.assert_allclose(image.pixels[:, :2], 0.6, rtol=1e-6)
 
@@ -41,7 +41,7 @@ def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
     photo = np.full((8, 8, 3), 0.2, np.float32)
     photo[0, 0] = 0.4  # a detail
-    image = PersonStack(header(), header().seen, photo).image(lit(0.6), 1.0, None)
+    image = PersonStack(header(), header().seen, photo).rows(lit(0.6), 1.0, None).whole()
     assert image.alpha is None
     assert image.pixels[4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
     assert image.pixels[0, 0, 0] == pytest.approx(1.2, rel=2e-3)

@@ -1,0 +1,44 @@
+"""One budget of memory for a process, which readers ask before they decode a file.
+
+`--memory` sets it for each job. What a process holds at rest, its libraries and networks, is not in it.
+"""
+
+import math
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from facerf_cli.errors import InputError
+
+SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by default
+_CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
+_GB = 1 << 30
+_set: list[int] = []  # the limit, once it was set
+
+
+def set_limit(limit_bytes: int) -> None:
+    """Set the budget of this process."""
+    _set[:] = [limit_bytes]
+
+
+def limit_bytes() -> int:
+    """The budget of this process."""
+    return _set[0] if _set else default_limit()
+
+
+def default_limit(jobs: int = 1) -> int:
+    """A job's part of `SHARE` of the memory of the machine, or of its container."""
+    most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(OSError, ValueError):  # no container, or one without a limit
+        most = min(most, int(_CGROUP.read_text()))
+    return int(SHARE * most) // max(1, jobs)
+
+
+def require(what: str, needed_bytes: int, instead: str) -> None:
+    """Raise InputError where something needs more than the budget; `instead` says what else would do."""
+    if needed_bytes > limit_bytes():
+        least = math.ceil(100 * needed_bytes / _GB) / 100
+        raise InputError(
+            f"{what}: needs {least:.2f} GB of memory, and {limit_bytes() / _GB:.2f} GB are allowed; "
+            f"give --memory {least:.2f} or {instead}"
+        )

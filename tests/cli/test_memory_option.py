@@ -1,0 +1,61 @@
+"""`--memory` is a ceiling: what needs more is refused in one line, and jobs share what there is."""
+
+from pathlib import Path
+
+import pytest
+from skimage.data import astronaut
+
+from facerf_cli import memory
+from facerf_cli.cli.batch import _Work
+from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.options import Settings
+from facerf_cli.files.images import write_display
+from facerf_cli.main import global_options_first, main
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """Standard error in one line, whatever the width of the terminal."""
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_a_photo_beyond_the_budget_is_refused_before_it_is_decoded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photo = tmp_path / "large.pgm"
+    photo.write_bytes(b"P5\n7000 5000\n255\n")  # a header alone: decoding it would be another error
+    line = ["relight", str(photo), "-o", str(tmp_path / "out"), "--light", "40,20"]
+    assert main([*line, "--memory", "0.5"]) == 1
+    assert "7000 x 5000 pixels: needs 0.79 GB of memory, and 0.50 GB are allowed; give --memory 0.79" in said(
+        capsys
+    )
+    assert main([*line, "--memory", "0.8"]) == 1 and "cut short" in said(capsys)
+    assert main([*line, "--memory", "inf"]) == 2 and main([*line, "--memory", "0"]) == 2
+
+
+def test_a_face_beyond_the_budget_is_refused_by_the_photos_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_display(tmp_path / "me.png", astronaut() / 255.0)
+    monkeypatch.setattr("facerf_cli.face.view._STRIP_BYTES", 1 << 30)
+    line = ["relight", str(tmp_path / "me.png"), "-o", str(tmp_path / "out"), "--light", "40,20"]
+    assert main([*line, "--memory", "1"]) == 1
+    text = said(capsys)
+    assert "me.png: a face of " in text and "give --memory 1.01 or a smaller photo" in text
+
+
+def test_jobs_have_a_share_each_unless_one_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Settings().job_bytes(4) == memory.default_limit(4)
+    assert Settings(memory_bytes=7).job_bytes(4) == 7
+    seen = []
+    work = _Work(lambda item: seen.append(memory.limit_bytes()), False, 12345)  # type: ignore[arg-type]
+    work(Item(Path("a"), Path("a"), "a"))
+    assert seen == [12345]
+
+
+def test_it_may_stand_before_or_after_the_verb() -> None:
+    assert global_options_first(["relight", "a.jpg", "--memory", "2"]) == [
+        "--memory",
+        "2",
+        "relight",
+        "a.jpg",
+    ]

@@ -1,0 +1,127 @@
+"""The budget of memory: what readers ask for before they decode, and who is refused."""
+
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from facerf_cli import memory
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import load_fit
+from facerf_cli.face.morphable import MAX_ARRAYS, load_face_model
+from facerf_cli.files.images import read_image
+from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
+
+HEIGHT, WIDTH = 30, 50
+
+
+def image(path: Path, channels: list[str], kind: str = "half") -> Path:
+    spec = oiio.ImageSpec(WIDTH, HEIGHT, len(channels), kind)
+    spec.channelnames = tuple(channels)
+    spec.alpha_channel = channels.index("A") if "A" in channels else -1
+    stream = oiio.ImageOutput.create(str(path))
+    assert stream.open(str(path), spec)
+    values = np.zeros((HEIGHT, WIDTH, len(channels)), np.float32) + np.arange(len(channels)) / len(channels)
+    assert stream.write_image(values.astype(np.float32)) and stream.close()
+    return path
+
+
+def test_a_limit_is_a_share_of_the_machine_and_of_its_container(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1 << 20}
+    monkeypatch.setattr(memory, "os", SimpleNamespace(sysconf=sizes.get))
+    monkeypatch.setattr(memory, "_CGROUP", tmp_path / "memory.max")
+    assert memory.default_limit() == 2 << 30 and memory.default_limit(4) == 512 << 20
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.default_limit() == 2 << 30
+    (tmp_path / "memory.max").write_text(f"{1 << 30}\n")
+    assert memory.default_limit() == 512 << 20
+
+
+def test_a_refusal_names_what_is_needed_and_what_is_allowed() -> None:
+    memory.set_limit(1 << 30)
+    memory.require("a.exr", 1 << 30, "crop it")
+    with pytest.raises(InputError) as refused:
+        memory.require("a.exr", (1 << 30) + 1, "crop it")
+    assert str(refused.value) == (
+        "a.exr: needs 1.01 GB of memory, and 1.00 GB are allowed; give --memory 1.01 or crop it"
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "channels", "kind", "bytes_px"),
+    [
+        ("grey.png", ["Y"], "uint8", 1 + 12),
+        ("a.png", ["R", "G", "B", "A"], "uint16", 8 + 16),
+        ("a.exr", ["R", "G", "B"], "half", 12 + 12),
+        ("many.exr", ["R", "G", "B", *(f"other{n:03d}.R" for n in range(300))], "half", 12 + 12),
+    ],
+)
+def test_an_image_asks_for_the_channels_that_it_shows(
+    tmp_path: Path, name: str, channels: list[str], kind: str, bytes_px: int
+) -> None:
+    path, needed = image(tmp_path / name, channels, kind), HEIGHT * WIDTH * bytes_px
+    memory.set_limit(needed)
+    assert read_image(path).pixels.shape == (HEIGHT, WIDTH, 3)
+    memory.set_limit(needed - 1)
+    with pytest.raises(InputError, match=rf"{name}: {WIDTH} x {HEIGHT} pixels: needs .* of memory"):
+        read_image(path)
+
+
+def test_an_image_asks_for_what_its_reader_makes_of_it(tmp_path: Path) -> None:
+    path = image(tmp_path / "a.png", ["R", "G", "B"], "uint8")
+    memory.set_limit(HEIGHT * WIDTH * (12 + 50))
+    read_image(path, kept_px=50)
+    with pytest.raises(InputError, match="of memory"):
+        read_image(path, kept_px=51)
+
+
+def bomb(path: Path, members: int, bytes_each: int) -> Path:
+    """An .npz that is a thousand times smaller than its arrays."""
+    np.savez_compressed(path, **{f"a{n}": np.zeros(bytes_each, np.uint8) for n in range(members)})
+    assert path.stat().st_size < members * bytes_each / 100
+    return path
+
+
+def test_the_arrays_of_a_file_count_together(tmp_path: Path) -> None:
+    path = bomb(tmp_path / "a.npz", 8, 1 << 20)
+    memory.set_limit(3 * 8 * ((1 << 20) + 128))  # a member has a header
+    with pytest.raises(InputError, match="not a facerf face model"):  # by its arrays, once they are read
+        load_face_model(path)
+    memory.set_limit(23 << 20)
+    with pytest.raises(InputError, match=r"a\.npz: needs 0\.03 GB of memory"):
+        load_face_model(path)
+
+
+def test_a_file_of_many_arrays_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"it holds {MAX_ARRAYS + 1} arrays; at most {MAX_ARRAYS}"):
+        load_face_model(bomb(tmp_path / "a.npz", MAX_ARRAYS + 1, 1 << 16))
+
+
+def test_a_fit_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = bomb(tmp_path / "fit.npz", 1, 1 << 20)
+    monkeypatch.setattr(zipfile.ZipExtFile, "read", _read_little(zipfile.ZipExtFile.read))
+    with pytest.raises(InputError, match=r"fit\.npz: not a fit .*a0\.npy is too large"):
+        load_fit(path)
+
+
+def _read_little(read):
+    def checked(self, size=-1):
+        assert 0 <= size <= 1 << 16, "an array was read"
+        return read(self, size)
+
+    return checked
+
+
+def test_a_checkpoint_asks_for_its_networks(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    save_checkpoint(path, {}, {})
+    memory.set_limit(3 * path.stat().st_size)
+    load_checkpoint(path)
+    memory.set_limit(3 * path.stat().st_size - 1)
+    with pytest.raises(InputError, match=r"a\.safetensors: needs"):
+        load_checkpoint(path)

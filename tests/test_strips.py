@@ -1,0 +1,124 @@
+"""Images in strips: rows that are computed when they are read, and never many of them at once."""
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+import torch
+import torch.nn.functional as F
+
+from facerf_cli import strips as module
+from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
+from facerf_cli.portrait.matte import PersonColours, enlarged, refine_matte, shrunk
+from facerf_cli.strips import Computed, strips, whole
+from tests.oracles.person_colours import slow_person_colours
+
+HEIGHT, WIDTH = 150, 70
+DRAW = np.random.default_rng(4)
+
+
+@pytest.fixture(autouse=True)
+def _small_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STRIP_PX", 64 * WIDTH)
+
+
+def test_strips_cover_all_rows_once() -> None:
+    parts = list(strips((HEIGHT, WIDTH, 3)))
+    assert [row for part in parts for row in range(HEIGHT)[part]] == list(range(HEIGHT))
+    assert [part.start for part in parts] == [0, 64, 128]
+
+
+class Watched:
+    """Rows of an image that notes how many are read at once."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        self.image, self.shape, self.most = image, image.shape, 0
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        self.most = max(self.most, rows.stop - rows.start)
+        return self.image[rows]
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.png", "a.jpg", "a.tif"])
+def test_files_are_written_by_strips_as_by_one(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pixels = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
+    alpha, normals = DRAW.random((HEIGHT, WIDTH), np.float32), DRAW.random((HEIGHT, WIDTH, 3), np.float32)
+
+    def write(path: Path) -> list[Watched]:
+        watched = [Watched(pixels), Watched(alpha), Watched(normals)]
+        if name == "a.exr":
+            write_exr(path, *watched[:2], {"normal": watched[2], "person.A": watched[1]})
+        elif name == "a.tif":
+            write_tiff(path, *watched[:2])
+        else:
+            write_display(path, watched[0], 0.5, watched[1])
+        return watched
+
+    watched = write(tmp_path / name)
+    assert max(one.most for one in watched) == 64
+    monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
+    write(tmp_path / f"whole{name}")
+    assert (tmp_path / name).read_bytes() == (tmp_path / f"whole{name}").read_bytes()
+    if name == "a.exr":
+        with_alpha = pixels * alpha[..., None]
+        np.testing.assert_allclose(
+            oiio.ImageBuf(str(tmp_path / name)).get_pixels()[..., :3], with_alpha, atol=1e-3
+        )
+
+
+def test_a_read_does_not_depend_on_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_display(
+        tmp_path / "a.png", DRAW.random((HEIGHT, WIDTH, 3), np.float32), 0.0, DRAW.random((HEIGHT, WIDTH))
+    )
+    found = read_image(tmp_path / "a.png")
+    monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
+    at_once = read_image(tmp_path / "a.png")
+    assert (found.pixels == at_once.pixels).all() and (found.alpha == at_once.alpha).all()
+
+
+def test_computed_rows_are_asked_for_by_their_numbers() -> None:
+    asked: list[slice] = []
+
+    def of(rows: slice) -> np.ndarray:
+        asked.append(rows)
+        return np.repeat(np.arange(rows.start, rows.stop, dtype=np.float32)[:, None], WIDTH, 1)
+
+    image = Computed((HEIGHT, WIDTH), of)
+    assert (whole(image)[:, 0] == np.arange(HEIGHT)).all() and len(asked) == 3
+    assert len(image[140:]) == 10 and asked[-1] == slice(140, 150)
+    assert np.asarray(image).shape == (HEIGHT, WIDTH)
+
+
+def test_maps_are_enlarged_and_shrunk_as_by_torch() -> None:
+    maps = DRAW.random((4, 31, 17), np.float32)
+    wide = F.interpolate(torch.from_numpy(maps)[None], (HEIGHT, WIDTH), mode="bilinear")[0].numpy()
+    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH)), wide, atol=2e-6)
+    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH), slice(40, 61)), wide[:, 40:61], atol=2e-6)
+    image = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
+    small = F.interpolate(planes, (41, 23), mode="area")[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(shrunk(image, (41, 23)), small, atol=1e-6)
+    np.testing.assert_allclose(shrunk(image[..., 0], (41, 23)), small[..., 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("most_px", [1024, 60])
+def test_colours_of_a_person_are_those_of_the_whole_image(
+    most_px: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.portrait.matte._COLOURS_PX", most_px)
+    photo = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
+    matte = (DRAW.random((HEIGHT, WIDTH), np.float32) * 3 - 1).clip(0, 1)
+    colours = PersonColours(photo, matte)
+    np.testing.assert_allclose(whole(colours), slow_person_colours(photo, matte, most_px), atol=2e-6)
+    assert (colours[33:40] == whole(colours)[33:40]).all()
+
+
+def test_a_matte_is_refined_by_strips_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    photo = DRAW.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    rough, guide = DRAW.random((30, 14), np.float32), DRAW.random((30, 14, 3), np.float32)
+    found = refine_matte(rough, guide, photo)
+    monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
+    np.testing.assert_allclose(found, refine_matte(rough, guide, photo), atol=1e-6)
