@@ -28,7 +28,8 @@ from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.texture import inpaint
-from facerf_cli.viewer.frame import PersonBox, resized, small_composition
+from facerf_cli.resize import resized
+from facerf_cli.viewer.frame import PersonBox, small_composition
 
 _LIGHTS_AT_ONCE = 16
 _DARK = 1e-3  # floor of the detail, as a share of its mean: ratios over black are noise

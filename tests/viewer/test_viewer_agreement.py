@@ -9,8 +9,8 @@ from facerf_cli.colour import linear_to_srgb
 from facerf_cli.files.images import read_image
 from facerf_cli.models import load_models
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
+from facerf_cli.resize import shrunk_photo
 from facerf_cli.viewer.basis import BasisSettings, light_basis
-from facerf_cli.viewer.frame import shrunk_photo
 from facerf_cli.viewer.packing import packed
 from tests.oracles.viewer_page import Page
 

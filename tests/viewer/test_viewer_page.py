@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from facerf_cli.colour import anchored_exposure_ev
+from facerf_cli.resize import fitted, resized
 from facerf_cli.viewer.basis import ExposureSamples, brightness_of, factored
-from facerf_cli.viewer.frame import PersonBox, fitted, resized
+from facerf_cli.viewer.frame import PersonBox
 from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 from tests.oracles.viewer_page import Page, direction, document_of, encoded

@@ -31,7 +31,7 @@ from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.viewer.frame import shrunk_photo
+from facerf_cli.resize import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame

@@ -12,9 +12,9 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import facts_of, fit_faces, load_models_once, read_photo
 from facerf_cli.colour import linear_to_srgb
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.resize import fitted, resized, shrunk_photo
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import BasisSettings, LightBasis, light_basis
-from facerf_cli.viewer.frame import fitted, resized, shrunk_photo
 from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 
