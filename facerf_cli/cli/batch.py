@@ -6,7 +6,6 @@ raises `InputError` for a faulty item (the run continues); any other `FacerfErro
 ends it.
 """
 
-import json
 import logging
 import sys
 import time
@@ -24,6 +23,7 @@ from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line, one_line, unexpected
 from facerf_cli.workers import process_died, spread
 
@@ -319,7 +319,7 @@ def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
         return
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError:  # a run that was killed may leave half a line
             continue
         if isinstance(row, dict):

@@ -18,6 +18,7 @@ from facerf_cli.cli.recipe import Recipe, RecipesOf, differences
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import json_line
 
 _INDEXES = ".facerf-index*.jsonl"
@@ -55,7 +56,7 @@ class _Rows:
 
     def _take(self, line: str) -> None:
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError:  # a run that was killed may leave half a line
             return
         if not isinstance(row, dict):

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
@@ -25,7 +26,6 @@ from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
 FORMAT = "facerf-checkpoint-1"
-_LARGEST_SIDE = 4096  # working side, in a checkpoint that is read
 
 # Classes by the name of a network in a checkpoint, and its form.
 _CLASSES: dict[tuple[str, str], type[Any]] = {
@@ -80,7 +80,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        metadata = json.loads(header["facerf"])
+        metadata = parse_json(header["facerf"])
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is not a JSON object")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
@@ -97,7 +97,6 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
     """Make the network that metadata describe and load its tensors; raises ValueError if they do not fit."""
     network_class = _CLASSES[name, described["form"]]
-    _require_bounded(described)
     with torch.device("meta"):  # takes no memory, whatever sizes the file demands
         shapes = network_class.from_metadata(described).state_dict().items()
         expected = {key: tensor.shape for key, tensor in shapes}
@@ -106,13 +105,6 @@ def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -
     network: nn.Module = network_class.from_metadata(described)
     network.load_state_dict(tensors)
     return network
-
-
-def _require_bounded(described: dict[str, Any]) -> None:
-    """Raise ValueError for bad values of the settings on which no tensor's shape depends."""
-    side, normals = described.get("side", 128), described.get("normals", True)
-    if type(side) is not int or not 8 <= side <= _LARGEST_SIDE or type(normals) is not bool:
-        raise ValueError(f"a working side of {side}, normals {normals}")
 
 
 def _tensors_of(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -16,7 +16,6 @@ list of `id` and `coordinates`.
 """
 
 import importlib
-import json
 import zlib
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from scipy.io.matlab import MatReadError
 
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face.importers.source import SourceModel, require_mesh
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import one_line
 
 _MAX_BYTES, _MAX_ENTRIES, _MAX_SHAPES = 1 << 30, 120_000_000, 500
@@ -237,7 +237,7 @@ def _known_2017(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
     if dataset.nbytes > _MAX_TEXT:
         raise ValueError("metadata/landmarks/json is too long")
     known = {}
-    for entry in json.loads(_text(dataset[()])):
+    for entry in parse_json(_text(dataset[()])):
         number = _LANDMARKS_2017.get(str(entry["id"]))
         point = np.array(entry["coordinates"], dtype=np.float64) / 1000
         if number is None or point.shape != (3,) or not np.isfinite(point).all():
