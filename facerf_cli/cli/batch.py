@@ -19,6 +19,7 @@ from typing import Any
 
 from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.naming import OF_FILES, NamePattern
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
@@ -72,9 +73,11 @@ def run_batch(
     recipes_of: RecipesOf,
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
     prepare: Callable[[], object] | None = None,
+    name: str | None = None,
 ) -> int:
-    """Process the files that `inputs` name: `run_files` over `collect_items`."""
-    items = collect_items(inputs, options.output, suffixes, null_separated=settings.null_separated)
+    """Process the files that `inputs` name: `run_files` over `collect_items`, with the pattern of --name."""
+    pattern = NamePattern.parse(name, "--name", OF_FILES) if name else None
+    items = collect_items(inputs, options.output, suffixes, pattern, settings.null_separated)
     return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
 
 

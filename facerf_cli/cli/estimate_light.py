@@ -20,6 +20,7 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
+    NameOption,
     OutputOption,
     OverwriteOption,
     settings_of,
@@ -137,6 +138,7 @@ def estimate_light(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    name: NameOption = None,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -177,5 +179,6 @@ def estimate_light(
         photo.settings,
         OneRecipe(work),
         prepare=partial(work.prepare, dry_run),
+        name=name,
     )
     raise typer.Exit(code)

@@ -8,6 +8,7 @@ from string import Formatter
 from facerf_cli.errors import UsageError
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
+OF_FILES = (*OF_PHOTOS, "frame")
 OF_IMAGES = (*OF_PHOTOS, "light", "frame")
 _SEPARATORS = "._-"  # one of these before an empty field goes with it
 _WIDTH = re.compile(r"0?[1-9]?")

@@ -18,6 +18,7 @@ from facerf_cli.cli.options import (
     InputsArgument,
     JobsOption,
     MemoryOption,
+    NameOption,
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
@@ -119,6 +120,7 @@ def predict_olat(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    name: NameOption = None,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -152,5 +154,6 @@ def predict_olat(
         settings,
         OneRecipe(work),
         prepare=photo.preparation(dry_run),
+        name=name,
     )
     raise typer.Exit(code)

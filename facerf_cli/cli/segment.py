@@ -12,6 +12,7 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
+    NameOption,
     OutputOption,
     OverwriteOption,
     settings_of,
@@ -48,6 +49,7 @@ def segment(
     landmarks: LandmarksOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
+    name: NameOption = None,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -69,5 +71,7 @@ def segment(
     photo.check()
     work = Segment(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch("segment", inputs, work, work.outputs_of, options, photo.settings, OneRecipe(work))
+    code = run_batch(
+        "segment", inputs, work, work.outputs_of, options, photo.settings, OneRecipe(work), name=name
+    )
     raise typer.Exit(code)

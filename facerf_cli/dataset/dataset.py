@@ -46,7 +46,7 @@ class Dataset:
 
     folder: Path
     face_model: str  # name of the fitted model
-    crop_px: int
+    crop_px: int  # side of the largest crop
     light_ids: tuple[str, ...]
     directions_world: np.ndarray  # [L, 3] unit, toward the lights
     splits: dict[str, tuple[str, ...]]  # by 'train', 'validation' and 'test'
@@ -260,7 +260,7 @@ class Split:
         return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
 
 
-def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int) -> str:
+def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int | None) -> str:
     """Short digest of all that a subject's files depend on besides its images."""
     content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
     return digest(json.dumps(content, sort_keys=True).encode())
@@ -273,7 +273,6 @@ def describe_dataset(
     seed: int,
     model: MorphableModel,
     face_model_sha256: str,
-    crop_px: int,
 ) -> dict[str, Any]:
     """Make the content of `dataset.json`; subjects without a record are marked as failed."""
     splits = split.of(capture.subjects, seed)
@@ -281,7 +280,7 @@ def describe_dataset(
         "format": FORMAT,
         "capture": capture.folder.resolve().name,
         "face_model": model.name,
-        "crop_px": crop_px,
+        "crop_px": max(entry["crop_px"] for one in records.values() for entry in one["cameras"].values()),
         "colour_space": _COLOUR_SPACE,
         "axes": "x right, y up, z toward the camera; metres; pixel centres at index + 0.5",
         **_calibration(capture),

@@ -58,7 +58,7 @@ def sheet_tiles(
     masked = lit * (0.1 + 0.9 * header.seen[..., None])
     single = np.stack([shown[light] for light in sheet_lights(header.directions)])
     single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
-    small = Crop(0.0, 0.0, float(side_px), min(side_px, _TILE_PX))
+    small = Crop(0.0, 0.0, float(side_px), _TILE_PX)  # crops of a subject may differ in size
     tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])
     for tile, light in zip(tiles[3:], sheet_lights(header.directions), strict=True):
         mark_light(tile, header.directions[light], 1.0)

@@ -60,7 +60,7 @@ def prepare_subject(
     chosen: Selection,
     model: MorphableModel,
     folder: Path,
-    crop_px: int,
+    crop_px: int | None,
     key: str,
     strict: bool = False,
 ) -> dict[str, Any]:
@@ -116,6 +116,7 @@ def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, 
         "face_found": face_found,
         "error_iod": round(fit.error_iod, 5),
         "quality": fit.quality,
+        "crop_px": fit.crop.size_px,
         "crop_off_iod": round(off_iod, 5),
     }
 

@@ -34,7 +34,7 @@ from facerf_cli.cli.items.photos import (
 )
 from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
-from facerf_cli.cli.relight import Relight
+from facerf_cli.cli.relight_work import Relight
 from facerf_cli.colour import ExposureRule
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
 from facerf_cli.errors import InputError
