@@ -90,9 +90,10 @@ def run_files(
     settings: Settings,
     recipes_of: RecipesOf,
     prepare: Callable[[], object] | None = None,
+    index: FolderIndex | None = None,
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
-    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
+    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of, index)
     missing = [item for item in items if options.dry_run and not item.input_path.exists()]
     for item in missing:
         log.error("%s: no such file; check the path", item.input_path)
@@ -108,18 +109,21 @@ def run_items(
     settings: Settings,
     prepare: Callable[[], object] | None = None,
     recipes_of: RecipesOf | None = None,
+    index: FolderIndex | None = None,
 ) -> int:
     """Process the items and return the exit code: 0 all done, 1 some failed.
 
     An item is finished if its outputs exist and, with `recipes_of`, were made from the same input by the
     same recipe. With `--shard` only this process's share of them, which has a report of its own. `prepare` is
     called once, before the first item, and not at all where everything is finished: it loads what `process`
-    needs, so that an error in that is reported once; in a dry run, too. With several workers `process` runs
+    needs, so that an error in that is reported once; in a dry run, too. An `index` that was read stands for
+    that of `recipes_of`. With several workers `process` runs
     in other processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be
     used.
     """
     items = settings.shard.share(items)
-    index = FolderIndex(options.output, verb, settings.shard, recipes_of) if recipes_of else None
+    if index is None and recipes_of:
+        index = FolderIndex(options.output, verb, settings.shard, recipes_of)
     states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
     reasons = {item: reason for item, (reason, _) in states.items()}
     todo = [replace(item, stale=states[item][1]) for item in items if reasons[item] is not None]
@@ -155,15 +159,13 @@ def run_items(
 
 
 def all_finished(
-    verb: str,
     items: Sequence[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
-    recipes_of: RecipesOf,
+    index: FolderIndex,
 ) -> bool:
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
-    index = FolderIndex(options.output, verb, settings.shard, recipes_of)
     share = settings.shard.share(items)
     return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
 

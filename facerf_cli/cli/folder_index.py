@@ -93,6 +93,10 @@ class FolderIndex:
         self.edited: list[Path] = []  # finished outputs that are not as they were written
         name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
         self.path = folder / f".facerf-index{name}.jsonl"
+        self.want(recipes_of)
+
+    def want(self, recipes_of: RecipesOf) -> None:
+        """Judge outputs by other recipes from now on."""
         self._wanted = [(_key(recipe), recipe) for recipe in recipes_of(self.digest_of)]
 
     def digest_of(self, path: Path) -> str:
@@ -131,7 +135,7 @@ class FolderIndex:
         key, recipe = self._wanted_of(number)
         if row.get("recipe") != key:
             old = self._rows.recipes.get(str(row.get("recipe")), {})
-            return differences(old, recipe) if old else "other options"
+            return differences(old, recipe) or "other options" if old else "other options"
         if self._digest_or_none(input_path) != row.get("input"):
             return "the input changed"
         if path.stat().st_size == 0:

@@ -10,6 +10,7 @@ import typer
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
+from facerf_cli.cli.folder_index import FolderIndex
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
@@ -35,6 +36,7 @@ from facerf_cli.cli.output_options import (
     STDOUT,
     ColourspaceOption,
     CompressionOption,
+    DisplayOption,
     FormatOption,
     OcioOption,
     OutputOptions,
@@ -66,10 +68,9 @@ def relight(
         list[str] | None,
         typer.Option(
             "--envmap",
-            metavar="SKY.exr|DIR|procedural:N",
-            help="Relight under lat-long maps (.exr, .hdr): files, folders or quoted patterns; a light of "
-            "estimate-light or convert-light (.json); or the first N maps that facerf envmap draws from "
-            "--seed. Repeatable; .exr and .hdr files that follow it directly are maps, too.",
+            metavar="MAP|DIR",
+            help="Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of "
+            "estimate-light (.json), or procedural:N, maps of facerf envmap. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -79,9 +80,8 @@ def relight(
         typer.Option(
             "--light",
             metavar="LIGHT",
-            help="Relight under AZ,EL[,R,G,B] in degrees (AZ > 0: from the image's right), several by ;, "
-            "a light by its keys (at=, from=, size=, kelvin=, ...), a rig file or a preset "
-            "(rembrandt). NAME= makes a layer. Repeatable.",
+            help="Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig "
+            "file or a preset (rembrandt); docs/lights.md. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -91,8 +91,7 @@ def relight(
         typer.Option(
             "--light-from",
             metavar="PHOTO|DIR",
-            help="Relight under the light of another photo, estimated from its largest face as `facerf "
-            "estimate-light` does by default (with this --reflectance). Repeatable.",
+            help="Relight under the light of another photo, as estimate-light finds it. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -128,8 +127,9 @@ def relight(
     reflectance: Annotated[
         RelightKind,
         typer.Option(
-            help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
-            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md).",
+            metavar="KIND",
+            help="Relight the whole portrait, or the face by the paper's field; or by a baseline: "
+            "diffuse-sh, specular-sh, prt.",
             rich_help_panel=METHOD,
         ),
     ] = "portrait",
@@ -137,20 +137,20 @@ def relight(
         str,
         typer.Option(
             metavar="auto|face|EV",
-            help="Expose PNG and JPEG so that the face is as bright as in the photo (auto) or well lit "
-            "(face); or by a number of EV.",
+            help="Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.",
             rich_help_panel=IMAGE,
         ),
     ] = "auto",
     exposure_group: Annotated[
         ExposureGroup,
         typer.Option(
-            help="Choose an exposure for each photo, or from the first one for a whole folder or sequence "
-            "of frames.",
+            metavar="KIND",
+            help="Share an exposure: of each photo, or the first one's by folder or sequence of frames.",
             rich_help_panel=IMAGE,
         ),
     ] = "photo",
     view: ViewOption = OutputOptions.view,
+    display: DisplayOption = OutputOptions.display,
     format_: FormatOption = "",
     output_colourspace: ColourspaceOption = None,
     compression: CompressionOption = OutputOptions.compression,
@@ -166,9 +166,9 @@ def relight(
     background: Annotated[
         str,
         typer.Option(
-            metavar="photo|envmap|none|FILE|COLOUR",
-            help="Show behind the person the photo's background, as it was; the map, seen by the photo's "
-            "camera; nothing (alpha); an image; or a colour, #RRGGBB or linear R,G,B.",
+            metavar="KIND|FILE|COLOUR",
+            help="Show behind the person the photo, the envmap, none (alpha), an image, or a colour: "
+            "#RRGGBB or linear R,G,B.",
             rich_help_panel=IMAGE,
         ),
     ] = "photo",
@@ -187,7 +187,7 @@ def relight(
         typer.Option(
             metavar="NAME,...",
             help="Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the "
-            "face alone face (its soft mask) and uv. The matte, person.A, is always there.",
+            "face alone face and uv.",
             show_default="none",
             rich_help_panel=IMAGE,
         ),
@@ -196,8 +196,7 @@ def relight(
         Path | None,
         typer.Option(
             metavar="FILE|DIR|PATTERN",
-            help="Change only what a grey image, or its alpha, of the photo's size shows "
-            "(mattes/{stem}.png: of each its own).",
+            help="Change only what a grey image shows (mattes/{stem}.png: of each its own).",
             show_default=False,
             rich_help_panel=IMAGE,
         ),
@@ -207,7 +206,7 @@ def relight(
         typer.Option(
             "--photo",
             metavar="FILE|DIR|PATTERN",
-            help="Put an OLAT stack of predict-olat back on its photo, at the photo's resolution.",
+            help="Put an OLAT stack back on its photo, at the photo's resolution.",
             show_default=False,
             rich_help_panel=IMAGE,
         ),
@@ -249,15 +248,11 @@ def relight(
     jobs: JobsOption = 1,
     memory: MemoryOption = 2.0,
 ) -> None:
-    """Relight photos under environment maps and single lights.
+    """Relight photos, or OLAT stacks, under environment maps and single lights.
 
-    Each image is written as a scene-linear EXR, with the layer person.A (the matte) and those of --aov, and
-    as a PNG at --exposure, or as --format says; -o - writes one image to standard output. One prediction
-    serves all maps and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the
-    end.
-
-    An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
-    the nearest of them.
+    Each image is written as a scene-linear EXR with the matte as layer person.A, and as a PNG at --exposure.
+    -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
+    --light takes the nearest of them.
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
@@ -303,7 +298,7 @@ def relight(
         exposure=parse_exposure(exposure),
         memory_bytes=int(memory * 2**30),
         asked_for_photo=composite == "photo",
-        output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
+        output=OutputOptions(formats, output_colourspace, compression, view, display, config_of(ocio)),
         reflectance="field" if shown == "face" and reflectance == "portrait" else reflectance,
         network_alone=network_alone,
         name=pattern,
@@ -318,9 +313,15 @@ def relight(
     items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
     work = work.with_leaders(items)
     work.refuse_meeting(items)
-    finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
-    usable = work if finished else work.readable(dry_run)
-    code = run_files("relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of)
+    index = FolderIndex(output, "relight", settings.shard, work.recipes_of)
+    usable, finished = work, all_finished(items, work.outputs_of, options, settings, index)
+    index.edited.clear()  # they are judged again
+    if not finished:
+        usable = work.readable(dry_run)
+        index.want(usable.recipes_of)
+    code = run_files(
+        "relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of, index=index
+    )
     if ball and not dry_run and settings.shard.number == 1:
         _write_balls(usable, options)
     raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))

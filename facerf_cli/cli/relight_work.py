@@ -1,4 +1,4 @@
-"""What `facerf relight` makes of one item: its settings, outputs and recipes."""
+"""The work of `facerf relight` on one item: its settings, outputs and recipes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

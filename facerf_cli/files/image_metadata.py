@@ -27,6 +27,7 @@ from facerf_cli.colour import (
     linear_space,
 )
 from facerf_cli.errors import InputError
+from facerf_cli.files.heif import heif_header, is_heif
 from facerf_cli.files.icc import space_of_profile
 from facerf_cli.logs import LOGGER_NAME, one_line
 
@@ -65,17 +66,29 @@ class Header:
 
 def read_header(path: Path) -> Header | None:
     """Read the header of an image's first part; return None if the file is not a readable image."""
-    stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
-    if stream is None:
-        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+    spec = _spec_of(path) if path.is_file() else None
+    if spec is None:
         return None
-    spec = stream.spec()
-    stream.close()
     width, height = spec.full_width, spec.full_height
     if spec.get_int_attribute("Orientation", 1) >= 5:  # rotated by 90 degrees
         width, height = height, width
     floating, bits = is_floating(spec), 8 * spec.format.size()
     return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+
+
+def _spec_of(path: Path) -> oiio.ImageSpec | None:
+    if is_heif(path):
+        try:
+            return heif_header(path)[1]  # upright
+        except InputError:  # damaged, or pi-heif is not there
+            return None
+    stream = oiio.ImageInput.open(utf8_path(path))
+    if stream is None:
+        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        return None
+    spec = stream.spec()
+    stream.close()
+    return spec
 
 
 def utf8_path(path: Path) -> str:

@@ -64,3 +64,11 @@ def test_man_pages_have_the_panels_as_subsections() -> None:
     assert panels == ["Light", "Method", "Face", "Image", "Batch"]
     top = manpages.pages()["facerf.1"]
     assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
+
+
+def test_the_longest_help_is_under_150_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["relight", "--help"]) == 0
+    assert 60 < len(capsys.readouterr().out.splitlines()) < 150

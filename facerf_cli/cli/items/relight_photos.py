@@ -86,16 +86,18 @@ class _Shown:
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     """Relight a photo or a stack under every setup; the images written, and facts for the report."""
-    stack = item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
-    return _relight_stack(item, work) if stack else _relight_photo(item, work)
+    return _relight_stack(item, work) if _is_stack(item) else _relight_photo(item, work)
+
+
+def _is_stack(item: Item) -> bool:
+    return item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
     metadata = _metadata(item, work)
-    leader = work.leader_of(item)
-    chosen_ev = None if leader is None or leader == item else _exposures_of(leader, work)
+    chosen_ev = _shared_exposures(item, work)
     written: Written = {}
     if work.composite == "photo":
         shown = _together(item, image, faces, work)
@@ -106,11 +108,20 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     return written, facts_of(faces)
 
 
+def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
+    """The exposures of an item's group; None where it has none, or is the first of it."""
+    leader = work.leader_of(item)
+    return None if leader is None or leader == item else _exposures_of(leader, work)
+
+
 @cache
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of the first photo of a group, which the others share; found once a process."""
-    image = read_photo(leader, work.photo)
-    shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
+    """Exposures of the first photo or stack of a group, which the others share; found once a process."""
+    if _is_stack(leader):
+        shown = _show_stack(leader, work)[0]
+    else:
+        image = read_photo(leader, work.photo)
+        shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
     parts = _parts(shown, work)
     return _exposures_ev(parts, shown.relit, shown.composer, work)
 
@@ -191,6 +202,12 @@ def _target(item: Item, fit: FaceFit, image: LinearImage, work: Relight) -> Targ
 
 
 def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    shown, metadata, facts = _show_stack(item, work)
+    return dict(_write_setups(item, "", shown, work, metadata, _shared_exposures(item, work))), facts
+
+
+def _show_stack(item: Item, work: Relight) -> tuple[_Shown, dict[str, Any], dict[str, Any]]:
+    """A stack relit by setups, the metadata of its images, and facts for the report."""
     if work.pose is not None or work.asked_for_photo:
         raise InputError(
             f"{item.input_path}: a stack holds one pose of a face without its photo; give the photo"
@@ -225,8 +242,7 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         weights = weights_over_stack(_each_light(setup), directions, work.sampling)
         return list(map(Relit, weighted_sum(batches, weights)))
 
-    shown = _Shown(composer, relit, apart, bytes_each, backdrops=backdrops)
-    return dict(_write_setups(item, "", shown, work, metadata)), facts
+    return _Shown(composer, relit, apart, bytes_each, backdrops=backdrops), dict(metadata), facts
 
 
 def _person_composer(
@@ -302,7 +318,7 @@ def _write_setups(
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
             if work.output.shown_suffix:
-                log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.shown_suffix), ev)
+                log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
 
 
