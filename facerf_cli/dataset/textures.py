@@ -50,7 +50,7 @@ def texture_path(dataset: Dataset, side: int, subject: str, camera: str) -> Path
 def sources_path(dataset: Dataset, side: int, subject: str) -> Path:
     """Path of a subject's unwrapped sources."""
     rows = "".join(json_line(asdict(pair)) for pair in _pairs(dataset, subject))
-    stamps = "".join(_stamp(dataset, subject, camera) for camera in dataset.cameras[subject])
+    stamps = "".join(stamp(dataset, subject, camera) for camera in dataset.cameras[subject])
     return _folder(dataset, side, subject) / f"relit-{digest((rows + stamps).encode())}.npy"
 
 
@@ -87,7 +87,7 @@ def _pairs(dataset: Dataset, subject: str) -> list[Pair]:
     return found[0] if found else []
 
 
-def _stamp(dataset: Dataset, subject: str, camera: str) -> str:
+def stamp(dataset: Dataset, subject: str, camera: str) -> str:
     """Text that changes when a stack is written again."""
     facts = dataset.stack_path(subject, camera).stat()
     return f"{LAYOUT_VERSION}-{facts.st_size}-{facts.st_mtime_ns}"
@@ -99,12 +99,16 @@ def _is_finished(dataset: Dataset, side: int, subject: str) -> bool:
 
 
 def _is_unwrapped(dataset: Dataset, side: int, subject: str, camera: str) -> bool:
-    path = texture_path(dataset, side, subject, camera)
+    return is_made_from(dataset, subject, camera, texture_path(dataset, side, subject, camera))
+
+
+def is_made_from(dataset: Dataset, subject: str, camera: str, path: Path) -> bool:
+    """Tell whether a safetensors file was made from a stack as it is, by its metadata `of`; see `stamp`."""
     if not path.is_file():
         return False
     try:
         with safe_open(path, framework="pt") as file:
-            return (file.metadata() or {}).get("of") == _stamp(dataset, subject, camera)
+            return (file.metadata() or {}).get("of") == stamp(dataset, subject, camera)
     except (SafetensorError, OSError):
         return False
 
@@ -140,7 +144,7 @@ def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: s
     }
     with atomic_path(texture_path(dataset, side, subject, camera)) as temporary:
         contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
-        save_file(contiguous, temporary, {"of": _stamp(dataset, subject, camera)})
+        save_file(contiguous, temporary, {"of": stamp(dataset, subject, camera)})
 
 
 def _read_fit(path: Path, header: StackHeader, model: MorphableModel) -> tuple[FaceFit, Tensor]:

@@ -75,10 +75,15 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
     return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
 
 
-def look_at_person(model: MorphableModel, photo: np.ndarray, fit: FaceFit) -> SeenPerson:
-    """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face."""
+def look_at_person(
+    model: MorphableModel, photo: np.ndarray, fit: FaceFit, square: Crop | None = None
+) -> SeenPerson:
+    """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
+
+    All is seen in the square around the landmarks, or in a given one.
+    """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
-    square = portrait_square(landmarks_px)
+    square = square or portrait_square(landmarks_px)
     segmentation = segment(to_display(photo), landmarks_px)
     classes = _classes_in(segmentation, square)
     proxy = proxy_of(model, fit, classes, square)

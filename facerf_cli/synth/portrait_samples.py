@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from safetensors.torch import load_file
@@ -34,7 +34,8 @@ class PortraitSample:
 
     `lights` [B, T, 3] and `visible` [B, T, s, s] are of the targets [B, T, 3, S, S]; `rig` [B, L, 3],
     `rig_visible` [B, L, s, s] and `weights` [B, L, 3] of the photo's own light, `own` [B, 3, S, S] the photo
-    without noise; albedo, true_normals [B, 3, S, S]; shares [B, C, S, S] of the true classes.
+    without noise; albedo, true_normals [B, 3, S, S], known where `labelled` [B] is 1; shares [B, C, S, S] of
+    the true classes.
     """
 
     image: Tensor
@@ -54,6 +55,7 @@ class PortraitSample:
     albedo: Tensor
     true_normals: Tensor
     shares: Tensor
+    labelled: Tensor
 
     @property
     def inputs(self) -> PortraitInputs:
@@ -64,6 +66,23 @@ class PortraitSample:
     def to(self, device: torch.device) -> "PortraitSample":
         """Move the sample to `device`."""
         return PortraitSample(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+class PortraitSource(Protocol):
+    """People to draw samples of: synthetic ones, or those of a dataset (`dataset/portraits.py`)."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Origin and licence of the people."""
+        ...
+
+    def people(self, held_out: int) -> tuple[list[int], list[int]]:
+        """Indices of the people to train on, and of at most `held_out` others."""
+        ...
+
+    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
+        """Draw one sample [1, ...] of one of some people, with `targets` lights."""
+        ...
 
 
 class StoredTransport:
@@ -88,56 +107,102 @@ class StoredTransport:
         """Draw one sample [1, ...] of one of some people, with `targets` lights."""
         views = self.views[people[_below(len(people), generator)]]
         path = views[_below(len(views), generator)]
-        view, seen = load_view(path), load_file(seen_path(path))
+        view = load_view(path)
         surface = view.looks[_below(len(view.looks), generator)]
         rig = view.portrait.directions
-        weights = _source_light(rig, generator)
+        weights = source_light(rig, generator)
         chosen = draw_target_lights(rig, targets, generator)
         single = torch.eye(len(rig))[chosen, :, None].expand(-1, -1, 3)
-        images = images_under(view.portrait, surface, torch.cat([weights[None], single]))
         albedo, normals = albedo_of(view.portrait, surface)
-        classes = seen["classes"].float() / 255
-        visible = seen["visible"].float() / 255
-        uniform = Uniform(generator)
-        balance = torch.exp(uniform(-0.12, 0.12, 3, 1, 1))
-        images, albedo = images * balance, albedo * balance
-        if torch.rand((), generator=generator) < _GREY:
-            images, albedo = (x.mean(-3, keepdim=True).expand_as(x) for x in (images, albedo))
-        skin = classes[SKIN]
-        scale = MEAN_RADIANCE / _mean_over(albedo, skin)
-        exposed = images[0] / _mean_over(images[0], skin)
-        stored = self.backgrounds[_below(len(self.backgrounds), generator)]
-        background = 4 * background_of(stored, images.shape[-1], generator)
-        photo = _as_taken(exposed + (1 - view.alpha) * background, generator)
-        side = classes.shape[-1]
-        sample = PortraitSample(
-            image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
-            classes=classes,
-            normals=seen["normals"].float(),
-            depth=seen["depth"].float(),
-            covered=seen["covered"].float() / 255,
-            reached=reached_by(rig, visible, side),
-            own_shading=own_shading(photo, classes, seen["normals"].float(), rig, visible),
-            lights=rig[chosen],
-            visible=visible[chosen],
-            targets=(images[1:] * scale).clamp(max=_BRIGHTEST),
-            rig=rig,
-            rig_visible=visible,
-            weights=weights,
-            own=images[0] * scale,
-            albedo=albedo * scale,
-            true_normals=normals,
+        lit = LitPerson(
+            images=images_under(view.portrait, surface, torch.cat([weights[None], single])),
+            albedo=albedo,
+            normals=normals,
             shares=view.portrait.classes.permute(2, 0, 1).float() / 255,
+            behind=1 - view.alpha,
+            rig=rig,
+            weights=weights,
+            chosen=chosen,
         )
-        batched = PortraitSample(*(getattr(sample, field.name)[None] for field in fields(sample)))
-        return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
+        return sample_of(lit, load_file(seen_path(path)), self.backgrounds, generator)
+
+
+@dataclass(frozen=True, eq=False)
+class LitPerson:
+    """A person under the light of a photo, and under T lights of a rig.
+
+    images [1 + T, 3, S, S]; weights [L, 3] of the rig [L, 3] light the first, each of the lights `chosen`
+    [T] one of the others. albedo [3, S, S], or what stands for it; normals [3, S, S], None where nobody
+    knows them; shares [C, S, S] of the classes; behind [S, S], the share of what lies behind the person.
+    """
+
+    images: Tensor
+    albedo: Tensor
+    normals: Tensor | None
+    shares: Tensor
+    behind: Tensor
+    rig: Tensor
+    weights: Tensor
+    chosen: Tensor
+
+
+def sample_of(
+    lit: LitPerson, seen: dict[str, Tensor], backgrounds: Tensor, generator: torch.Generator
+) -> PortraitSample:
+    """Photograph a person before a background; `seen` are the layers of `transport_bank.layers_of`.
+
+    Where `seen` has the visibility of a rig all around as `around`, with directions `around_directions`, the
+    person's own rig need not lie all around.
+    """
+    classes = seen["classes"].float() / 255
+    visible = seen["visible"].float() / 255
+    around = seen["around"].float() / 255 if "around" in seen else visible
+    directions = seen.get("around_directions", lit.rig)
+    images, albedo = _balanced(lit.images, lit.albedo, generator)
+    skin, side = classes[SKIN], classes.shape[-1]
+    scale = MEAN_RADIANCE / _mean_over(albedo, skin)
+    stored = backgrounds[_below(len(backgrounds), generator)]
+    background = 4 * background_of(stored, side, generator) * lit.behind
+    photo = _as_taken(images[0] / _mean_over(images[0], skin) + background, generator)
+    normals = seen["normals"].float()
+    sample = PortraitSample(
+        image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
+        classes=classes,
+        normals=normals,
+        depth=seen["depth"].float(),
+        covered=seen["covered"].float() / 255,
+        reached=reached_by(directions, around, side),
+        own_shading=own_shading(photo, classes, normals, directions, around),
+        lights=lit.rig[lit.chosen],
+        visible=visible[lit.chosen],
+        targets=(images[1:] * scale).clamp(max=_BRIGHTEST),
+        rig=lit.rig,
+        rig_visible=visible,
+        weights=lit.weights,
+        own=images[0] * scale,
+        albedo=albedo * scale,
+        true_normals=normals if lit.normals is None else lit.normals,
+        shares=lit.shares,
+        labelled=torch.tensor(float(lit.normals is not None)),
+    )
+    batched = PortraitSample(*(getattr(sample, field.name)[None] for field in fields(sample)))
+    return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
+
+
+def _balanced(images: Tensor, albedo: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Images [N, 3, S, S] and albedo [3, S, S] in another white balance, some of them grey."""
+    balance = torch.exp(Uniform(generator)(-0.12, 0.12, 3, 1, 1))
+    images, albedo = images * balance, albedo * balance
+    if torch.rand((), generator=generator) < _GREY:
+        images, albedo = (x.mean(-3, keepdim=True).expand_as(x) for x in (images, albedo))
+    return images, albedo
 
 
 def _below(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (), generator=generator))
 
 
-def _source_light(rig: Tensor, generator: torch.Generator) -> Tensor:
+def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:
     """Draw weights [L, 3] of the photo's light."""
     if torch.rand((), generator=generator) >= _LAMP_SHARE:
         return draw_light(rig, generator)

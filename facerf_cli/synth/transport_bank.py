@@ -17,14 +17,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait.person import look_at_person, surface_of
+from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.square import SIDE_PX, SIDES
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
@@ -160,11 +160,10 @@ def _see_shard(backgrounds: Tensor, seed: int, paths: list[Path]) -> None:
 def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Tensor]:
     """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
 
-    classes [C, S, S], covered [1, S, S] and visible [L, s, s] of the view's lights: uint8, of 255; normals
-    [3, S, S], depth [1, S, S]: float16.
+    All is seen in the view's own frame, so that it lies on the view's images; see `layers_of`.
     """
     generator = torch.Generator().manual_seed(seed)
-    portrait = view.portrait
+    portrait, frame = view.portrait, Crop(0.0, 0.0, float(SIDE_PX), SIDE_PX)
     chosen = backgrounds[int(torch.randint(len(backgrounds), (), generator=generator))]
     for _ in range(_TRIES):
         weights = draw_light(portrait.directions, generator)
@@ -173,19 +172,35 @@ def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Ten
         image = image / image.mean().clamp_min(1e-6) * 0.1 + (1 - view.alpha) * background
         exposed = (image / image.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
-            face = find_faces(exposed, "portrait")[0]
-            crop = from_landmarks(face.landmarks_px, _CROP_PX)
-            fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-            person = look_at_person(_builtin(), exposed, fit)
-            normals, depth, covered = surface_of(person.maps)
-            return {
-                "classes": (255 * person.classes).round().byte(),
-                "covered": (255 * covered[0]).byte(),
-                "normals": normals[0].half().contiguous(),
-                "depth": depth[0].half(),
-                "visible": (255 * person.visibility(portrait.directions)).round().byte(),
-            }
+            return layers_of(person_in(exposed, frame), portrait.directions)
     return {}
+
+
+def person_in(photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
+    """Find the largest face of a scene-linear photo [H, W, 3], fit it, and look at the person.
+
+    All is seen in the square around the landmarks, or in a given one. Raises InputError without a face.
+    """
+    face = find_faces(photo, "portrait")[0]
+    crop = from_landmarks(face.landmarks_px, _CROP_PX)
+    fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
+    return look_at_person(_builtin(), photo, fit, square)
+
+
+def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
+    """Return the layers that are kept of a person, and the shadows of lights [L, 3].
+
+    classes [C, S, S], covered [1, S, S] and visible [L, s, s] of the lights: uint8, of 255; normals
+    [3, S, S], depth [1, S, S]: float16.
+    """
+    normals, depth, covered = surface_of(person.maps)
+    return {
+        "classes": (255 * person.classes).round().byte(),
+        "covered": (255 * covered[0]).byte(),
+        "normals": normals[0].half().contiguous(),
+        "depth": depth[0].half(),
+        "visible": (255 * person.visibility(directions)).round().byte(),
+    }
 
 
 @cache

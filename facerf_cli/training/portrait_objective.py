@@ -1,4 +1,4 @@
-"""Stage `portrait`: the Portrait Network, on synthetic people lit by other lights at every step.
+"""Stage `portrait`: the Portrait Network, on people lit by other lights at every step.
 
 Errors of single lights, which sums of lights follow from, and of their contrast; of the photo under its
 light, so that it comes back; and of normals and albedo, which make training on synthetic people hold for
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.portrait_samples import SMALL, PortraitSample, StoredTransport
+from facerf_cli.synth.portrait_samples import SMALL, PortraitSample, PortraitSource
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20216
@@ -53,7 +53,7 @@ class PortraitObjective(Objective):
 
     def __init__(
         self,
-        portraits: StoredTransport,
+        portraits: PortraitSource,
         network: PortraitNetwork | None = None,
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
     ) -> None:
@@ -84,13 +84,14 @@ class PortraitObjective(Objective):
         small = alpha[:, 0], covered[:, 0]
         own_off = (_root(own * scale[:, 0]) - _root(_smaller(batch.own))) * _smaller(small[0]) / small[1]
         albedo_off = (_root(maps.albedo * scale[:, 0]) - _root(batch.albedo)) * small[0] / small[1]
+        labelled = batch.labelled.view(-1, 1, 1, 1)
         turned = 1 - (maps.normals * F.normalize(batch.true_normals, dim=1)).sum(1, keepdim=True)
         return {
             "lights": off.abs().mean(),
             "edges": settings.edges * edges,
             "own": settings.own * own_off.abs().mean(),
-            "albedo": settings.albedo * albedo_off.abs().mean(),
-            "normals": settings.normals * (turned * small[0] / small[1]).mean(),
+            "albedo": settings.albedo * (albedo_off * labelled).abs().mean(),
+            "normals": settings.normals * (turned * labelled * small[0] / small[1]).mean(),
             "contrast": settings.contrast * _contrast_error(found * scale, batch),
             "scale": settings.scale * scale.log().abs().mean(),
         }

@@ -259,6 +259,14 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> N
     assert list(networks) == ["portrait"] and "CC0" in metadata["licence"]
 
 
+def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path) -> None:
+    dataset = write_small_dataset(tmp_path / "dataset", (1, 1, 0), 1, lights=6, crop_px=192)
+    line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--workers", "0"]
+    assert main([*line, "--dataset", str(dataset.folder), "--steps", "1"]) == 0
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert list(networks) == ["portrait"] and metadata["provenance"]["trained_on"] == "dataset, 1 subjects"
+
+
 def test_too_few_people_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "4"]
     assert main(line) == 2

@@ -1,5 +1,6 @@
 """The terms of the stage portrait against known answers."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.portrait_samples import PortraitSample, StoredTransport
+from facerf_cli.synth.portrait_samples import PortraitSample
 from facerf_cli.training.portrait_objective import PortraitObjective, PortraitObjectiveSettings
 
 SIDE, RIG = 16, rig_directions(12)
@@ -68,6 +69,7 @@ def truth() -> PortraitSample:
         albedo=whole(0.4),
         true_normals=whole(NORMAL),
         shares=shares,
+        labelled=torch.ones(1),
     )
 
 
@@ -91,13 +93,12 @@ class Portraits:
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         return [1], [0]
 
-    def draw(self, people: list[int], targets: int, generator: torch.Generator) -> PortraitSample:
+    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
         return truth()
 
 
 def objective(answer: PortraitMaps) -> PortraitObjective:
-    portraits = cast(StoredTransport, Portraits())
-    return PortraitObjective(portraits, cast(PortraitNetwork, Answer(answer)), SETTINGS)
+    return PortraitObjective(Portraits(), cast(PortraitNetwork, Answer(answer)), SETTINGS)
 
 
 def terms(answer: PortraitMaps, sample: PortraitSample | None = None) -> dict[str, float]:
@@ -124,6 +125,14 @@ def test_each_term_sees_its_own_faults(change: dict[str, Tensor], dearer: set[st
     found = terms(perfect()._replace(**change))
     assert min(found[name] for name in dearer) > 3e-3
     assert (found["normals"] > 1e-4) == ("normals" in dearer)  # the others share the forgiven exposure
+
+
+def test_what_nobody_knows_of_real_people_counts_nothing() -> None:
+    wrong = perfect()._replace(
+        albedo=whole(torch.tensor([0.6, 0.4, 0.2])), normals=whole(torch.tensor([0.0, 1, 0]))
+    )
+    found = terms(wrong, replace(truth(), labelled=torch.zeros(1)))
+    assert found["albedo"] == found["normals"] == 0 and found["lights"] > 3e-3
 
 
 def test_exposure_is_forgiven_but_for_its_own_term() -> None:

@@ -14,7 +14,7 @@ from facerf_cli.synth.backgrounds import load_backgrounds
 from facerf_cli.synth.head.makehuman import MAKEHUMAN_LICENCE
 from facerf_cli.synth.portrait_bank import PortraitBankSettings, add_portraits
 from facerf_cli.synth.portrait_crops import StoredPortraits
-from facerf_cli.synth.portrait_samples import StoredTransport
+from facerf_cli.synth.portrait_samples import PortraitSource, StoredTransport
 from facerf_cli.synth.transport_bank import TransportBankSettings, add_proxies, add_transport
 from facerf_cli.training.parsing_objective import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.portrait_objective import PortraitObjective, PortraitObjectiveSettings
@@ -37,10 +37,8 @@ class WholePeople:
 
     @cached_property
     def backgrounds(self) -> Tensor:
-        """Backgrounds of their photos, drawn where they are missing."""
-        self.backgrounds_path.parent.mkdir(parents=True, exist_ok=True)
-        maps, heaps = (1, 4) if self.tiny else (_MAPS, _HEAPS)
-        return load_backgrounds(self.backgrounds_path, maps, heaps, self.seed)
+        """Backgrounds of their photos."""
+        return drawn_backgrounds(self.backgrounds_path, self.seed, self.tiny)
 
     def provenance(self) -> dict[str, Any]:
         """Origin and licence of the people."""
@@ -50,6 +48,13 @@ class WholePeople:
             "heads": f"synthetic people drawn from {' and '.join(model.credit for model in drawn)}",
             "licence": "; ".join(["MIT", *shapes, MAKEHUMAN_LICENCE]),
         }
+
+
+def drawn_backgrounds(path: Path, seed: int, tiny: bool) -> Tensor:
+    """Backgrounds of photos, drawn where their file is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    maps, heaps = (1, 4) if tiny else (_MAPS, _HEAPS)
+    return load_backgrounds(path, maps, heaps, seed)
 
 
 def parsing_objective(people: WholePeople, folder: Path, network: Any) -> ParsingObjective:
@@ -63,13 +68,16 @@ def parsing_objective(people: WholePeople, folder: Path, network: Any) -> Parsin
     return ParsingObjective(stored, network or ParsingNetwork(own), objective)
 
 
-def portrait_objective(people: WholePeople, folder: Path, network: Any) -> PortraitObjective:
-    """The stage portrait; portraits and proxies that are missing in `folder` are baked first."""
-    provenance = people.provenance()
+def stored_transport(people: WholePeople, folder: Path) -> StoredTransport:
+    """Synthetic people of the stage portrait; those that are missing in `folder` are baked and seen first."""
     settings = TransportBankSettings(views=1, looks=1, lights=12) if people.tiny else TransportBankSettings()
     add_transport(folder, people.models, people.indices, people.jobs, people.seed, settings)
     add_proxies(folder, people.backgrounds, people.jobs, people.seed)
-    stored = StoredTransport(folder, people.backgrounds, provenance)
-    own = PortraitSettings(_TINY_WIDTHS, _TINY_BLOCKS) if people.tiny else PortraitSettings()
-    objective = PortraitObjectiveSettings(held_out_people=people.held_out, targets=2 if people.tiny else 4)
-    return PortraitObjective(stored, network or PortraitNetwork(own), objective)
+    return StoredTransport(folder, people.backgrounds, people.provenance())
+
+
+def portrait_objective(source: PortraitSource, held_out: int, tiny: bool, network: Any) -> PortraitObjective:
+    """The stage portrait on people of a source, of whom at most `held_out` are held out."""
+    own = PortraitSettings(_TINY_WIDTHS, _TINY_BLOCKS) if tiny else PortraitSettings()
+    settings = PortraitObjectiveSettings(held_out_people=held_out, targets=2 if tiny else 4)
+    return PortraitObjective(source, network or PortraitNetwork(own), settings)

@@ -9,13 +9,20 @@ import torch
 from torch import nn
 
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
-from facerf_cli.cli.items.train_people import WholePeople, parsing_objective, portrait_objective
+from facerf_cli.cli.items.train_people import (
+    WholePeople,
+    drawn_backgrounds,
+    parsing_objective,
+    portrait_objective,
+    stored_transport,
+)
 from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.train import TrainOptions
 from facerf_cli.dataset.crops import mean_translation_m
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.photos import Photos, open_photos
+from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.samples import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
@@ -32,6 +39,7 @@ from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
 from facerf_cli.synth.face_crops import RenderedFaces
 from facerf_cli.synth.head_images import add_head_images
 from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
+from facerf_cli.synth.portrait_samples import PortraitSource
 from facerf_cli.synth.texture_samples import SampleSource
 from facerf_cli.training.appearance_objective import AppearanceObjective
 from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
@@ -193,8 +201,15 @@ def _parsing(options: TrainOptions, networks: Networks) -> Objective:
 
 
 def _portrait(options: TrainOptions, networks: Networks) -> Objective:
-    people = _whole_people(options)
-    return portrait_objective(people, _bank_folder(options) / "transport", networks.get("portrait"))
+    tiny, held_out = options.preset == "tiny", _sizes(options).held_out_heads
+    source: PortraitSource
+    if options.dataset:
+        path = options.output / "backgrounds.safetensors"
+        backgrounds = drawn_backgrounds(path, options.settings.seed, tiny)
+        source = open_dataset_portraits(options.dataset, backgrounds, options.jobs)
+    else:
+        source = stored_transport(_whole_people(options), _bank_folder(options) / "transport")
+    return portrait_objective(source, held_out, tiny, networks.get("portrait"))
 
 
 def _whole_people(options: TrainOptions) -> WholePeople:

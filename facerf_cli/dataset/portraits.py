@@ -1,0 +1,168 @@
+"""Portraits of a prepared dataset, which the stage portrait trains on in place of synthetic people.
+
+    portraits-192/SUBJECT/CAMERA.safetensors   OLATs of a stack and what is seen in it; empty without a face
+
+A view is treated as a user's photo of its crop would be: the person is found, fitted and segmented in the
+fully lit image, and all of it is kept in the square that the Portrait Network sees. Nobody knows the albedo,
+normals and classes of real people: the fully lit image stands for the albedo, what is seen for the classes.
+"""
+
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.samples import provenance_of
+from facerf_cli.dataset.textures import is_made_from, stamp
+from facerf_cli.errors import InputError
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.images import HALF_MAX
+from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.portrait.square import SIDE_PX
+from facerf_cli.synth.portrait_samples import LitPerson, PortraitSample, sample_of, source_light
+from facerf_cli.synth.texture_samples import draw_target_lights
+from facerf_cli.synth.threads import one_thread
+from facerf_cli.synth.transport_bank import layers_of, person_in
+from facerf_cli.workers import in_shards
+
+_AROUND = 48  # lights of the rig all around whose shadows are summarised, as of photos
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetPortraits:
+    """A prepared dataset and its portraits, a `PortraitSource`; its people are indices of `views`."""
+
+    dataset: Dataset
+    views: list[list[Path]]  # of each person in the split train or validation, those that show a face
+    training: int  # the first people, which are those of the split train
+    backgrounds: Tensor
+    provenance: dict[str, Any]
+
+    def people(self, held_out: int) -> tuple[list[int], list[int]]:
+        """Indices of the people of the split train, and of at most `held_out` of the split validation."""
+        everyone = list(range(len(self.views)))
+        return everyone[: self.training], everyone[self.training :][:held_out]
+
+    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
+        """Draw one sample [1, ...] of one of some people, with `targets` lights."""
+        views = self.views[people[int(torch.randint(len(people), (), generator=generator))]]
+        seen = load_file(views[int(torch.randint(len(views), (), generator=generator))])
+        rig, olats, classes = seen["directions"], seen["olats"], seen["classes"].float() / 255
+        weights = source_light(rig, generator)
+        chosen = draw_target_lights(rig, targets, generator)
+        photo = torch.einsum("lc,lcij->cij", weights, olats.float())
+        lacking = len(self.dataset.light_ids) - len(rig)  # of this person; a batch has one number of lights
+        lit = LitPerson(
+            images=torch.cat([photo[None], olats[chosen].float()]),
+            albedo=seen["lit"].float(),
+            normals=None,
+            shares=classes,
+            behind=classes[0] * seen["inside"],
+            rig=torch.cat([rig, rig[:1].expand(lacking, -1)]),
+            weights=F.pad(weights, (0, 0, 0, lacking)),
+            chosen=chosen,
+        )
+        seen["visible"] = F.pad(seen["visible"], (0, 0, 0, 0, 0, lacking))
+        return sample_of(lit, seen, self.backgrounds, generator)
+
+
+def open_dataset_portraits(folder: Path, backgrounds: Tensor, jobs: int) -> DatasetPortraits:
+    """Open the dataset in a folder, and make missing portraits of its splits train and validation.
+
+    Raises InputError where a split has nobody whose face is found.
+    """
+    dataset = read_dataset(folder)
+    _make_missing(dataset, jobs)
+    views = {split: _views_of(dataset, split) for split in ("train", "validation")}
+    for split, found in views.items():
+        if not found:
+            raise InputError(
+                f"{folder}: no face was found in the split {split}; run prepare-dataset with another --split"
+            )
+    provenance = provenance_of(dataset, load_face_model(dataset.face_model))
+    everyone = [*views["train"], *views["validation"]]
+    return DatasetPortraits(dataset, everyone, len(views["train"]), backgrounds, provenance)
+
+
+def _views_of(dataset: Dataset, split: str) -> list[list[Path]]:
+    """Portraits of each person of a split, of those who have some."""
+    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in dataset.splits[split]]
+    shown = [[path for path in views if _shows_a_face(path)] for views in paths]
+    return [views for views in shown if views]
+
+
+def _shows_a_face(path: Path) -> bool:
+    with safe_open(path, framework="pt") as file:
+        return bool(file.keys())
+
+
+def _of(dataset: Dataset, subjects: Sequence[str]) -> list[tuple[str, str]]:
+    return [(subject, camera) for subject in subjects for camera in dataset.cameras[subject]]
+
+
+def _path(dataset: Dataset, subject: str, camera: str) -> Path:
+    return dataset.folder / f"portraits-{SIDE_PX}" / subject / f"{camera}.safetensors"
+
+
+def _make_missing(dataset: Dataset, jobs: int) -> None:
+    views = _of(dataset, [*dataset.splits["train"], *dataset.splits["validation"]])
+    missing = [view for view in views if not is_made_from(dataset, *view, _path(dataset, *view))]
+    if missing:
+        folder = dataset.folder / f"portraits-{SIDE_PX}"
+        log.info("%s: looking at the people of %d stacks (done once)", folder, len(missing))
+        in_shards(partial(_make_shard, dataset), missing, jobs)
+
+
+def _make_shard(dataset: Dataset, views: list[tuple[str, str]]) -> None:
+    with one_thread():
+        for view in views:
+            tensors: dict[str, Tensor] = {}
+            with suppress(InputError):
+                tensors = _portrait_of(dataset.stack_path(*view))
+            with atomic_path(_path(dataset, *view)) as temporary:
+                save_file(tensors, temporary, {"of": stamp(dataset, *view)})
+
+
+@torch.no_grad()
+def _portrait_of(stack: Path) -> dict[str, Tensor]:
+    """Look at the person of a stack; raises InputError where no face is found.
+
+    olats [L, 3, S, S], lit [3, S, S] and inside [S, S], where the crop lies: float16; directions [L, 3];
+    around uint8 [48, s, s], the visibility of `around_directions`; the layers of `layers_of`.
+    """
+    header = read_olat_header(stack)
+    directions, around = torch.from_numpy(header.directions).float(), rig_directions(_AROUND)
+    person = person_in(header.source)
+    squared = [
+        _in_square(person.square.apply(olat.permute(1, 2, 0).float().numpy())) for olat in read_olats(stack)
+    ]
+    layers = layers_of(person, torch.cat([directions, around]))
+    visible = layers.pop("visible")
+    return {
+        **layers,
+        "visible": visible[:-_AROUND].contiguous(),
+        "around": visible[-_AROUND:].contiguous(),
+        "around_directions": around,
+        "olats": torch.stack(squared),
+        "lit": _in_square(person.square.apply(header.source)),
+        "inside": torch.from_numpy(person.square.valid(*header.source.shape[:2])).half(),
+        "directions": directions,
+    }
+
+
+def _in_square(image: Any) -> Tensor:
+    return torch.from_numpy(image).permute(2, 0, 1).clamp(0, HALF_MAX).half().contiguous()
