@@ -23,9 +23,9 @@ Settings = TypeVar("Settings")
 
 
 def settings_from(kind: type[Settings], metadata: Mapping[str, Any]) -> Settings:
-    """Make the dataclass of a network's settings from its metadata; raises ValueError where that is none."""
+    """Make the dataclass of a network's settings from its metadata; raises TypeError or ValueError."""
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
     given = {name: value for name, value in metadata.items() if name != "form" or name in known}
     if unknown := sorted(given.keys() - known):
-        raise ValueError(f"a network of this form has no {', '.join(unknown)}")
+        raise TypeError(f"a network of this form has no {', '.join(unknown)}")
     return TypeAdapter(kind).validate_json(json.dumps(given), strict=True)  # strict JSON has lists for tuples

@@ -20,7 +20,21 @@ DESCRIBED: dict[str, dict[str, Any]] = {
     "diffuse_sh": DiffuseNetwork().as_metadata(),
 }
 REFUSED = r"do not fit this version's network|is not a finite number|too large"
-NONSENSE = [[], [0], [[1]], [1e400], -1, 1e30, 10**30, float("inf"), float("nan"), "x", None, {"a": 1}]
+NONSENSE = [
+    [],
+    [8] * 5000,
+    [0],
+    [[1]],
+    [1e400],
+    -1,
+    1e30,
+    10**30,
+    float("inf"),
+    float("nan"),
+    "x",
+    None,
+    {"a": 1},
+]
 
 
 @pytest.mark.parametrize(("name", "key"), [(name, key) for name in DESCRIBED for key in DESCRIBED[name]])

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -52,6 +51,7 @@ from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
 log = logging.getLogger(LOGGER_NAME)
+_of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
 Written = dict[Path, float]  # the EXR of each image, and the exposure of the PNG in its place
 
@@ -111,19 +111,21 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
     """The exposures of an item's group; None where it has none, or is the first of it."""
     leader = work.leader_of(item)
-    return None if leader is None or leader == item else _exposures_of(leader, work)
+    if leader is None or leader == item:
+        return None
+    if (leader, work) not in _of_leaders:  # another process has written it, or an earlier run
+        _of_leaders[leader, work] = _exposures_of(leader, work)
+    return _of_leaders[leader, work]
 
 
-@cache
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of the first photo or stack of a group, which the others share; found once a process."""
+    """Exposures of the first photo or stack of a group."""
     if _is_stack(leader):
         shown = _show_stack(leader, work)[0]
     else:
         image = read_photo(leader, work.photo)
         shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
-    parts = _parts(shown, work)
-    return _exposures_ev(parts, shown.relit, shown.composer, work)
+    return _exposures_ev(_parts(shown, work), shown.relit, shown.composer, work)
 
 
 def _together(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _Shown:
@@ -307,6 +309,8 @@ def _write_setups(
         return shown.relit(part) if whole is None else whole
 
     exposures_ev = chosen_ev or _exposures_ev(parts, relit_by_part, shown.composer, work)
+    if work.leader_of(item) == item:
+        _of_leaders[item, work] = dict(exposures_ev)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
