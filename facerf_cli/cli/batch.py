@@ -131,6 +131,7 @@ def run_items(
     if todo and prepare:
         prepare()
     if options.dry_run:
+        _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
     is_new = not options.output.exists()
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
@@ -268,12 +269,15 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
 
 def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:
     """Log how many items are finished, and how many are made again for each reason."""
-    counts = Counter(reasons.values())
-    if finished := counts.pop(None, 0):
+    if finished := sum(reason is None for reason in reasons.values()):
         advice = "" if options.overwrite == "never" else " from the same inputs and options"
         log.info("%d of %d already finished%s", finished, len(reasons), advice)
-    counts.pop("", None)
-    for reason, count in sorted(counts.items(), key=str):
+    _say_what_is_made_again(reasons)
+
+
+def _say_what_is_made_again(reasons: Mapping[Item, str | None]) -> None:
+    counts = Counter(filter(None, reasons.values()))
+    for reason, count in sorted(counts.items()):
         log.info("%d made again: %s", count, reason)
 
 

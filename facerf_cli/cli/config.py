@@ -99,7 +99,7 @@ def config(
     for parameter in _options(command):
         if parameter.name in given:
             print(f"{parameter.opts[0]} = {_shown(given[parameter.name])}  ({source})")
-        elif parameter.name != "help":
+        elif parameter.name != "help" and not parameter.required:
             defaults.append(f"# {parameter.opts[0]} = {_shown(parameter.get_default(context))}")
     print("\n".join(["# not set, and so by default:", *defaults]))
 

@@ -59,6 +59,8 @@ def test_other_options_make_all_again_and_say_which(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     run([photos], tmp_path / "out", recipe={"lights": 150})
+    run([photos], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
+    assert "2 made again: --lights is 200, was 150" in capsys.readouterr().err
     run([photos], tmp_path / "out", recipe={"lights": 300})
     assert "2 made again: --lights is 300, was 150" in capsys.readouterr().err
 
