@@ -1,6 +1,6 @@
 """The neural reflectance field of one face: its texture under any single light, and any sum of lights."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -85,14 +85,34 @@ class OwnLight:
     quotient: Quotient
 
 
-def own_light(models: Models, face: FaceTexture) -> OwnLight:
-    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it."""
+def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> OwnLight:
+    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
+
+    A light that is `held` over the frames of a shot, by `light_of_frames`, is not estimated again.
+    """
+    small, olats = _coarse_olats(models, face)
+    light = _estimated([small], [olats]) if held is None else held
+    quotient = Quotient.of(small.texture, weighted_sum([olats], light.weights[None])[0], small.visible)
+    return OwnLight(light, quotient)
+
+
+def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
+    """Estimate one light, on small textures, from several frames of a shot together."""
+    pairs = [_coarse_olats(models, face) for face in faces]
+    return _estimated([small for small, _ in pairs], [olats for _, olats in pairs])
+
+
+def _coarse_olats(models: Models, face: FaceTexture) -> tuple[FaceTexture, Tensor]:
     small = shrunk(face)
-    olats = torch.cat(list(Field(models, small).olats(_coarse_rig())))
-    seen = small.visible > _SEEN_WELL
-    weights = estimate_weights(olats[..., seen], small.texture[:, seen])
-    quotient = Quotient.of(small.texture, weighted_sum([olats], weights[None])[0], small.visible)
-    return OwnLight(RigLight(_coarse_rig(), weights), quotient)
+    return small, torch.cat(list(Field(models, small).olats(_coarse_rig())))
+
+
+def _estimated(faces: Sequence[FaceTexture], olats: Sequence[Tensor]) -> RigLight:
+    """The light over the coarse rig that explains what faces show well."""
+    seen = [face.visible > _SEEN_WELL for face in faces]
+    lit = torch.cat([one[..., mask] for one, mask in zip(olats, seen, strict=True)], -1)
+    photos = torch.cat([face.texture[:, mask] for face, mask in zip(faces, seen, strict=True)], -1)
+    return RigLight(_coarse_rig(), estimate_weights(lit, photos))
 
 
 def photo_quotient(models: Models, face: FaceTexture) -> Quotient:

@@ -25,6 +25,7 @@ _CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/composit
 # Shared by the log and the progress bars, so that they do not overwrite each other.
 STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
+_LONGEST_LINE = 2000  # characters of a message; those of damaged files may be of any length
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,18 @@ def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "") -> dict[st
 def json_line(row: Mapping[str, Any]) -> str:
     """Format a row as one line of strict JSON: paths as text, numpy as numbers, NaN and infinity as null.
 
-    Bytes of a file's name that are not UTF-8 are escaped, so that the line can be written.
+    Bytes of a file's name that are not UTF-8 are escaped, so that the line can be written; and what is not
+    printable, so that a terminal does not obey it and no other program sees two lines.
     """
     text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
-    return text.encode(errors="backslashreplace").decode()
+    return "".join(map(_json_escape, text) if not text.isprintable() else text)
+
+
+def _json_escape(letter: str) -> str:
+    """JSON's escape of a character that is not printable."""
+    if letter.isprintable():
+        return letter
+    return "\\u007f" if letter == "\x7f" else json.dumps(letter)[1:-1]
 
 
 def _plain(value: Any) -> Any:
@@ -94,8 +103,11 @@ class LineFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Format the record as text."""
         prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
-        text = prefix + one_line(record.getMessage())
-        return f"{text}\n{self.formatException(record.exc_info)}" if record.exc_info else text
+        text = prefix + shown(record.getMessage())
+        if not record.exc_info:
+            return text
+        trace = self.formatException(record.exc_info).split("\n")
+        return "\n".join([text, *map(escaped, trace)])
 
 
 class JsonFormatter(logging.Formatter):
@@ -106,7 +118,7 @@ class JsonFormatter(logging.Formatter):
         row = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
-            "message": one_line(record.getMessage()),
+            "message": shown(record.getMessage()),
         }
         if record.exc_info:
             row["traceback"] = self.formatException(record.exc_info)
@@ -152,6 +164,22 @@ def unexpected(error: Exception) -> str:
 def one_line(text: str) -> str:
     """The text with line breaks and runs of spaces replaced by single spaces."""
     return " ".join(text.split())
+
+
+def escaped(text: str) -> str:
+    r"""The text with characters that are not printable as `\x1b` or `\u2028`.
+
+    They come from names and metadata: a terminal would obey some, and others hide or turn what follows.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def shown(text: str) -> str:
+    """The text as one printable line of limited length, for a log or a report."""
+    line = escaped(one_line(text[: 4 * _LONGEST_LINE]))
+    return line if len(line) <= _LONGEST_LINE else line[: _LONGEST_LINE - 3] + "..."
 
 
 def counted(number: int, thing: str) -> str:

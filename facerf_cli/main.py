@@ -6,6 +6,7 @@ needs every verb's signature before it parses the line, so this module imports a
 the work of a verb is in `cli/items/`, behind a deferred import. A test checks it.
 """
 
+import io
 import logging
 import os
 import signal
@@ -36,6 +37,7 @@ from facerf_cli.cli.train import train
 from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
+from facerf_cli.stopping import end_on_signals
 
 _PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
 # The verbs by panel of the help, in the order of a user's day.
@@ -57,6 +59,7 @@ VALUED = frozenset({"--device", "--checkpoint", "--seed", "--config"})
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
+_PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(
     name="facerf",
@@ -133,7 +136,10 @@ for _verbs_of in (app, *(group for group, _ in GROUPS.values())):
 
 def run() -> None:
     """Run the `facerf` script."""
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds: temporary files are removed
+    end_on_signals(_PATIENCE_S)
+    for stream in (sys.stdout, sys.stderr):  # names go out as the bytes that they are
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="surrogateescape")
     sys.exit(main(sys.argv[1:]))
 
 

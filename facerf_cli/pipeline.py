@@ -36,7 +36,7 @@ from facerf_cli.field import (
     shrunk,
     weighted_sums,
 )
-from facerf_cli.light.estimate import LightEvidence, RefinedLight, refine_light
+from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import NearLights
 from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
@@ -45,8 +45,9 @@ from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
 from facerf_cli.portrait.occluders import uncovered
+from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.portrait_field import PortraitField, SteadyFrame, maps_of
 from facerf_cli.whole_person import WholePerson
 
 
@@ -128,8 +129,11 @@ def reflectance_of(
     network_alone: bool = False,
     memory_bytes: int = MEMORY_BYTES,
     photo: np.ndarray | None = None,
+    steady: SteadyFrame | None = None,
 ) -> Reflectance:
     """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
+
+    A frame of a shot comes with what is steadied by the frames around it.
 
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
     with `network_alone` they are not. The models that the paper compares with have no such correction.
@@ -138,11 +142,14 @@ def reflectance_of(
         return explain(models, head, kind).reflectance
     if kind == "portrait" and photo is None:
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
-    own = None if network_alone else own_light(models, head.face)
+    own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
     field = Field(models, head.face, own.quotient if own else None, memory_bytes)
     if photo is None or kind == "field":
         return field
-    return PortraitField.of(models.face, photo, head, field, own)
+    if steady and steady.portrait:
+        return PortraitField.of(models.face, head, field, own, *steady.portrait)
+    person = look_at_person(models.face, photo, head.fit)
+    return PortraitField.of(models.face, head, field, own, person, maps_of(person))
 
 
 def composition_of(
@@ -235,8 +242,11 @@ def estimate_light(
     rig: Tensor | None = None,
     estimator: Estimator = DEFAULT_ESTIMATOR,
     keep_eyes: bool = False,
+    more: Sequence[Head] = (),
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
+
+    Of a shot the heads of `more` frames take part in the field's least squares.
 
     The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
@@ -248,9 +258,13 @@ def estimate_light(
         small = resize(texture, evidence.photo.shape[-1])[0]
         return LightEstimate(explained.light, evidence, small)
     rig = rig_directions() if rig is None else rig
-    olats = torch.cat(list(Field(models, shrunk(head.face)).olats(rig)))
-    evidence = replace(evidence, directions=rig, olats=olats)
-    weights, features = evidence.least_squares(estimator.non_negative), estimator.features
+    heads = [(head, evidence), *((one, photo_evidence(one.face, keep_eyes)) for one in more)]
+    frames = [
+        replace(seen, directions=rig, olats=torch.cat(list(Field(models, shrunk(one.face)).olats(rig))))
+        for one, seen in heads
+    ]
+    evidence, features = frames[0], estimator.features
+    weights = joined(frames).least_squares(estimator.non_negative)
     if features is None:
         return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training

@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -23,14 +22,15 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
 from facerf_cli.field import Field, OwnLight
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
-from facerf_cli.portrait.person import SeenPerson, look_at_person
+from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
+from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 
@@ -62,6 +62,18 @@ class PortraitLight:
         return torch.cat([self.shading, self.highlights, self.reached], 1)
 
 
+@dataclass(frozen=True, eq=False)
+class SteadyFrame:
+    """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot.
+
+    `portrait` is for the portrait field alone: the person as it sees them, and their maps.
+    """
+
+    light: RigLight
+    segmentation: Segmentation
+    portrait: tuple[SeenPerson, PortraitMaps] | None = None
+
+
 class _Some(NamedTuple):
     """Some lights: maps [l, S, S] and weights [M, l, 3]; `sent` is what would arrive without shadows."""
 
@@ -86,12 +98,14 @@ class PortraitField:
     @staticmethod
     @torch.no_grad()
     def of(
-        model: MorphableModel, photo: np.ndarray, head: Head, field: Field, own: OwnLight | None
+        model: MorphableModel,
+        head: Head,
+        field: Field,
+        own: OwnLight | None,
+        person: SeenPerson,
+        maps: PortraitMaps,
     ) -> "PortraitField":
-        """Look at the person in a scene-linear photo [H, W, 3]; `own` is the photo's estimated light."""
-        person = look_at_person(model, photo, head.fit)
-        rig = rig_directions(_SUMMARY_LIGHTS)
-        maps = _steadied(portrait_network()(person.inputs(rig, person.visibility(rig))), person)
+        """The field of a person with its maps; `own` is the photo's estimated light."""
         found = PortraitField(person, maps, person.exposure, field, _texels_in_square(model, head, person))
         return found if own is None else found._corrected(own)
 
@@ -180,6 +194,13 @@ class PortraitField:
         albedo = texture * sampled(self.maps.gain) + sampled(self.maps.bias)
         own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * self.exposure
         return torch.lerp(textures, own, _SHARE)
+
+
+@torch.no_grad()
+def maps_of(person: SeenPerson) -> PortraitMaps:
+    """The light transport of a person, as the Portrait Network sees it."""
+    rig = rig_directions(_SUMMARY_LIGHTS)
+    return _steadied(portrait_network()(person.inputs(rig, person.visibility(rig))), person)
 
 
 def _steadied(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:

@@ -6,7 +6,6 @@ A process that is killed costs its own item; in joblib's and the standard librar
 import logging
 import os
 import signal
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
@@ -16,10 +15,11 @@ from typing import Any, TypeVar
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.logs import LOGGER_NAME, log_to_queue
+from facerf_cli.stopping import end_on_signals
 
 T = TypeVar("T")
 R = TypeVar("R")
-_PATIENCE_S = 10  # for a worker to end after SIGTERM
+_PATIENCE_S = 1.0  # for a worker to unwind after SIGTERM
 
 
 @dataclass
@@ -28,23 +28,31 @@ class _Worker:
 
     process: Any
     pipe: Any
+    row: deque[int]  # numbers of the items that it takes next
     number: int | None = None  # of the item that it processes
     started: bool = False
 
 
 def in_processes(
-    work: Callable[[T], R], items: Sequence[T], jobs: int, broken: Callable[[T, Exception], R]
+    work: Callable[[T], R],
+    items: Sequence[T],
+    jobs: int,
+    broken: Callable[[T, Exception], R],
+    in_a_row: int = 1,
 ) -> Generator[tuple[int, R]]:
     """Yield results as they come; a process that dies costs its own item, and another one replaces it.
+
+    A process takes so many neighbouring items `in_a_row`, one after the other.
 
     Each process has its own pipe: a lock or a queue that processes share could stay locked by a killed one.
     """
     from multiprocessing.connection import wait  # --help does without it
 
-    waiting = deque(range(len(items)))
+    numbers = range(len(items))
+    waiting = deque(deque(numbers[first : first + in_a_row]) for first in numbers[::in_a_row])
     workers: dict[Any, _Worker] = {}
     try:
-        for _ in range(min(jobs, len(items))):
+        for _ in range(min(jobs, len(waiting))):
             _start_worker(workers, jobs)
         while workers:
             for pipe in wait(list(workers)):
@@ -57,6 +65,8 @@ def in_processes(
                     raise content
                 elif kind == "died":
                     del workers[pipe]
+                    if worker.row:
+                        waiting.appendleft(worker.row)
                     if number is not None:
                         if waiting:
                             _start_worker(workers, jobs)
@@ -80,7 +90,7 @@ def _start_worker(workers: dict[Any, _Worker], jobs: int) -> None:
     process = spawn.Process(target=_serve, args=(theirs, level, threads))
     process.start()
     theirs.close()  # so that the worker holds the only other end, and its death closes the pipe
-    workers[ours] = _Worker(process, ours)
+    workers[ours] = _Worker(process, ours, deque())
 
 
 def _receive(worker: _Worker) -> tuple[str, Any]:
@@ -103,13 +113,17 @@ def _cause_of_death(worker: _Worker) -> str:
     return f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
 
 
-def _send_next(worker: _Worker, work: Callable[[T], R], items: Sequence[T], waiting: deque[int]) -> None:
+def _send_next(
+    worker: _Worker, work: Callable[[T], R], items: Sequence[T], waiting: deque[deque[int]]
+) -> None:
     """Send a worker the next item, or None at the end."""
     with suppress(BrokenPipeError, ConnectionResetError):  # it died; `_receive` notices
         if not worker.started:
             worker.pipe.send(work)
             worker.started = True
-        worker.number = waiting.popleft() if waiting else None
+        if not worker.row and waiting:
+            worker.row = waiting.popleft()
+        worker.number = worker.row.popleft() if worker.row else None
         worker.pipe.send(None if worker.number is None else (items[worker.number],))
 
 
@@ -118,7 +132,7 @@ def _end_workers(workers: Sequence[_Worker]) -> None:
     for worker in workers:
         worker.process.terminate()
     for worker in workers:
-        worker.process.join(_PATIENCE_S)
+        worker.process.join(1.5 * _PATIENCE_S)
         worker.process.kill()
         worker.process.join()
         worker.pipe.close()
@@ -127,8 +141,10 @@ def _end_workers(workers: Sequence[_Worker]) -> None:
 def _serve(pipe: Any, level: int, threads: int) -> None:
     """Run a worker process: a result for each item, until None. Imports torch only after this call."""
     os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # unwinds: temporary files are removed
+    for number in ("SIGINT", "SIGHUP"):  # a terminal sends them to all; our parent ends us
+        if hasattr(signal, number):
+            signal.signal(getattr(signal, number), signal.SIG_IGN)
+    end_on_signals(_PATIENCE_S, interrupts=False)
     wire = _Wire(pipe)
     log_to_queue(wire, level)
     with suppress(EOFError, BrokenPipeError):  # the parent has ended
@@ -166,6 +182,7 @@ class Workers:
     jobs: int = 1
     ray: str | None = None  # address; None: this machine, without Ray
     gpus: int = 0
+    in_a_row: int = 1  # neighbouring items that a process of this machine takes one after the other
 
 
 def spread(
@@ -184,7 +201,7 @@ def spread(
 
         yield from in_order(in_ray(work, items, workers.ray, workers.jobs, workers.gpus, broken))
     elif workers.jobs > 1 and len(items) > 1:
-        yield from in_order(in_processes(work, items, workers.jobs, broken))
+        yield from in_order(in_processes(work, items, workers.jobs, broken, workers.in_a_row))
     else:
         yield from map(work, items)
 

@@ -12,7 +12,7 @@ LEVELS = (
     ("cli",),
     ("evaluation", "training", "api"),
     ("dataset",),
-    ("synth", "capture", "viewer"),
+    ("synth", "capture", "viewer", "film"),
     ("pipeline",),
     (
         "field",
@@ -27,7 +27,7 @@ LEVELS = (
     ("models", "portrait"),
     ("network", "face"),
     ("raster", "light", "files", "metrics"),
-    ("workers", "ray_workers", "colour", "ocio", "logs", "errors"),
+    ("workers", "ray_workers", "colour", "ocio", "logs", "stopping", "errors"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 STRANGERS = (("network", "face"), ("raster", "light"))  # what one needs of the other is handed in

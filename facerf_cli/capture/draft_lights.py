@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.regular import require_regular
 
 LIST_SUFFIX, LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
 _LIMIT_BYTES = 4 << 20
@@ -23,6 +24,7 @@ ListedLight = tuple[str, Direction]  # name of an image, empty in a list without
 
 def read_light_list(path: Path) -> list[ListedLight]:
     """Read a list of lights; InputError names the first wrong line."""
+    require_regular(path)
     try:
         with path.open("rb") as stream:
             content = stream.read(_LIMIT_BYTES + 1)

@@ -7,25 +7,28 @@ ends it.
 """
 
 import logging
+import os
 import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.cli.naming import OF_FILES, NamePattern
+from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.atomic import atomic_path, sweep_leftovers
+from facerf_cli.files.folder_lock import alone_in
 from facerf_cli.files.json_reader import parse_json
-from facerf_cli.logs import LOGGER_NAME, STDERR, json_line, one_line, unexpected
+from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
 from facerf_cli.workers import process_died, spread
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
@@ -40,6 +43,8 @@ class BatchOptions:
     overwrite: Overwrite = "changed"
     dry_run: bool = False
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
+    in_a_row: int = 1  # neighbouring items that one of the processes takes
+    print_outputs: bool = True  # on stdout; not those that are to be joined
 
 
 @dataclass(frozen=True)
@@ -76,8 +81,7 @@ def run_batch(
     name: str | None = None,
 ) -> int:
     """Process the files that `inputs` name: `run_files` over `collect_items`, with the pattern of --name."""
-    pattern = NamePattern.parse(name, "--name", OF_FILES) if name else None
-    items = collect_items(inputs, options.output, suffixes, pattern, settings.null_separated)
+    items = collect_items(inputs, options.output, suffixes, file_pattern(name), settings.null_separated)
     return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
 
 
@@ -94,7 +98,7 @@ def run_files(
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
     code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of, index)
-    missing = [item for item in items if options.dry_run and not item.input_path.exists()]
+    missing = [item for item in items if options.dry_run and not os.path.exists(item.input_path)]
     for item in missing:
         log.error("%s: no such file; check the path", item.input_path)
     return max(code, int(bool(missing)))
@@ -122,18 +126,45 @@ def run_items(
     used.
     """
     items = settings.shard.share(items)
-    if index is None and recipes_of:
-        index = FolderIndex(options.output, verb, settings.shard, recipes_of)
-    states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
+    with ExitStack() as stack:
+        is_new = not options.output.exists()
+        if not options.dry_run:
+            try:
+                stack.enter_context(alone_in(options.output, _lock_name(settings.shard)))
+            except OSError as error:
+                raise _unusable(options.output, error) from error
+        batch = _Batch(verb, items, process, outputs_of, options, settings)
+        if index is None and recipes_of:
+            index = FolderIndex(options.output, verb, settings.shard, recipes_of)
+        return _run_alone(batch, is_new, prepare, index)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """This process's share of a run: the arguments of `run_items`."""
+
+    verb: str
+    items: Sequence[Item]
+    process: Callable[[Item], Outcome]
+    outputs_of: Callable[[Item], Sequence[Path]]
+    options: BatchOptions
+    settings: Settings
+
+
+def _run_alone(
+    batch: _Batch, is_new: bool, prepare: Callable[[], object] | None, index: FolderIndex | None
+) -> int:
+    """Run the share while no other process writes to the folder; `is_new`: it did not exist before."""
+    verb, outputs_of, options, settings = batch.verb, batch.outputs_of, batch.options, batch.settings
+    states = {item: _why_again(item, outputs_of(item), options, index) for item in batch.items}
     reasons = {item: reason for item, (reason, _) in states.items()}
-    todo = [replace(item, stale=states[item][1]) for item in items if reasons[item] is not None]
-    finished = [item for item in items if reasons[item] is None]
+    todo = [replace(item, stale=states[item][1]) for item in batch.items if reasons[item] is not None]
+    finished = [item for item in batch.items if reasons[item] is None]
     if todo and prepare:
         prepare()
     if options.dry_run:
         _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
-    is_new = not options.output.exists()
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if index:
         index.open()
@@ -141,22 +172,35 @@ def run_items(
     if index and index.edited:
         kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
         log.warning(kept, len(index.edited))
-    failures = 0
-    workers = workers_of(settings, options.jobs)
-    with closing(spread(_Work(process, index is not None), todo, workers, _broken)) as results:
-        for result in _with_progress(results, len(todo), verb, settings):
-            if result.stops_the_run is not None:
-                raise result.stops_the_run
-            if index and result.made:
-                index.add(result.made, outputs_of(result.item))
-            with report.open("a", encoding="utf-8") as stream:
-                stream.write(json_line(_report_row(verb, result, options.output)) + "\n")
-            failures += _print_result(result)
-    if failures and len(items) > 1:
-        log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
+    failures = _process(batch, todo, report, index)
+    if failures and len(batch.items) > 1:
+        log.error("%d of %d failed; %s has a row for each", failures, len(batch.items), report)
     elif failures and is_new:
-        _remove_what_is_empty(options.output, [report, *([index.path] if index else [])])
+        lock = options.output / _lock_name(settings.shard)
+        _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
     return 1 if failures else 0
+
+
+def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderIndex | None) -> int:
+    """Process the items that are not finished, write their rows, and count failures."""
+    failures = 0
+    workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
+    work = _Work(batch.process, index is not None)
+    try:
+        with closing(spread(work, todo, workers, _broken)) as results:
+            for result in _with_progress(results, len(todo), batch.verb, batch.settings):
+                if result.stops_the_run is not None:
+                    raise result.stops_the_run
+                if index and result.made:
+                    index.add(result.made, batch.outputs_of(result.item))
+                with report.open("a", encoding="utf-8") as stream:
+                    stream.write(json_line(_report_row(batch.verb, result, batch.options.output)) + "\n")
+                failures += _print_result(result, batch.options)
+    finally:
+        if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
+            for folder in {path.parent for item in todo for path in batch.outputs_of(item)}:
+                sweep_leftovers(folder)
+    return failures
 
 
 def all_finished(
@@ -174,6 +218,11 @@ def all_finished(
 def report_name(shard: Shard) -> str:
     """The report's name; each shard has its own, since shards run at the same time."""
     return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
+
+
+def _lock_name(shard: Shard) -> str:
+    """The name of a run's lock; each shard has its own, since shards run at the same time."""
+    return ".facerf-lock" if shard.of == 1 else f".facerf-lock-{shard.number}-of-{shard.of}"
 
 
 def sums_up(
@@ -206,9 +255,7 @@ class _OfFile:
     process: Callable[[Item], Outcome]
 
     def __call__(self, item: Item) -> Outcome:
-        if not item.input_path.is_file():
-            state = "not a regular file" if item.input_path.exists() else "no such file"
-            raise InputError(f"{item.input_path}: {state}; check the path")
+        require_regular(item.input_path)
         return self.process(item)
 
 
@@ -226,7 +273,7 @@ class _Work:
             return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
-            read = read_row(item.input_path) if self.indexed and item.input_path.is_file() else None
+            read = read_row(item.input_path) if self.indexed and is_regular(item.input_path) else None
             outcome = self.process(item)
             made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
             return result(outcome=outcome, made=made)
@@ -255,7 +302,12 @@ def _why_again(
 
 
 def _exist(outputs: Sequence[Path]) -> bool:
-    return bool(outputs) and all(path.exists() for path in outputs)
+    return bool(outputs) and all(map(_is_there, outputs))
+
+
+def _is_there(path: Path) -> bool:
+    """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
+    return path.is_dir() or (is_regular(path) and path.stat().st_size > 0)
 
 
 def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
@@ -286,7 +338,7 @@ def _list_what_would_be_done(
 ) -> int:
     for item in todo:
         for path in outputs_of(item):
-            print(f"{item.input_path} -> {path}")
+            print_path(f"{item.input_path} -> {path}")
     log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
     return 0
 
@@ -317,21 +369,24 @@ def _open_report(
         with atomic_path(path) as temporary:
             temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
     except FacerfError as error:
-        cause = error.__cause__
-        reason = cause.strerror if isinstance(cause, OSError) else error
-        raise UsageError(f"-o {path.parent}: cannot be written to ({reason}); give another folder") from error
+        raise _unusable(path.parent, error.__cause__ or error) from error
     return path
 
 
+def _unusable(folder: Path, error: BaseException) -> UsageError:
+    reason = error.strerror if isinstance(error, OSError) else error
+    return UsageError(f"-o {folder}: cannot be written to ({reason}); give another folder")
+
+
 def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
-    if not path.is_file():
+    if not is_regular(path):
         return
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
         try:
             row = parse_json(line)
         except ValueError:  # a run that was killed may leave half a line
             continue
-        if isinstance(row, dict):
+        if isinstance(row, dict) and isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
             yield row
 
 
@@ -343,7 +398,7 @@ def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, An
         "input": result.item.input_path,
         "status": "failed" if result.error else "done",
         "seconds": result.seconds,
-        "error": result.error or None,
+        "error": shown(result.error) or None,
         "outputs": [
             path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
             for path in outcome.outputs
@@ -352,16 +407,22 @@ def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, An
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
-def _print_result(result: _Result) -> int:
+def _print_result(result: _Result, options: BatchOptions) -> int:
     """Print outputs to stdout, an error to stderr; return 1 for a failure."""
     if result.error:
-        log.error("%s", one_line(result.error))
+        log.error("%s", result.error)
         if result.trace:
             log.debug("%s", "\n" + result.trace)
         return 1
-    for path in result.outcome.outputs if result.outcome else ():
-        print(path, flush=True)
+    if result.outcome and options.print_outputs:
+        for path in result.outcome.outputs:
+            print_path(path)
     return 0
+
+
+def print_path(text: object) -> None:
+    """Print a name to standard output, for people escaped, for programs as it is."""
+    print(escaped(str(text)) if sys.stdout.isatty() else text, flush=True)
 
 
 def _with_progress(

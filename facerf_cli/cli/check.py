@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from facerf_cli.cli.batch import print_path
 from facerf_cli.cli.folder_index import check_outputs
 from facerf_cli.errors import UsageError
 from facerf_cli.logs import LOGGER_NAME
@@ -29,7 +30,7 @@ def check(
     for path, state in check_outputs(folder):
         counts[state] += 1
         if state != "whole":
-            print(f"{path}: {state}")
+            print_path(f"{path}: {state}")
     if not counts:
         raise UsageError(f"{folder}: no index of outputs; give the output folder of a verb that reads photos")
     log.info("%s", ", ".join(f"{count} {state}" for state, count in sorted(counts.items())))

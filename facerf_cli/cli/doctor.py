@@ -22,6 +22,7 @@ EXTRAS = {
     "tensorboard": "the curves of `train`",
     "ray": "`--ray`, on clusters",
     "heic": "HEIC photos of phones",
+    "video": "films in and out; its wheel holds GPL codecs",
     "dlib": "`--landmarks-from dlib`, not for commercial use",
 }
 _WIDTH, _HEAD = 100, 13  # columns of the screen, and of a section's or part's name

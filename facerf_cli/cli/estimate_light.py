@@ -1,6 +1,6 @@
 """`facerf estimate-light`: the light of a photo as a map, as numbers and as an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, Outcome, run_files
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
+from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import (
     FACE,
     LIGHT,
@@ -18,7 +19,6 @@ from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
-    InputsArgument,
     JobsOption,
     NameOption,
     OutputOption,
@@ -33,7 +33,17 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.recipe import OneRecipe
+from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.shots import (
+    PhotosArgument,
+    SequenceOption,
+    Shot,
+    check_shots,
+    collect_frames,
+    follow_all,
+    recipe_of_shots,
+    whole_shots,
+)
 from facerf_cli.errors import UsageError
 
 _OUTPUTS = ("_light.exr", "_light.json", "_light.png")
@@ -47,6 +57,7 @@ class EstimateLight:
     options: LightOptions
     width_px: int
     sh_order: int
+    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """Every file of an item's (first) face."""
@@ -57,18 +68,27 @@ class EstimateLight:
         from facerf_cli.cli.items.photo_lights import prepare_light
 
         prepare_light(self.options, with_networks=not dry_run)
+        follow_all(self.shots, self.options.photo, dry_run)
+
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        """The recipe of all outputs."""
+        return [recipe_of(self, digest_of) | recipe_of_shots(self.shots, digest_of)]
 
     def __call__(self, item: Item) -> Outcome:
-        """Estimate the light of every chosen face."""
-        from facerf_cli.cli.items.photo_lights import write_lights
+        """Estimate the light of every chosen face, or that of a shot."""
+        from facerf_cli.cli.items.photo_lights import write_lights, write_shot_light
 
+        for shot in self.shots:
+            if item.output_base == shot.base:
+                seen = write_shot_light(shot, item, self.options, self.width_px, self.sh_order)
+                return Outcome(self.outputs_of(item), seen)
         tags, facts = write_lights(item, self.options, self.width_px, self.sh_order)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)
 
 
 def estimate_light(
     context: typer.Context,
-    inputs: InputsArgument,
+    inputs: PhotosArgument,
     output: OutputOption,
     lights: Annotated[
         str,
@@ -139,6 +159,7 @@ def estimate_light(
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
     name: NameOption = None,
+    sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -149,6 +170,8 @@ def estimate_light(
     and their spherical harmonics; and _light.png: the photo, the face under the estimated light, where that
     is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the residual
     inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
+
+    A film, or images with --sequence, has one light, which is estimated from several frames together.
 
     A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
     the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
@@ -168,17 +191,23 @@ def estimate_light(
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()
-    work = EstimateLight(how, width, sh_order)
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name))
+    check_shots(shots, photo)
+    if shots and (refine != "none" or reflectance != "field" or matte is not None):
+        raise UsageError(
+            "a film or --sequence: its light is that of the field; leave out --refine, "
+            "--reflectance and --matte"
+        )
+    work = EstimateLight(how, width, sh_order, shots)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch(
+    code = run_files(
         "estimate-light",
-        inputs,
+        whole_shots(items, shots),
         work,
         work.outputs_of,
         options,
         photo.settings,
-        OneRecipe(work),
+        work.recipes_of,
         prepare=partial(work.prepare, dry_run),
-        name=name,
     )
     raise typer.Exit(code)

@@ -1,6 +1,7 @@
 """The options that the protocols of `facerf evaluate` share, each named and explained once."""
 
 import inspect
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -200,7 +201,7 @@ class EvaluateOptions:
     def require_output_apart(self, folders: Iterable[Path]) -> None:
         """Raise UsageError for an output folder inside one that is read: the next run would read it, too."""
         for folder in folders:
-            if self.output.resolve().is_relative_to(folder.resolve()):
+            if Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(folder)):
                 raise UsageError(f"-o {self.output}: lies in {folder}, which is read; give another folder")
 
 

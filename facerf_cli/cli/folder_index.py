@@ -10,6 +10,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -19,6 +20,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import json_line
 
 _INDEXES = ".facerf-index*.jsonl"
@@ -35,12 +37,19 @@ class Made:
 
 def read_row(path: Path) -> Row:
     """A row of a file to be read: its state and its digest. Raises InputError if it cannot be read."""
+    require_regular(path)
     try:
         state = os.stat(path)
-        digest = file_sha256(path)
+        digest = _digest(path, *_state(state).values())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
     return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
+
+
+@lru_cache(maxsize=8)  # every frame of a film has the film as its input
+def _digest(path: Path, *_: int) -> str:
+    """SHA-256 of a file in a state: its size, time and inode."""
+    return file_sha256(path)
 
 
 class _Rows:
@@ -50,7 +59,7 @@ class _Rows:
         self.files: dict[str, Row] = {}
         self.recipes: dict[str, Recipe] = {}
         self.outputs: dict[str, Row] = {}
-        for path in sorted(folder.glob(_INDEXES)):
+        for path in filter(is_regular, sorted(folder.glob(_INDEXES))):
             for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
                 self._take(line)
 
@@ -75,7 +84,7 @@ def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
     """Read all outputs in a folder's index; yield each, and `whole`, `missing`, `empty` or `changed`."""
     for name, row in sorted(_Rows(folder).outputs.items()):
         path = folder / name
-        if not path.is_file():
+        if not is_regular(path):
             yield path, "missing"
         elif not path.stat().st_size:
             yield path, "empty"
@@ -128,7 +137,7 @@ class FolderIndex:
 
     def _why(self, number: int, path: Path, input_path: Path) -> str | None:
         row = self._rows.outputs.get(self._name(path))
-        if not path.exists():
+        if not is_regular(path):
             return "" if row is None else "an output is missing"
         if row is None or row.get("verb") != self._verb:
             return "there is no record of what they were made from"

@@ -14,12 +14,14 @@ PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
     | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
 )
+FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 
 
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
 _NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
 _MOST_FRAMES = 100_000
+_LONGEST_PATH = 4096  # characters
 
 
 @dataclass(frozen=True, order=True)
@@ -31,6 +33,7 @@ class Item:
     name: str  # path in the output folder, without suffix; the item's identity there
     mirrored: PurePosixPath | None = None  # of a file: path in its input folder, or name alone
     stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
+    frame: int | None = field(default=None, compare=False)  # of a film, from 0
 
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
@@ -66,13 +69,13 @@ def collect_items(
     one place are refused. `-` reads paths from stdin. Hidden files and folders are left out, and so is an
     output folder inside an input folder.
     """
-    output_real = output_folder.resolve()
+    output_real = os.path.realpath(output_folder)  # resolve() fails for links in a circle
     found: dict[Path, tuple[Path, PurePosixPath]] = {}  # absolute -> as the user would write it, mirrored
     for path in map(Path, expand_inputs(inputs, null_separated)):
-        if not path.is_dir():
+        if not os.path.isdir(path):
             found.setdefault(Path(os.path.abspath(path)), (path, PurePosixPath(path.name)))
             continue
-        if path.resolve() == output_real:
+        if os.path.realpath(path) == output_real:
             raise UsageError(f"{path}: the output folder is an input folder; give another one with -o")
         for file in _walk(path, output_real, suffixes):
             absolute, mirrored = Path(os.path.abspath(file)), PurePosixPath(file.relative_to(path))
@@ -111,7 +114,7 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
     for entry in inputs:
         if entry == "-":
             yield from filter(None, _stdin_names(null_separated))
-        elif os.path.exists(entry):
+        elif os.path.exists(entry) or len(entry) > _LONGEST_PATH:
             yield entry
         elif frames := _FRAMES.fullmatch(entry):
             yield from _range(entry, *frames.groups())
@@ -147,10 +150,12 @@ def _numbered(entry: str, before: str, after: str) -> list[str]:
     return [path for _, path in found]
 
 
-def _walk(folder: Path, output_real: Path, suffixes: frozenset[str]) -> Iterator[Path]:
+def _walk(folder: Path, output_real: str, suffixes: frozenset[str]) -> Iterator[Path]:
     for here, folders, files in os.walk(folder):
         folders[:] = [
-            name for name in folders if name[0] != "." and (Path(here) / name).resolve() != output_real
+            name
+            for name in folders
+            if name[0] != "." and os.path.realpath(os.path.join(here, name)) != output_real
         ]
         for name in files:
             sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files

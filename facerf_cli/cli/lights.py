@@ -15,7 +15,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.light.studio import StudioLight
 
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
-Sampling = Literal["cell", "paper"]
+Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
 
 

@@ -55,6 +55,11 @@ class NamePattern:
         return PurePosixPath(result.lstrip("/")).as_posix()
 
 
+def file_pattern(text: str | None) -> NamePattern | None:
+    """Parse the --name of a verb that writes files a photo, where it is given."""
+    return NamePattern.parse(text, "--name", OF_FILES) if text else None
+
+
 def _fits(name: str, spec: str) -> bool:
     return not spec or (name == "frame" and _WIDTH.fullmatch(spec) is not None)
 

@@ -1,6 +1,7 @@
 """The options that verbs share, each named, explained and read once; and the choice of workers."""
 
 import inspect
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
 
 T = TypeVar("T")
+_SHARE = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 EPILOG = (
     "Global options (--checkpoint, --device, --seed, -v, -q; see 'facerf --help') may stand before or after "
     "the verb."
@@ -39,7 +41,7 @@ class Shard:
         if text is None:
             return Shard()
         number, slash, of = text.partition("/")
-        if not (slash and number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of)):
+        if not (slash and _SHARE.fullmatch(text) and 1 <= int(number) <= int(of)):
             raise UsageError(f"--shard {text}: not a share; give K/N with K from 1 to N, such as 3/8")
         return Shard(int(number), int(of))
 
@@ -69,9 +71,9 @@ def settings_of(context: typer.Context) -> Settings:
     return settings
 
 
-def workers_of(settings: Settings, jobs: int) -> Workers:
+def workers_of(settings: Settings, jobs: int, in_a_row: int = 1) -> Workers:
     """The workers that `--jobs`, `--ray` and `--device` ask for."""
-    return Workers(jobs, settings.ray, int(settings.device == "cuda"))
+    return Workers(jobs, settings.ray, int(settings.device == "cuda"), in_a_row)
 
 
 def was_given(context: typer.Context, name: str) -> bool:

@@ -2,6 +2,7 @@
 
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +11,7 @@ import typer
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
 from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
+from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
 from facerf_cli.cli.folder_index import FolderIndex
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
@@ -23,11 +25,9 @@ from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
     InputColourspaceOption,
-    InputsArgument,
     JobsOption,
     MemoryOption,
     NetworkAloneOption,
-    OutputOption,
     OverwriteOption,
     refuse_given,
     settings_of,
@@ -56,14 +56,21 @@ from facerf_cli.cli.photo_options import (
     check_companion,
 )
 from facerf_cli.cli.relight_work import Composite, ExposureGroup, Relight
-from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
+from facerf_cli.cli.shots import (
+    FRAMES_IN_A_ROW,
+    PhotosArgument,
+    SequenceOption,
+    check_shots,
+    collect_frames,
+)
+from facerf_cli.cli.values import is_sweep, parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import UsageError
 
 
 def relight(
     context: typer.Context,
-    inputs: InputsArgument,
-    output: OutputOption,
+    inputs: PhotosArgument,
+    output: FilmOrFolderOption,
     envmap: Annotated[
         list[str] | None,
         typer.Option(
@@ -220,12 +227,14 @@ def relight(
         ),
     ] = False,
     envmap_sampling: Annotated[
-        Sampling,
+        Sampling | None,
         typer.Option(
-            help="Give each light the map's integral over its cell, or, as in the paper, one pixel.",
+            help="Give each light the map's integral over its cell; share it smoothly among lights; or, "
+            "as in the paper, one pixel.",
+            show_default="cell; smooth for --rotate FROM:TO:N",
             rich_help_panel=LIGHT,
         ),
-    ] = "cell",
+    ] = None,
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
     face: FaceOption = "largest",
@@ -234,6 +243,7 @@ def relight(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    fps: FpsOption = None,
     name: Annotated[
         str | None,
         typer.Option(
@@ -243,6 +253,7 @@ def relight(
             rich_help_panel=BATCH,
         ),
     ] = None,
+    sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -251,12 +262,20 @@ def relight(
     """Relight photos, or OLAT stacks, under environment maps and single lights.
 
     Each image is written as a scene-linear EXR with the matte as layer person.A, and as a PNG at --exposure.
+    A film, or images with --sequence, is one shot: one identity, and one light by which the field is
+    corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or FILE.mov joins
+    frames to a film, with the sound of the film that they come from.
+
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
     --light takes the nearest of them.
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
-    formats = parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
+    film = film_output(output, fps)
+    if film is not None:
+        refuse_given(context, ("format_", "ball", "name"), f"is not for -o {output}; leave it out")
+        output = film.folder
+    formats = film.formats if film else parse_formats(format_ or ("png" if output == STDOUT else "exr,png"))
     refuse_unused(context, formats)
     if pose is not None and composite == "photo":
         raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
@@ -279,6 +298,8 @@ def relight(
     behind = parse_background(background)
     if behind.kind != "photo" and (composite == "face" or pose is not None):
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+    if film and (behind.kind == "none" or composite == "face" or pose is not None):
+        raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
     check_companion(matte, "--matte")
     check_companion(photo_of_stack, "--photo")
     shown: Composite = composite or ("photo" if pose is None else "face")
@@ -288,7 +309,7 @@ def relight(
         photo=photo,
         setups=collect_setups(envmap or (), rotate, light or (), output, settings.seed, lit),
         rig=lights,
-        sampling=envmap_sampling,
+        sampling=envmap_sampling or ("smooth" if rotate and is_sweep(rotate) else "cell"),
         pose=pose,
         composite=shown,
         background=behind,
@@ -309,10 +330,14 @@ def relight(
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
         _write_to_stdout(inputs, work)
         return
-    options = BatchOptions(output, overwrite, dry_run, jobs)
-    items = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
-    work = work.with_leaders(items)
+    items, shots = collect_frames(inputs, output, settings, sequence, pattern)
+    check_shots(shots, photo)
+    in_a_row = FRAMES_IN_A_ROW if shots else 1
+    options = BatchOptions(output, overwrite, dry_run, jobs, in_a_row, print_outputs=film is None)
+    work = replace(work.with_leaders(items), shots=shots)
     work.refuse_meeting(items)
+    if film is not None:
+        raise typer.Exit(run_to_film(film, items, shots, work, options, settings))
     index = FolderIndex(output, "relight", settings.shard, work.recipes_of)
     usable, finished = work, all_finished(items, work.outputs_of, options, settings, index)
     index.edited.clear()  # they are judged again

@@ -14,6 +14,7 @@ from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.shots import Shot, follow_all, recipe_of_shots
 from facerf_cli.cli.values import Exposure
 from facerf_cli.errors import FacerfError, UsageError
 
@@ -45,6 +46,7 @@ class Relight:
     exposure_group: ExposureGroup = "photo"
     photo_of_stack: Path | None = None
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
+    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
@@ -94,6 +96,7 @@ class Relight:
         shared = recipe_of(self, digest_of)
         if self.leaders:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
+        shared |= recipe_of_shots(self.shots, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
@@ -107,6 +110,7 @@ class Relight:
 
         check_output(self.output)
         self.photo.preparation(dry_run)()
+        follow_all(self.shots, self.photo, dry_run)
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self
         setups = readable(self.setups)
@@ -115,7 +119,7 @@ class Relight:
         return replace(self, setups=setups)
 
     def __call__(self, item: Item) -> Outcome:
-        """Relight a photo or a stack."""
+        """Relight a photo, a frame or a stack."""
         from facerf_cli.cli.items.relight_photos import relight_item
 
         written, facts = relight_item(item, self.for_stale(item))

@@ -12,6 +12,7 @@ MOST_FRAMES = 9999
 _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 
+_MOST_DIGITS = 9  # of a count; Python refuses to read thousands
 Exposure = float | Literal["auto", "face"]  # EV, or the rule that chooses it
 PoseDeg = tuple[float, float, float]
 
@@ -77,7 +78,7 @@ def parse_lights(text: str) -> int | list[tuple[float, float]]:
     The text is a number, 'az,el;az,el', or a file of such lines.
     """
     if text.isdecimal():
-        if not 1 <= int(text) <= MOST_LIGHTS:
+        if not (len(text) <= _MOST_DIGITS and 1 <= int(text) <= MOST_LIGHTS):
             raise UsageError(f"--lights {text}: not a number of lights; give 1 to {MOST_LIGHTS}")
         return int(text)
     is_file = os.path.isfile(text)  # Path's own raises where a long list is no possible name

@@ -4,12 +4,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.files.images import PHOTO_LIMIT_PX, read_image
+from facerf_cli.files.regular import require_regular
 
 SUFFIXES = (".exr", ".png", ".npy")  # of predictions in files
 _LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16  # limits of a .npy file
@@ -95,11 +97,12 @@ def _prediction(folder: Path, case: str, shape: tuple[int, ...], grey_as_given: 
 
 def read_array(path: Path) -> np.ndarray:
     """Read an image [H, W, 3] float32 from a .npy of floats [H, W, 3] or [H, W], taken as linear Rec.709."""
+    require_regular(path, "give an image as .npy")
     try:
         if path.stat().st_size > PHOTO_LIMIT_PX * 3 * _LARGEST_NUMBER_BYTES + _HEADER_BYTES:
             raise InputError(f"{path}: larger than any image that is read; give one image in a file")
         values = np.load(path, mmap_mode="r", allow_pickle=False)  # a header may promise more than there is
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError, OverflowError, TypeError) as error:
         raise InputError(f"{path}: not an array of numbers ({error}); write one by numpy.save") from None
     if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,)) or not math.prod(values.shape):
         raise InputError(f"{path}: an array of shape {list(values.shape)}; give [height, width, 3]")

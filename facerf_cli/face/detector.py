@@ -34,7 +34,7 @@ def detected_boxes(image_srgb: np.ndarray, side_px: int) -> list[Box]:
 
 def reduced(image: np.ndarray, scale: float) -> np.ndarray:
     """Resize to uint8 by averaging (or smoothly enlarging) without a float copy of the whole image."""
-    block = max(1, int(1 / scale))
+    block = max(1, min(int(1 / scale), *image.shape[:2]))  # an image may be one pixel wide
     height, width = (length // block for length in image.shape[:2])
     small = np.zeros((height, width, 3), np.float32)
     for row in range(block):

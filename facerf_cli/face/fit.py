@@ -5,7 +5,6 @@ alone constrain identity little and most of the surface not at all, so the prior
 """
 
 import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -28,9 +27,10 @@ from facerf_cli.face.gauss_newton import (
     minimise,
     residuals,
 )
-from facerf_cli.face.morphable import BUILTIN, MorphableModel
+from facerf_cli.face.morphable import BUILTIN, NPZ_ERRORS, MorphableModel
 from facerf_cli.face.silhouette import CONTOUR_RAYS, NOSE, POINTS_PER_RAY
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
+from facerf_cli.files.regular import require_regular
 from facerf_cli.raster.camera import Camera, project
 
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # the largest mean landmark errors of a good and of a fair fit
@@ -267,10 +267,11 @@ def save_fit(path: Path, fit: FaceFit, metadata: Mapping[str, str | int] | None 
 
 def load_fit(path: Path) -> FaceFit:
     """Read a fit that `save_fit` wrote; raises InputError for any other file."""
+    require_regular(path, "fit the photo again")
     try:
         with np.load(path, allow_pickle=False) as file:
             return fit_from_arrays({key: file[key] for key in file.files})
-    except (ValueError, TypeError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+    except NPZ_ERRORS as error:
         raise InputError(f"{path}: not a fit that facerf wrote ({error}); fit the photo again") from None
 
 

@@ -15,6 +15,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, check_landmarks
 from facerf_cli.files.documents import Document, Points68, checked
 from facerf_cli.files.json_reader import read_json
+from facerf_cli.files.regular import require_regular
 
 _MAX_BYTES = 1 << 20  # of a landmark file
 _ADVICE = "give 68 landmarks as .pts or JSON"
@@ -95,6 +96,7 @@ def read_landmarks(path: Path) -> np.ndarray:
     The file is iBUG's `.pts`, whose pixels count from 1, or JSON with pixel centres at index + 0.5: a list of
     68 [x, y], or an object with this list as "landmarks".
     """
+    require_regular(path, _ADVICE)
     try:
         if path.suffix.lower() == ".pts":
             return check_landmarks(_read_pts(path))

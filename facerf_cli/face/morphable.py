@@ -11,6 +11,7 @@ import zlib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,10 @@ BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by index
 # Errors that reading a damaged .npz can raise.
 _ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
-NPZ_ERRORS = (ValueError, OSError, KeyError, EOFError, RuntimeError, TypeError, *_ZIP_ERRORS)
+# numpy parses a header as a text of Python, and believes its sizes.
+_HEADER_ERRORS = (SyntaxError, TokenError, OverflowError, MemoryError, SystemError)
+_ARRAY_ERRORS = (ValueError, OSError, LookupError, EOFError, RuntimeError, TypeError, AttributeError)
+NPZ_ERRORS = (*_ARRAY_ERRORS, *_HEADER_ERRORS, *_ZIP_ERRORS)
 _HEAD_KEYS = ("mean", "identity", "expression", "triangles", "part", "uv")
 _HEAD_PREFIX = "head_"  # of the head's arrays in a face model's file
 _MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head

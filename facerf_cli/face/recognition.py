@@ -11,7 +11,7 @@ from facerf_cli.raster.camera import PIXEL_CENTRE
 
 RECOGNITION_LICENCE = (
     "dlib_face_recognition_resnet_model_v1: in the public domain (Davis King); trained on FaceScrub, VGG "
-    "Face and pictures of the web"
+    "Face, the web"
 )
 _NETWORK_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 

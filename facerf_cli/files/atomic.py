@@ -1,42 +1,88 @@
-"""Atomic writes: an output is written under a temporary name in its folder, then renamed."""
+"""Atomic writes: an output is written into a hidden folder beside it, made durable, and renamed.
 
+The hidden folder belongs to this process alone: its name is random and `mkdir` refuses a name that exists, so
+no link that another user has put there is followed. A power cut leaves the old output or the new one: the
+data is on the disk before the rename, and the rename before the next step (Pillai et al., 'All File Systems
+Are Not Created Equal', OSDI 2014).
+"""
+
+import atexit
+import errno
 import hashlib
 import os
 import platform
+import secrets
 import shutil
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
+from facerf_cli.stopping import clean_by
 
-_ABANDONED_S = 24 * 3600  # another machine's temporary file counts as abandoned after so long without a write
+_ABANDONED_S = (
+    24 * 3600
+)  # another machine's temporary folder counts as abandoned after so long without a write
+_MARK = ".part-"
+_LONGEST_STEM = (
+    40  # characters of a name, of up to 4 bytes, that its temporary folder repeats; names end at 255
+)
+_open: set[Path] = set()  # temporary folders of this process
+_swept: set[Path] = set()  # folders whose leftovers this process has removed
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path for a file or a folder; it replaces `path` when the block succeeds.
 
-    The temporary name keeps the suffix (writers choose their format by it) and is hidden, so that a search of
-    the folder does not take it for an input. Missing parent folders are created. Temporary files that a
-    killed process left for the same output are removed. Several machines may write the same output at once.
+    The temporary path keeps the name (writers choose their format by its suffix), in a hidden folder, so that
+    a search does not take it for an input. Missing parent folders are created. What a killed process left in
+    the folder is removed. Several machines may write the same output at once.
     """
-    temporary = path.with_name(f".{path.stem}.part-{_machine()}-{os.getpid()}{path.suffix}")
+    room = path.with_name(_room_name(path.stem))
+    temporary = room / path.name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(path)
+        _sweep_once(path.parent)
+        room.mkdir(mode=0o700)
+        _open.add(room)
         yield temporary
         if not temporary.exists():
             raise FacerfError(f"{path}: could not be written")
-        if temporary.is_dir() and path.is_dir():
-            shutil.rmtree(path)
+        _sync_all(temporary)
+        if temporary.is_dir() and path.is_dir() and not path.is_symlink():
+            os.replace(path, room / f"{path.name}.old")
         os.replace(temporary, path)
+        _sync_folder(path.parent)
     except OSError as error:
         raise FacerfError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
-        _remove(temporary)
+        shutil.rmtree(room, ignore_errors=True)
+        _open.discard(room)
+
+
+def sweep_leftovers(folder: Path) -> None:
+    """Remove temporary folders of processes that have ended from a folder."""
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            if entry.name.startswith(".") and _MARK in entry.name and _is_abandoned(entry):
+                _remove(Path(entry.path))
+
+
+def _remove_own() -> None:
+    """Remove what this process is writing."""
+    for room in list(_open):
+        shutil.rmtree(room, ignore_errors=True)
+
+
+clean_by(_remove_own)
+atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
+
+
+def _room_name(stem: str) -> str:
+    return f".{stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(8)}"
 
 
 @cache
@@ -45,21 +91,23 @@ def _machine() -> str:
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
-def _remove_leftovers(path: Path) -> None:
-    """Remove the temporary files of `path` whose processes have ended."""
-    before, after = f".{path.stem}.part-", path.suffix
-    for name in os.listdir(path.parent):
-        machine, _, owner = name[len(before) : len(name) - len(after)].partition("-")
-        ours = name.startswith(before) and name.endswith(after) and owner.isdecimal()
-        if ours and _is_abandoned(path.with_name(name), machine, int(owner)):
-            _remove(path.with_name(name))
+def _sweep_once(folder: Path) -> None:
+    """Remove leftovers at the first write in a folder: a search for each file would be quadratic."""
+    absolute = Path(os.path.abspath(folder))
+    if absolute not in _swept:
+        _swept.add(absolute)
+        sweep_leftovers(folder)
 
 
-def _is_abandoned(leftover: Path, machine: str, owner: int) -> bool:
+def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
+    machine, _, rest = leftover.name.rpartition(_MARK)[2].partition("-")
+    owner = rest.partition("-")[0].partition(".")[0]
+    if len(machine) != len(_machine()) or not owner.isdecimal():
+        return False
     if machine == _machine():
-        return not _runs(owner)
+        return not _runs(int(owner))
     try:
-        return time.time() - leftover.stat().st_mtime > _ABANDONED_S
+        return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
     except OSError:  # its process has just renamed or removed it
         return False
 
@@ -69,7 +117,7 @@ def _runs(process: int) -> bool:
         return True
     try:
         os.kill(process, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):
         return False
     except PermissionError:
         pass
@@ -77,7 +125,35 @@ def _runs(process: int) -> bool:
 
 
 def _remove(path: Path) -> None:
-    if path.is_dir():
+    if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
-    elif path.exists():
-        path.unlink()
+    else:
+        path.unlink(missing_ok=True)
+
+
+def _sync_all(path: Path) -> None:
+    """Bring a file, or all of a folder, from memory to the disk."""
+    if not path.is_dir():
+        _sync(path)
+        return
+    for here, _, files in os.walk(path):
+        for name in files:
+            _sync(Path(here) / name)
+        _sync_folder(Path(here))
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a folder's names to the disk, where its file system can."""
+    try:
+        _sync(folder)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.EACCES, errno.EBADF, errno.ENOTSUP, errno.EISDIR):
+            raise

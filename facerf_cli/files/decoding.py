@@ -8,8 +8,9 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.heif import decode_heif, heif_header, is_heif
-from facerf_cli.files.image_metadata import require_whole_png, utf8_path
+from facerf_cli.files.heif import decode_heif, is_heif
+from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
+from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
@@ -20,14 +21,11 @@ def decode(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSpec]:
 
     The size is checked before pixels are decoded.
     """
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, not an image; give an image file")
-    if not path.is_file() or not path.stat().st_size:
-        raise InputError(f"{path}: {'the file is empty' if path.is_file() else 'no such file'}")
+    require_regular(path, "give an image file")
+    if not path.stat().st_size:
+        raise InputError(f"{path}: the file is empty; give an image file")
     if is_heif(path):
-        image, spec = heif_header(path)
-        _check_size(path, spec, limit_px)
-        return decode_heif(path, image, spec), spec
+        return decode_heif(path, limit_px)
     require_whole_png(path)
     return _decode_by_oiio(path, limit_px)
 
@@ -37,7 +35,7 @@ def _decode_by_oiio(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSp
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(utf8_path(path), settings)
     if stream is None:
-        advice = f"save it again as EXR, PNG or JPEG ({_reason(path, oiio.geterror())})"
+        advice = f"save it again as EXR, PNG or JPEG ({_reason(path, oiio_error())})"
         raise InputError(f"{path}: not a readable image; {advice}")
     try:
         spec = stream.spec()
@@ -45,7 +43,7 @@ def _decode_by_oiio(path: Path, limit_px: int) -> tuple[np.ndarray, oiio.ImageSp
         if stream.format_name() == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5:
             raise InputError(f"{path}: a DPX file that lies on its side is not read; save it upright")
         values = stream.read_image(0, 0, 0, spec.nchannels, oiio.FLOAT)
-        message = _reason(path, stream.geterror())
+        message = _reason(path, oiio_error(stream))
     finally:
         stream.close()
     if values is None or "premature end" in message.lower():  # a JPEG cut short decodes to grey

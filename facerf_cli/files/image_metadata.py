@@ -8,6 +8,7 @@ import logging
 import struct
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from facerf_cli.colour import (
     linear_space,
 )
 from facerf_cli.errors import InputError
-from facerf_cli.files.heif import heif_header, is_heif
+from facerf_cli.files.heif import decode_heif, is_heif
 from facerf_cli.files.icc import space_of_profile
 from facerf_cli.logs import LOGGER_NAME, one_line
 
@@ -36,6 +37,7 @@ Attributes = Mapping[str, str | int | float]
 # Colour spaces by a part of the description, in lower case, of ICC profiles that hold tables; the first match
 # counts.
 _ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+_HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
 OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
 _SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
@@ -64,6 +66,17 @@ class Header:
     metadata: dict[str, Any]
 
 
+def oiio_error(stream: Any = oiio) -> str:
+    """Take the pending error of OpenImageIO, or of one of its streams, which need not be UTF-8.
+
+    OpenImageIO prints an error that nobody took when the program ends.
+    """
+    try:
+        return str(stream.geterror())
+    except UnicodeDecodeError as error:
+        return error.object.decode(errors="replace")
+
+
 def read_header(path: Path) -> Header | None:
     """Read the header of an image's first part; return None if the file is not a readable image."""
     spec = _spec_of(path) if path.is_file() else None
@@ -79,12 +92,12 @@ def read_header(path: Path) -> Header | None:
 def _spec_of(path: Path) -> oiio.ImageSpec | None:
     if is_heif(path):
         try:
-            return heif_header(path)[1]  # upright
+            return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
         except InputError:  # damaged, or pi-heif is not there
             return None
     stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
-        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        oiio_error()
         return None
     spec = stream.spec()
     stream.close()
@@ -105,7 +118,11 @@ def utf8_path(path: Path) -> str:
 def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
     """Return the attributes that are text, numbers or tuples, without the orientation."""
     plain = (str, int, float, tuple)
-    attributes = {entry.name: entry.value for entry in spec.extra_attribs if isinstance(entry.value, plain)}
+    attributes = {}
+    for entry in spec.extra_attribs:
+        with suppress(UnicodeDecodeError):  # of a text in another encoding
+            if isinstance(entry.value, plain):
+                attributes[entry.name] = entry.value
     attributes.pop("Orientation", None)  # `read_image` turns the image upright
     return attributes
 
@@ -163,6 +180,7 @@ def require_whole_png(path: Path) -> None:
 
     OpenImageIO does not report such damage reliably.
     """
+    size = path.stat().st_size
     with path.open("rb") as stream:
         if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
             return
@@ -170,7 +188,7 @@ def require_whole_png(path: Path) -> None:
         while kind != b"IEND":
             head = stream.read(8)
             length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
-            body, checksum = stream.read(length), stream.read(4)
+            body, checksum = stream.read(min(length, size)), stream.read(4)  # a length may be 4 GiB
             if len(body) != length or len(checksum) != 4:
                 raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
             if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):

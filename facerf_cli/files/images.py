@@ -38,6 +38,7 @@ from facerf_cli.files.image_metadata import (
     embed_xmp,
     is_floating,
     metadata_of,
+    oiio_error,
     space_of_file,
     states_space,
     utf8_path,
@@ -285,14 +286,14 @@ def _write(
     with atomic_path(path) as temporary:
         stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:
-            oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+            oiio_error()
             raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
         name = str(temporary)
         good = stream.open(name, tuple(specs)) if len(specs) > 1 else stream.open(name, specs[0])
         for number, (spec, part) in enumerate(zip(specs, parts, strict=True)):
             good = good and (number == 0 or stream.open(name, spec, "AppendSubimage"))
             good = good and stream.write_image(np.ascontiguousarray(part))
-        message = stream.geterror()
+        message = oiio_error(stream)
         if not (stream.close() and good):
-            raise FacerfError(f"{path}: cannot write: {one_line(message or stream.geterror())}")
+            raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
         embed_xmp(temporary, metadata or {})

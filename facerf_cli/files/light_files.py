@@ -22,6 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
+from facerf_cli.files.regular import require_regular
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
@@ -179,6 +180,7 @@ def write_numbers(path: Path, numbers: Tensor) -> None:
 def read_numbers(path: Path, counts: tuple[int, ...]) -> Tensor:
     """Read numbers [N] from a text file, separated by white space; N must be one of `counts`."""
     wanted = " or ".join(map(str, counts))
+    require_regular(path)
     try:
         with path.open("rb") as stream:
             words = stream.read(_TEXT_LIMIT_BYTES).decode("ascii").split()

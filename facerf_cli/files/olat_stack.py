@@ -24,9 +24,10 @@ from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
-from facerf_cli.files.image_metadata import Attributes, utf8_path
+from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
 from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import one_line
 
 Format = Literal["facerf-olat-1"]
@@ -83,9 +84,9 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
         good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
         source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
         good = good and stream.write_image(_as_half(path, source))
-        message = stream.geterror()
+        message = oiio_error(stream)
         if not (stream.close() and good):
-            raise FacerfError(f"{path}: cannot write: {one_line(message or stream.geterror())}")
+            raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
@@ -134,13 +135,21 @@ def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
 
 def is_olat_stack(path: Path) -> bool:
     """Return whether a file is an OLAT stack that facerf wrote; False if it cannot be opened as an image."""
-    stream = oiio.ImageInput.open(utf8_path(path))
+    stream = oiio.ImageInput.open(utf8_path(path)) if is_regular(path) else None
     if stream is None:
-        oiio.geterror()  # otherwise OpenImageIO prints the pending error at exit
+        oiio_error()
         return False
-    found = bool(stream.spec().get_string_attribute(_HEADER))
+    found = bool(_text_of(stream.spec()))
     stream.close()
     return found
+
+
+def _text_of(spec: oiio.ImageSpec) -> str:
+    """The first part's JSON; empty for any other part, and for a text that is not UTF-8."""
+    try:
+        return spec.get_string_attribute(_HEADER)
+    except UnicodeDecodeError:
+        return ""
 
 
 def read_olat_stack(path: Path, limit_bytes: int = STACK_LIMIT_BYTES) -> OlatStack:
@@ -164,15 +173,14 @@ def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None
 
 @contextmanager
 def _opened(path: Path) -> Iterator[oiio.ImageInput]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    require_regular(path, "give a stack that `facerf predict-olat` wrote")
     stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
-        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio.geterror())}")
+        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio_error())}")
     try:
         yield stream
     finally:
-        stream.geterror()
+        oiio_error(stream)
         stream.close()
 
 
@@ -231,7 +239,7 @@ def _header_of(path: Path, spec: oiio.ImageSpec, limit_bytes: int | None = None)
 
 
 def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
-    text = spec.get_string_attribute(_HEADER)
+    text = _text_of(spec)
     if not text:
         raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
     try:
@@ -294,7 +302,7 @@ def _pixels(
         window = (spec.y + first, spec.y + past, 0)
         values = stream.read_scanlines(number, 0, *window, 0, spec.nchannels, oiio.HALF)
     if values is None:
-        raise InputError(f"{path}: damaged or cut short: {one_line(stream.geterror())}")
+        raise InputError(f"{path}: damaged or cut short: {one_line(oiio_error(stream))}")
     values = values.reshape(past - first, spec.width, spec.nchannels)
     values = values[..., [names.index(name) for name in channels]]
     if not np.isfinite(values).all():

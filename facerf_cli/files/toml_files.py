@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.regular import require_regular
 
 
 def read_toml(path: Path, limit_bytes: int, too_long: str, advice: str) -> dict[str, Any]:
@@ -12,6 +13,7 @@ def read_toml(path: Path, limit_bytes: int, too_long: str, advice: str) -> dict[
 
     Raises InputError, which says `too_long` of a file over the limit, and `advice` of one that is no TOML.
     """
+    require_regular(path)
     try:
         with path.open("rb") as stream:
             data = stream.read(limit_bytes + 1)

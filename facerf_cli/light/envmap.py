@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.light.rig_triangles import lights_around
 from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong_solid_angles
 
-Sampling = Literal["cell", "paper"]
+Sampling = Literal["cell", "smooth", "paper"]
 _COLUMNS_AT_ONCE = 1 << 10  # of a map, which are integrated in float64
 _LEAST_CELL_ROWS = 256  # of the grid on which cells are found
 _BALL_SAMPLES = 3  # along each side of a pixel of a ball
@@ -44,8 +45,9 @@ def envmap_weights(
     """Weights [L, 3] float32 of the lights at `directions` [L, 3] under a linear map [H, W, 3].
 
     `rotate_deg` is added to every azimuth of the map. Sampling "cell" integrates the map over cells: pi times
-    the sum of the weights is the integral of the map, at any map size. Sampling "paper" takes the map's pixel
-    at the light's direction (paper, 'Relighting'), times an equal share of the sphere.
+    the sum of the weights is the integral of the map, at any map size. "smooth" shares each direction of the
+    map among the three lights around it, so that weights change without steps as the map turns. "paper" takes
+    the map's pixel at the light's direction (paper, 'Relighting'), times an equal share of the sphere.
     """
     return rotated_weights(envmap, directions, [rotate_deg], sampling)[0]
 
@@ -57,11 +59,18 @@ def rotated_weights(
     if sampling == "paper":
         return torch.stack([_pixel_weights(envmap, directions, rotation) for rotation in rotations_deg])
     height = cell_rows(len(directions))
-    cell = nearest_light(directions, height, 2 * height).reshape(-1)
+    if sampling == "smooth":
+        texels = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
+        index, share = lights_around(texels, directions)
+    else:
+        index = nearest_light(directions, height, 2 * height).reshape(-1, 1)
+        share = torch.ones(index.shape, dtype=torch.float64)
     rows = _RowIntegrals(envmap, height)
     weights = torch.zeros(len(rotations_deg), len(directions), 3, dtype=torch.float64)
     for weight, rotation_deg in zip(weights, rotations_deg, strict=True):
-        weight.index_add_(0, cell, rows.rotated(2 * height, rotation_deg).reshape(-1, 3) / math.pi)
+        power = rows.rotated(2 * height, rotation_deg).reshape(-1, 3) / math.pi
+        for light, part in zip(index.unbind(1), share.unbind(1), strict=True):
+            weight.index_add_(0, light, part[:, None] * power)
     return weights.float()
 
 

@@ -90,6 +90,18 @@ class LightEvidence:
         return estimate_smooth_weights(self.directions, olats, photo, self.clipped[:, self.mask])
 
 
+def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
+    """The evidence of several frames under the same lights, one below the other."""
+    if len(frames) == 1:
+        return frames[0]
+    return LightEvidence(
+        frames[0].directions,
+        torch.cat([frame.olats for frame in frames], -2),
+        torch.cat([frame.photo for frame in frames], -2),
+        torch.cat([frame.mask for frame in frames], -2),
+    )
+
+
 def estimate_weights(olats: Tensor, image: Tensor) -> Tensor:
     """Solve Eq. (leastsq) for non-negative weights [L, C], which sum images [L, C, N] to an image [C, N].
 

@@ -85,7 +85,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             raise ValueError("its metadata is not a JSON object")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
             raise ValueError("it holds values that are not finite")
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, RecursionError, RuntimeError) as error:
         raise InputError(
             f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"
         ) from None

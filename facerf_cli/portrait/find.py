@@ -98,6 +98,14 @@ def faces_of(image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
     return sorted(faces, key=lambda face: face.box_px[0])
 
 
+def face_near(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> FoundFace | None:
+    """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
+    check_display(image_srgb)
+    (seen,) = look(image_srgb, [_around(landmarks_px)])
+    again = _refined(image_srgb, seen) if _is_face(seen, image_srgb) else None
+    return _as_face(again) if again else None
+
+
 def _sure(found: list[Seen]) -> list[Seen]:
     return [one for one in found if one.relative_error <= _SURE_ERROR]
 
@@ -116,7 +124,7 @@ def _looked_at(image: np.ndarray, squares: list[Square]) -> list[Seen]:
 def _refined(image: np.ndarray, seen: Seen) -> Seen | None:
     """Look twice more at a face, large and upright; None where it turns out to be none."""
     for last in (False, True):
-        seen = look(image, [_around(seen)], mirrored=last)[0]
+        seen = look(image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
         if not _is_face(seen, image):
             return None
     return seen if seen.relative_error <= _MOST_ERROR else None
@@ -139,13 +147,13 @@ def _is_face(seen: Seen, image: np.ndarray) -> bool:
     return bool(seen.presence >= _LEAST_PRESENCE and inside)
 
 
-def _around(seen: Seen) -> Square:
-    """The square that shows a face large and upright."""
-    face = seen.landmarks_px[:68]
+def _around(face: np.ndarray) -> Square:
+    """The square that shows a face with landmarks [68, 2] large and upright."""
     x_px, y_px = (face.min(0) + face.max(0)) / 2
     left, right = face[list(OUTER_EYE_CORNERS)]
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    return Square(float(x_px), float(y_px), _FACE_SIDES * max(seen.extent_px, 1.0), turn_rad)
+    extent_px = float(np.ptp(face, axis=0).max())
+    return Square(float(x_px), float(y_px), _FACE_SIDES * max(extent_px, 1.0), turn_rad)
 
 
 def _square(box_px: Box) -> Square:

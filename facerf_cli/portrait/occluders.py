@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.portrait.classes import CLASSES
@@ -18,13 +19,25 @@ def uncovered(seen: Seen, crop: Crop) -> np.ndarray:
 
     Outside of what the network saw it is 1.
     """
-    own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
-    covered = seen.classes[~own].sum(0)
+    return _shown(seen.classes, seen.square.to_share(_places(crop)))
+
+
+def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.ndarray:
+    """The share of `uncovered`, by the classes [C, h, w] of a whole photo of H x W pixels."""
+    return _shown(classes, _places(crop) / (size_px[1], size_px[0]))
+
+
+def _places(crop: Crop) -> np.ndarray:
+    """Centres [S, S, 2] of a crop's pixels in the photo's."""
     centres = (np.arange(crop.size_px) + PIXEL_CENTRE) / crop.scale
-    x, y = np.meshgrid(centres + crop.x0_px, centres + crop.y0_px)
-    grid = 2 * seen.square.to_share(np.stack([x, y], -1)) - 1
-    sampled = F.grid_sample(
-        covered[None, None].float(), torch.from_numpy(grid).float()[None], align_corners=False
-    )[0, 0]
+    return np.stack(np.meshgrid(centres + crop.x0_px, centres + crop.y0_px), -1)
+
+
+def _shown(classes: Tensor, shares: np.ndarray) -> np.ndarray:
+    """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
+    own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
+    covered = classes[~own].sum(0)
+    grid = torch.from_numpy(2 * shares - 1).float()[None]
+    sampled = F.grid_sample(covered[None, None].float(), grid, align_corners=False)[0, 0]
     low, high = _SURE
     return np.asarray((1 - (sampled - low) / (high - low)).clamp(0, 1).numpy())

@@ -76,15 +76,19 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def look_at_person(
-    model: MorphableModel, photo: np.ndarray, fit: FaceFit, square: Crop | None = None
+    model: MorphableModel,
+    photo: np.ndarray,
+    fit: FaceFit,
+    square: Crop | None = None,
+    segmentation: Segmentation | None = None,
 ) -> SeenPerson:
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
 
-    All is seen in the square around the landmarks, or in a given one.
+    All is seen in the square around the landmarks, or in a given one; a `segmentation` may be given.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = square or portrait_square(landmarks_px)
-    segmentation = segment(to_display(photo), landmarks_px)
+    segmentation = segmentation or segment(to_display(photo), landmarks_px)
     classes = _classes_in(segmentation, square)
     proxy = proxy_of(model, fit, classes, square)
     image = torch.from_numpy(square.apply(photo)).permute(2, 0, 1)

@@ -72,11 +72,15 @@ class _Layers(Mapping[str, np.ndarray]):
 
 def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3]."""
+    return segmentation_of(seen_classes(image_srgb, landmarks_px), image_srgb)
+
+
+def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
+    """Shares [C, h, w] of the classes at a small size, which sum to 1; see `segment`."""
     height, width = image_srgb.shape[:2]
     body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
-    scale = min(1.0, _SMALL_PX / max(height, width))
-    size = max(1, round(height * scale)), max(1, round(width * scale))
+    size = _small_size(height, width)
     wide, *close = look(image_srgb, [body, *near])
     shares = torch.stack([_feather(square, size, image_srgb.shape) for square in near])
     seen = torch.stack([_over_photo(one, size, image_srgb.shape) for one in close])
@@ -84,12 +88,24 @@ def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     largest = shares.amax(0)
     classes = torch.lerp(_over_photo(wide, size, image_srgb.shape), mean, largest)
     classes = _connected(classes, largest)
-    classes = classes / classes.sum(0).clamp_min(1e-6)
-    guide = F.interpolate(
-        torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255, size=size, mode="area"
-    )
-    matte = refine_matte(1 - classes[0].numpy(), guide[0].permute(1, 2, 0).numpy(), image_srgb)
-    return Segmentation(classes, matte)
+    return classes / classes.sum(0).clamp_min(1e-6)
+
+
+def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:
+    """The segmentation of an image [H, W, 3] by its classes [C, h, w], whose matte follows its edges."""
+    guide = small_image(image_srgb).permute(1, 2, 0).numpy()
+    return Segmentation(classes, refine_matte(1 - classes[0].numpy(), guide, image_srgb))
+
+
+def small_image(image_srgb: np.ndarray) -> Tensor:
+    """An sRGB uint8 image at the size of its classes [3, h, w], in 0..1."""
+    image = torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255
+    return F.interpolate(image, size=_small_size(*image_srgb.shape[:2]), mode="area")[0]
+
+
+def _small_size(height: int, width: int) -> tuple[int, int]:
+    scale = min(1.0, _SMALL_PX / max(height, width))
+    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def _around(landmarks_px: np.ndarray, sides: float, above: float) -> Square:

@@ -22,6 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import LOGGER_NAME, json_line
+from facerf_cli.stopping import unhurried
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)
@@ -127,7 +128,8 @@ def stop_on_signals() -> Iterator[Stop]:
 
     before = {which: signal.signal(which, note) for which in _SIGNALS}
     try:
-        yield stop
+        with unhurried():
+            yield stop
     finally:
         for which, handler in before.items():
             signal.signal(which, handler)

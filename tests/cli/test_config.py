@@ -85,5 +85,5 @@ def test_a_wrong_file_is_one_line(
 
 def test_no_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert main(["config", "--config", str(tmp_path / "none.toml")]) == 2
-    assert "cannot be read" in capsys.readouterr().err
+    assert "no such file" in capsys.readouterr().err
     assert main(["config", "relighting"]) == 2

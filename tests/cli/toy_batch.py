@@ -43,6 +43,8 @@ class Copy:
             if data == b"wait" and not (self.notes / "victim").exists():
                 self.note("victim", str(os.getpid()))
                 self.sleep()
+            if data == b"fall":
+                os.kill(os.getpid(), signal.SIGKILL)
             temporary.write_bytes(data)
         self.note("written", item.name)
         if data == b"late" and not (self.notes / "late").exists():
@@ -51,7 +53,7 @@ class Copy:
         return Outcome([path], {"bytes": len(data)})
 
     def note(self, name: str, line: str) -> None:
-        with (self.notes / name).open("a") as stream:
+        with (self.notes / name).open("a", errors="surrogateescape") as stream:
             fcntl.flock(stream, fcntl.LOCK_EX)
             stream.write(line + "\n")
 

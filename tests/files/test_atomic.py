@@ -2,12 +2,19 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.files.atomic import _machine, atomic_path
+from facerf_cli.files import atomic
+from facerf_cli.files.atomic import _machine, atomic_path, sweep_leftovers
+
+
+@pytest.fixture(autouse=True)
+def _no_folder_was_swept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(atomic, "_swept", set())
 
 
 def _dead_process() -> int:
@@ -18,23 +25,32 @@ def _dead_process() -> int:
 
 def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) -> None:
     dead, alive, elsewhere = (f"{_machine()}-{_dead_process()}", f"{_machine()}-{os.getppid()}", "0123abcd-1")
-    (tmp_path / f".a.part-{dead}.exr").write_text("half")
-    (tmp_path / f".folder.part-{dead}").mkdir()
-    (tmp_path / f".a.part-{elsewhere}2.exr").write_text("of a machine that has been off for a week")
-    os.utime(tmp_path / f".a.part-{elsewhere}2.exr", (0, time.time() - 7 * 86400))
+    (tmp_path / f".a.part-{dead}-00ff").mkdir()
+    (tmp_path / f".a.part-{dead}-00ff" / "a.exr").write_text("half")
+    (tmp_path / f".b.part-{dead}.exr").write_text("as older versions named them")
+    (tmp_path / f".a.part-{elsewhere}2-00ff").mkdir()
+    os.utime(tmp_path / f".a.part-{elsewhere}2-00ff", (0, time.time() - 7 * 86400))
     kept = [
-        tmp_path / f".a.part-{elsewhere}.exr",
-        tmp_path / f".a.part-{alive}.exr",
-        tmp_path / f".ab.part-{dead}.exr",
-        tmp_path / f".a.part-{dead}.txt",
+        tmp_path / f".a.part-{elsewhere}-00ff",
+        tmp_path / f".a.part-{alive}-00ff",
+        tmp_path / ".a.part-x",
     ]
     for path in kept:
-        path.write_text("not ours to remove")
+        path.mkdir()
     with atomic_path(tmp_path / "a.exr") as temporary:
         temporary.write_text("whole")
     with atomic_path(tmp_path / "folder") as temporary:
         temporary.mkdir()
     assert sorted(tmp_path.iterdir()) == sorted([*kept, tmp_path / "a.exr", tmp_path / "folder"])
+
+
+def test_a_folder_is_searched_for_leftovers_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[Path] = []
+    monkeypatch.setattr(atomic, "sweep_leftovers", searched.append)
+    for name in ("a", "b", "c"):
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.write_text("x")
+    assert searched == [tmp_path]
 
 
 def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
@@ -43,4 +59,117 @@ def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
         raise KeyError
     with pytest.raises(FacerfError, match="could not be written"), atomic_path(tmp_path / "a.exr"):
         pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_temporary_name_cannot_be_foreseen_and_belongs_to_its_owner(tmp_path: Path) -> None:
+    rooms = []
+    for _ in range(2):
+        with atomic_path(tmp_path / "a.png") as temporary:
+            rooms.append(temporary.parent)
+            assert temporary.parent.stat().st_mode & 0o777 == 0o700
+            temporary.write_text("x")
+    assert rooms[0] != rooms[1] and len(rooms[0].name.rpartition("-")[2]) == 16
+
+
+def test_a_link_at_the_temporary_name_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "theirs").mkdir()
+    monkeypatch.setattr(atomic.secrets, "token_hex", lambda _: "known")
+    (tmp_path / atomic._room_name("a")).symlink_to(tmp_path / "theirs")
+    with pytest.raises(FacerfError, match="File exists"), atomic_path(tmp_path / "a.png") as temporary:
+        temporary.write_text("x")
+    assert not list((tmp_path / "theirs").iterdir())
+
+
+def test_a_link_in_the_place_of_an_output_is_replaced_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "theirs").write_text("theirs")
+    (tmp_path / "a.txt").symlink_to(tmp_path / "theirs")
+    with atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text("ours")
+    assert (tmp_path / "theirs").read_text() == "theirs" and not (tmp_path / "a.txt").is_symlink()
+
+
+def test_a_long_name_has_a_temporary_one(tmp_path: Path) -> None:
+    for name in ("n" * 251 + ".txt", "\U0001f642" * 62 + ".txt"):  # 252 bytes and more
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.write_text("x")
+        assert (tmp_path / name).read_text() == "x"
+
+
+def test_a_folder_takes_the_place_of_another(tmp_path: Path) -> None:
+    for number in ("1", "2"):
+        with atomic_path(tmp_path / "page") as temporary:
+            temporary.mkdir()
+            (temporary / number).write_text("x")
+    assert [path.name for path in (tmp_path / "page").iterdir()] == ["2"]
+    assert list(tmp_path.iterdir()) == [tmp_path / "page"]
+
+
+class Disk:
+    """A disk that loses at a power cut what was not brought to it, in the way that is worst.
+
+    It records `fsync` and `replace` of a write. After a cut a file that was not synced is empty, and a rename
+    has happened or not, unless its folder was synced after it.
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path, old: str) -> None:
+        self.path, self.old = path, old
+        self.synced: dict[int, str] = {}  # contents by inode
+        self.states: list[set[str]] = [{old}]  # what a cut may leave at `path`, after each step
+        self._fsync, self._replace = os.fsync, os.replace
+        monkeypatch.setattr(os, "fsync", self.fsync)
+        monkeypatch.setattr(os, "replace", self.replace)
+
+    def fsync(self, descriptor: int) -> None:
+        self._fsync(descriptor)
+        state = os.fstat(descriptor)
+        if os.path.isdir(f"/proc/self/fd/{descriptor}"):
+            renamed = os.path.samestat(state, os.stat(self.path.parent)) and len(self.states) > 1
+            self.states.append({self._durable()} if renamed else self.states[-1])
+        else:
+            self.synced[state.st_ino] = Path(f"/proc/self/fd/{descriptor}").read_text()
+
+    def replace(self, source: Path, target: Path) -> None:
+        self._replace(source, target)
+        self.states.append({self.old, self._durable()})
+
+    def _durable(self) -> str:
+        return self.synced.get(self.path.stat().st_ino, "lost")
+
+
+@pytest.mark.parametrize("lacks", ["", "fsync of the file", "fsync of the folder"])
+def test_a_power_cut_leaves_the_old_or_the_new(
+    lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not os.path.isdir("/proc/self/fd"):
+        pytest.skip("needs /proc")
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    disk = Disk(monkeypatch, path, "old")
+    nothing: Callable[..., None] = lambda *_: None  # noqa: E731
+    if lacks:  # the test must be able to fail
+        monkeypatch.setattr(atomic, "_sync_all" if "file" in lacks else "_sync_folder", nothing)
+    with atomic_path(path) as temporary:
+        temporary.write_text("new")
+    never_half = all(state <= {"old", "new"} for state in disk.states)
+    assert (never_half, disk.states[-1] == {"new"}) == (lacks != "fsync of the file", lacks == "")
+
+
+def test_all_of_a_folder_is_brought_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(atomic, "_sync", lambda path: synced.append(path.name))
+    with atomic_path(tmp_path / "page") as temporary:
+        (temporary / "images").mkdir(parents=True)
+        (temporary / "images" / "a.png").write_text("x")
+        (temporary / "index.html").write_text("x")
+    assert set(synced) == {"a.png", "index.html", "images", "page", tmp_path.name}
+    assert synced[-1] == tmp_path.name
+
+
+def test_a_killed_worker_s_leftovers_are_swept(tmp_path: Path) -> None:
+    (tmp_path / f".a.part-{_machine()}-{_dead_process()}-00ff").mkdir()
+    sweep_leftovers(tmp_path)
+    sweep_leftovers(tmp_path / "missing")
     assert not list(tmp_path.iterdir())

@@ -4,7 +4,15 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.envmap import ball, check_envmap, envmap_weights, rotated_weights, texel_integrals
+from facerf_cli.light.envmap import (
+    Sampling,
+    ball,
+    check_envmap,
+    envmap_weights,
+    rotated_weights,
+    texel_integrals,
+)
+from facerf_cli.light.rig_triangles import lights_around
 from facerf_cli.light.sphere import (
     azel_to_direction,
     direction_to_uv,
@@ -169,3 +177,40 @@ def test_broken_pixels_are_counted() -> None:
     envmap[1, 2, 0], envmap[3, 3] = torch.nan, torch.inf
     with pytest.raises(InputError, match="2 pixels"):
         check_envmap(envmap)
+
+
+def _sun(rotations_deg: list[float], lights: int, sampling: Sampling) -> torch.Tensor:
+    """Weights [R, L] of a small sun that turns."""
+    envmap = torch.zeros(64, 128, 3)
+    envmap[24, 40] = 50.0
+    return rotated_weights(envmap, rig_directions(lights), rotations_deg, sampling)[..., 0]
+
+
+def test_a_sun_that_turns_passes_smoothly_from_light_to_light() -> None:
+    turns_deg = [0.5 * step for step in range(60)]
+    smooth, cells = (_sun(turns_deg, 60, sampling) for sampling in ("smooth", "cell"))
+    torch.testing.assert_close(smooth.sum(1), cells.sum(1))  # no light is lost
+    most = [float((x.diff(dim=0).abs().sum(1) / x.sum(1)[1:]).max()) for x in (smooth, cells)]
+    # lights are 26 degrees apart: half a degree moves a fiftieth of the sun out of one light and into others
+    assert most[0] < 0.06 and most[1] > 0.3
+
+
+def test_shares_of_a_direction_point_to_it() -> None:
+    rig = rig_directions(40)
+    towards = torch.nn.functional.normalize(torch.randn(500, 3, dtype=torch.float64), dim=1)
+    index, share = lights_around(towards, rig)
+    assert (share >= 0).all()
+    torch.testing.assert_close(share.sum(1), torch.ones(500, dtype=torch.float64))
+    mean = torch.nn.functional.normalize((share[..., None] * rig.double()[index]).sum(1), dim=1)
+    torch.testing.assert_close(mean, towards, atol=1e-6, rtol=0)
+    on_lights = lights_around(rig.double(), rig)
+    best = on_lights[0].gather(1, on_lights[1].argmax(1, keepdim=True))[:, 0]
+    assert best.tolist() == list(range(40))
+
+
+@pytest.mark.parametrize("lights", [[[0.0, 0, 1]], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.6, 0.53]]])
+def test_directions_that_no_rig_surrounds_go_to_the_nearest_light(lights: list[list[float]]) -> None:
+    rig = torch.tensor(lights)
+    index, share = lights_around(torch.tensor([[0.0, 0, -1], [0.0, 0.1, 1.0]]), rig)
+    assert share[0].tolist() == [1.0, 0.0, 0.0] and share.sum(1).tolist() == pytest.approx([1.0, 1.0])
+    assert int(index[0, 0]) == int((rig @ torch.tensor([0.0, 0, -1])).argmax())

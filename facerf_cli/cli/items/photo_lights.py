@@ -1,6 +1,7 @@
 """The light of one photo: estimated, and written as a map, as JSON and as an image to look at."""
 
 import logging
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from facerf_cli.cli.items.photos import (
     read_matte,
     read_photo,
 )
+from facerf_cli.cli.items.shot_frames import seen_frame, view_of
 from facerf_cli.cli.light_options import LightOptions
+from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import LinearImage, write_display, write_exr
@@ -42,6 +45,15 @@ def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
         feature_network(options.vgg_weights)
 
 
+def write_shot_light(shot: Shot, item: Item, options: LightOptions, width_px: int, sh_order: int) -> Any:
+    """Estimate and write the one light of a shot, from key frames together; facts for the report."""
+    view = view_of(shot, options.photo)
+    number, *others = view.middle_first
+    image, face = seen_frame(shot, number, options.photo, portrait=False)
+    more = [view.head(frame) for frame in others]
+    return _write(item, image, face, options, width_px, sh_order, more) | {"frames": view.key_frames}
+
+
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
     """Estimate and write the light of each chosen face of a photo; their tags, and facts for the report."""
     image = read_photo(item, options.photo)
@@ -60,7 +72,7 @@ def light_of_photo(path: Path, options: LightOptions) -> RigLight:
 
 
 def _estimate(
-    item: Item, image: LinearImage, head: Head, options: LightOptions
+    item: Item, image: LinearImage, head: Head, options: LightOptions, more: Sequence[Head] = ()
 ) -> tuple[LightEstimate, dict[str, Any]]:
     """The light of one fitted face, and facts for the report."""
     models = load_models_once(options.photo)
@@ -73,6 +85,7 @@ def _estimate(
             directions_of(options.rig),
             Estimator(options.non_negative, features),
             options.keep_eyes,
+            more,
         )
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
@@ -132,9 +145,15 @@ def feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
 
 
 def _write(
-    item: Item, image: LinearImage, face: FittedFace, options: LightOptions, width_px: int, sh_order: int
+    item: Item,
+    image: LinearImage,
+    face: FittedFace,
+    options: LightOptions,
+    width_px: int,
+    sh_order: int,
+    more: Sequence[Head] = (),
 ) -> dict[str, Any]:
-    estimate, facts = _estimate(item, image, face.head, options)
+    estimate, facts = _estimate(item, image, face.head, options, more)
     models = load_models_once(options.photo)
     said = {f"facerf:light_{name}": _as_metadata(value) for name, value in facts.items()}
     metadata = provenance(item, options.photo, models.checkpoint_name) | said

@@ -29,9 +29,10 @@ from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
+from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
-_LANDMARK_SUFFIXES = (".pts", ".json")
+LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -42,6 +43,7 @@ class FittedFace:
     tag: str
     found: FaceBox
     head: Head
+    steady: SteadyFrame | None = None  # of a frame of a shot
 
     @property
     def fit(self) -> FaceFit:
@@ -177,7 +179,7 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
 
 def _given(item: Item, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
-    return face_at(read_landmarks(companion(item, landmarks, _LANDMARK_SUFFIXES, "--landmarks")))
+    return face_at(read_landmarks(companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")))
 
 
 def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:

@@ -31,13 +31,15 @@ from facerf_cli.cli.items.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.cli.items.shot_frames import seen_frame, view_of
 from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight_work import Relight
+from facerf_cli.cli.shots import shot_of
 from facerf_cli.colour import ExposureRule
 from facerf_cli.composite import Composition, Relit, RelitImage, Target
 from facerf_cli.errors import InputError
-from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
@@ -94,8 +96,7 @@ def _is_stack(item: Item) -> bool:
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
-    image = read_photo(item, work.photo)
-    faces = fit_faces(item, image, work.photo)
+    image, faces = _seen(item, work)
     metadata = _metadata(item, work)
     chosen_ev = _shared_exposures(item, work)
     written: Written = {}
@@ -108,9 +109,26 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     return written, facts_of(faces)
 
 
+def _seen(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
+    """The image of an item and its faces; those of a frame of a shot steadied by the frames around it."""
+    if place := shot_of(work.shots, item):
+        image, face = seen_frame(*place, work.photo, work.reflectance == "portrait")
+        return image, [face]
+    image = read_photo(item, work.photo)
+    return image, fit_faces(item, image, work.photo)
+
+
+def _leader_of(item: Item, work: Relight) -> Item | None:
+    """The photo whose exposure an item shares; of a shot a frame of its middle."""
+    place = shot_of(work.shots, item)
+    if place is None:
+        return work.leader_of(item)
+    return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
+
+
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
-    """The exposures of an item's group; None where it has none, or is the first of it."""
-    leader = work.leader_of(item)
+    """The exposures of an item's group; None where it has none, or is the one that it has them of."""
+    leader = _leader_of(item, work)
     if leader is None or leader == item:
         return None
     if (leader, work) not in _of_leaders:  # another process has written it, or an earlier run
@@ -119,12 +137,13 @@ def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
 
 
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of the first photo or stack of a group."""
+    """Exposures of a photo or stack that others share."""
+    if isinstance(work.exposure, float):
+        return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     if _is_stack(leader):
         shown = _show_stack(leader, work)[0]
     else:
-        image = read_photo(leader, work.photo)
-        shown = _together(leader, image, fit_faces(leader, image, work.photo), work)
+        shown = _together(leader, *_seen(leader, work), work)
     return _exposures_ev(_parts(shown, work), shown.relit, shown.composer, work)
 
 
@@ -163,9 +182,9 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
 
 def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> _Shown:
     models, head = load_models_once(work.photo), face.head
-    target = _target(item, head.fit, image, work)
+    target = _target(item, face, image, work)
     reflectance = reflectance_of(
-        models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels
+        models, head, work.reflectance, work.network_alone, work.memory_bytes, image.pixels, face.steady
     )
     composition = composition_of(models, image.pixels, head, reflectance, target)
     directions, weights = weights_over_rig(work.setups, work.rig, work.sampling)
@@ -192,13 +211,15 @@ def _each_light(setup: LightSetup) -> tuple[LightSetup, ...]:
     return tuple(replace(setup, lights=(light,)) for light in setup.lights)
 
 
-def _target(item: Item, fit: FaceFit, image: LinearImage, work: Relight) -> Target:
+def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> Target:
     """The head in the pose of `--pose`, composed as the options choose."""
     rotation = rotation_of(work.pose)
-    posed = None if rotation is None else replace(fit, rotation=rotation)
+    posed = None if rotation is None else replace(face.fit, rotation=rotation)
     if work.composite != "photo":
         return Target(posed, work.composite)
     matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
+    if matte is None and face.steady is not None:
+        matte = face.steady.segmentation.matte
     kind = work.background.kind
     return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
 
@@ -309,7 +330,7 @@ def _write_setups(
         return shown.relit(part) if whole is None else whole
 
     exposures_ev = chosen_ev or _exposures_ev(parts, relit_by_part, shown.composer, work)
-    if work.leader_of(item) == item:
+    if _leader_of(item, work) == item:
         _of_leaders[item, work] = dict(exposures_ev)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
@@ -321,7 +342,7 @@ def _write_setups(
                 layers = {**layers, **dict(zip(setup.names, each, strict=True))}
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
-            if work.output.shown_suffix:
+            if work.output.shown_suffix and not chosen_ev:
                 log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
 

@@ -1,6 +1,7 @@
 """The person of one photo, cut out of it, as files."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,9 @@ import numpy as np
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import facts_of_found, find_people, read_photo, stamp
+from facerf_cli.cli.items.shot_frames import segmented_frame
 from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.shots import Shot, shot_of
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.face.landmarks import Face, to_display
 from facerf_cli.files.documents import write_document
@@ -25,24 +28,32 @@ _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 _HUES = np.array([0.07, 0.6, 0.5, 0.95, 0.9, 0.78, 0.7, 0.33, 0.14, 0.45, 0.85, 0.62, 0.25])
 
 
-def write_segments(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, Any]]:
-    """Segment and write each chosen person of a photo; their tags, and facts for the report."""
+def write_segments(
+    item: Item, options: PhotoOptions, shots: Sequence[Shot] = ()
+) -> tuple[list[str], dict[str, Any]]:
+    """Segment and write each chosen person of a photo; their tags, and facts for the report.
+
+    The person of a frame of a shot is steadied by the frames around it.
+    """
+    if place := shot_of(shots, item):
+        image, face, found = segmented_frame(*place, options)
+        _write(item, "", image, to_display(image.pixels), face, found)
+        return [""], {}
     image = read_photo(item, options)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     for tag, face in reversed(people):
-        _write(item, tag, image, display, face, options)
+        _write(item, tag, image, display, face, segment(display, face.landmarks_px))
     return [tag for tag, _ in people], facts_of_found([face for _, face in people])
 
 
 def _write(
-    item: Item, tag: str, image: LinearImage, display: np.ndarray, face: Face, options: PhotoOptions
+    item: Item, tag: str, image: LinearImage, display: np.ndarray, face: Face, found: Segmentation
 ) -> None:
     def path(ending: str) -> Path:
         return item.output(tag + ending)
 
     metadata = stamp(item)
-    found = segment(display, face.landmarks_px)
     colours = person_colours(image.pixels, found.matte)
     write_exr(path("_segment.exr"), colours, found.matte, found.layers(), metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)

@@ -17,7 +17,9 @@ import OpenImageIO as oiio
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.case import Case, Comparison, read_array
+from facerf_cli.files.image_metadata import oiio_error, utf8_path
 from facerf_cli.files.images import LinearImage, read_image
+from facerf_cli.files.regular import is_regular
 from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
@@ -186,9 +188,9 @@ def _size_px(path: Path) -> tuple[int, int]:
     if path.suffix.lower() == ".npy":
         height, width = read_array(path).shape[:2]
         return width, height
-    stream = oiio.ImageInput.open(str(path))
+    stream = oiio.ImageInput.open(utf8_path(path)) if is_regular(path) else None
     if stream is None:
-        oiio.geterror()  # clears the message, which would be printed at exit
+        oiio_error()
         read_image(path)  # raises an error that names the cause
         raise FacerfError(f"{path}: cannot be read; check the file")
     spec = stream.spec()

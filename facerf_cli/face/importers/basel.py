@@ -15,45 +15,28 @@ the neutral face. `metadata/landmarks/json`, written by scalismo, names points o
 list of `id` and `coordinates`.
 """
 
-import importlib
-import zlib
+import importlib.util
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import scipy.io
-from scipy.io.matlab import MatReadError
 
 from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.face.importers.basel_arrays import CELLS, LANDMARKS, MAX_SHAPES
 from facerf_cli.face.importers.source import SourceModel, require_mesh
+from facerf_cli.files.apart import arrays_apart
 from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import one_line
 
-_MAX_BYTES, _MAX_ENTRIES, _MAX_SHAPES = 1 << 30, 120_000_000, 500
-_MAX_TEXT = 1 << 20  # bytes of the landmarks' JSON
-
+_READERS = "facerf_cli.face.importers.basel_arrays"  # in a process of their own
 _LICENCE_2009 = "Basel Face Model 2009, (c) University of Basel; non-commercial use, by its licence agreement"
-_ARRAYS_2009 = ("shapeMU", "shapePC", "shapeEV", "tl")
-_NUMBERS = ("single", "double", "int16", "uint16", "int32", "uint32", "int64", "uint64")  # kinds of arrays
 _VERTICES_2009 = 53490
 # MPEG-4 feature points among the 68 landmarks: number and vertex from 0, eos's ibug_to_bfm.txt (Apache-2.0).
 _LANDMARKS_2009 = """
 17 38792 | 19 40087 | 21 40514 | 22 41091 | 24 41511 | 26 42825 | 30 8319 | 33 8334 | 36 2088 | 39 5959
 42 10603 | 45 14472 | 48 5006 | 51 8344 | 54 11714 | 57 8374 | 62 8354 | 66 8366
 """
-# Errors that reading a damaged .mat can raise.
-_MAT_ERRORS = (
-    NotImplementedError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    OSError,
-    EOFError,
-    zlib.error,
-    MatReadError,
-)
-
 _LICENCE_2017 = (
     "Basel Face Model {year}, (c) University of Basel; non-commercial use, by its licence agreement"
 )
@@ -85,12 +68,11 @@ def read_basel_2009(path: Path) -> SourceModel:
     """Read the model from `01_MorphableModel.mat` or its folder; raises InputError for any other file."""
     if path.is_dir():
         path = next(iter(sorted(path.rglob("01_MorphableModel.mat"))), path / "01_MorphableModel.mat")
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the Basel Face Model's 01_MorphableModel.mat")
+    require_regular(path, "give the Basel Face Model's 01_MorphableModel.mat")
     try:
         mean, basis, deviations, triangles = _arrays_2009(path)
         require_mesh(mean, triangles)
-    except _MAT_ERRORS as error:
+    except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(
             f"{path}: not a Basel Face Model 2009 ({one_line(str(error))[:160]}); "
             "give 01_MorphableModel.mat as it was downloaded"
@@ -109,21 +91,12 @@ def read_basel_2009(path: Path) -> SourceModel:
 
 def _arrays_2009(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Mean [N, 3] in metres, unit basis [3 N, K], deviations [K] in metres, triangles [F, 3] from 0."""
-    if path.stat().st_size > _MAX_BYTES:
-        raise ValueError("it is too large")
-    listed = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(path)}
-    for name in _ARRAYS_2009:
-        if name not in listed:
-            raise ValueError(f"it lacks {name}")
-        shape, kind = listed[name]
-        if len(shape) != 2 or shape[0] * shape[1] > _MAX_ENTRIES or kind not in _NUMBERS:
-            raise ValueError(f"{name} is a {kind} of shape {list(shape)}")
-    raw = scipy.io.loadmat(path, variable_names=_ARRAYS_2009)  # numbers only: no objects, no functions
-    mean, basis, deviations = (raw[name] for name in _ARRAYS_2009[:3])
+    raw = arrays_apart(_READERS, "arrays_2009", path)
+    mean, basis, deviations = (raw[name] for name in ("shapeMU", "shapePC", "shapeEV"))
     mean, deviations = mean.ravel().astype(np.float64), deviations.ravel().astype(np.float32)
-    if basis.shape != (len(mean), len(deviations)) or len(mean) % 3 or len(deviations) > _MAX_SHAPES:
+    if basis.shape != (len(mean), len(deviations)) or len(mean) % 3 or len(deviations) > MAX_SHAPES:
         raise ValueError(f"shapePC has shape {list(basis.shape)}, not [{len(mean)}, {len(deviations)}]")
-    if not all(np.isfinite(field).all() for field in (mean, basis, deviations)):
+    if not all(np.isfinite(field).all() for field in (mean, basis, deviations, raw["tl"])):
         raise ValueError("it holds values that are not finite")
     triangles = raw["tl"].astype(np.int64) - 1
     return mean.reshape(-1, 3) / 1e6, basis, deviations / 1e6, triangles
@@ -142,33 +115,22 @@ def read_basel_2017(path: Path, kind: str = "basel-2017") -> SourceModel:
 
     Raises FacerfError where h5py, of the extra `face-models`, is missing.
     """
-    h5py = _h5py()
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give the Basel Face Model's .h5")
+    if importlib.util.find_spec("h5py") is None:
+        raise FacerfError("Basel Face Model: h5py is missing; run pip install 'facerf[face-models]'")
+    require_regular(path, "give the Basel Face Model's .h5")
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            return _source_2017(file, kind)
-    except (ValueError, KeyError, TypeError, IndexError, OSError, RuntimeError, RecursionError) as error:
+        return _source_2017(arrays_apart(_READERS, "arrays_2017", path), kind)
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as error:
         raise InputError(
             f"{path}: not a Basel Face Model {_YEARS[kind]} ({one_line(str(error))[:160]}); "
             "give its .h5 as it was downloaded"
         ) from None
 
 
-def _h5py() -> Any:
-    """Import the optional package h5py."""
-    try:
-        return importlib.import_module("h5py")
-    except ImportError:
-        raise FacerfError(
-            "Basel Face Model: h5py is missing; run pip install 'facerf[face-models]'"
-        ) from None
-
-
-def _source_2017(file: Any, kind: str) -> SourceModel:
-    mean, identity = _linear_model(file, "shape")
-    usual, expression = _linear_model(file, "expression")
-    triangles = _numbers(file, "shape/representer/cells").astype(np.int64).T
+def _source_2017(arrays: Mapping[str, np.ndarray], kind: str) -> SourceModel:
+    mean, identity = _linear_model(arrays, "shape")
+    usual, expression = _linear_model(arrays, "expression")
+    triangles = arrays[CELLS].astype(np.int64).T
     if usual.shape != mean.shape:
         raise ValueError(f"its expressions have {len(usual)} vertices, its shapes {len(mean)}")
     require_mesh(mean, triangles)
@@ -181,17 +143,15 @@ def _source_2017(file: Any, kind: str) -> SourceModel:
         expression=np.concatenate([usual[None].astype(expression.dtype), expression]),
         expression_names=("mean_expression", *names),
         triangles=triangles,
-        known=_known_2017(file, mean),
+        known=_known_2017(arrays, mean),
     )
 
 
-def _linear_model(file: Any, group: str) -> tuple[np.ndarray, np.ndarray]:
+def _linear_model(arrays: Mapping[str, np.ndarray], group: str) -> tuple[np.ndarray, np.ndarray]:
     """Mean [N, 3] in metres, and basis [K, N, 3] in metres per standard deviation."""
-    mean, basis, variance = (
-        _numbers(file, f"{group}/model/{name}") for name in ("mean", "pcaBasis", "pcaVariance")
-    )
+    mean, basis, variance = (arrays[f"{group}/model/{name}"] for name in ("mean", "pcaBasis", "pcaVariance"))
     mean, variance = mean.ravel(), variance.ravel()
-    if basis.shape != (len(mean), len(variance)) or len(mean) % 3 or not 1 <= len(variance) <= _MAX_SHAPES:
+    if basis.shape != (len(mean), len(variance)) or len(mean) % 3 or not 1 <= len(variance) <= MAX_SHAPES:
         raise ValueError(f"{group}/model/pcaBasis has shape {list(basis.shape)}")
     if not np.allclose(np.linalg.norm(basis[:, 0].astype(np.float64)), 1, atol=0.01):
         raise ValueError(f"{group}/model/pcaBasis is not of unit length")
@@ -201,43 +161,12 @@ def _linear_model(file: Any, group: str) -> tuple[np.ndarray, np.ndarray]:
     return mean.reshape(-1, 3) / 1000, scaled.T.reshape(len(variance), -1, 3)
 
 
-def _numbers(file: Any, name: str) -> np.ndarray:
-    """Read the numbers of a dataset; raises ValueError for links, large datasets and values not finite."""
-    dataset = _dataset(file, name)
-    if dataset.dtype.kind not in "fiu" or dataset.size > _MAX_ENTRIES or dataset.ndim > 2:
-        raise ValueError(f"{name} is {dataset.dtype} of shape {list(dataset.shape)}")
-    values = dataset[()]
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds values that are not finite")
-    return values.astype(np.float64) if values.ndim < 2 else values
-
-
-def _dataset(file: Any, name: str) -> Any:
-    """The dataset `name`, stored in this file."""
-    h5py = _h5py()
-    at = file
-    for part in name.split("/"):
-        link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
-        if link is None:
-            raise ValueError(f"it lacks {name}")
-        if not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{name} is a link")
-        at = at[part]
-    if not isinstance(at, h5py.Dataset) or at.external or at.is_virtual:
-        raise ValueError(f"{name} is not a dataset of this file")
-    return at
-
-
-def _known_2017(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
+def _known_2017(arrays: Mapping[str, np.ndarray], mean: np.ndarray) -> dict[int, np.ndarray]:
     """The known landmarks on the mean [N, 3] by number; none where the file names no points."""
-    try:
-        dataset = _dataset(file, "metadata/landmarks/json")
-    except ValueError:
+    if LANDMARKS not in arrays:
         return {}
-    if dataset.nbytes > _MAX_TEXT:
-        raise ValueError("metadata/landmarks/json is too long")
     known = {}
-    for entry in parse_json(_text(dataset[()])):
+    for entry in parse_json(arrays[LANDMARKS].tobytes()):
         number = _LANDMARKS_2017.get(str(entry["id"]))
         point = np.array(entry["coordinates"], dtype=np.float64) / 1000
         if number is None or point.shape != (3,) or not np.isfinite(point).all():
@@ -246,10 +175,3 @@ def _known_2017(file: Any, mean: np.ndarray) -> dict[int, np.ndarray]:
         if np.linalg.norm(mean[nearest] - point) < _ON_MEAN_M:
             known[number] = mean[nearest]
     return known
-
-
-def _text(stored: Any) -> str | bytes:
-    """Convert a text as h5py reads it: text, bytes, or an array of one text or of its bytes."""
-    if isinstance(stored, np.ndarray) and stored.dtype.kind in "OSU" and stored.size == 1:
-        stored = stored.item()
-    return stored if isinstance(stored, (str, bytes)) else np.asarray(stored).tobytes()

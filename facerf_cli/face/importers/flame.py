@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import SourceModel, read_npz, require_mesh
+from facerf_cli.face.morphable import NPZ_ERRORS
 from facerf_cli.files.inert_arrays import array_of
 from facerf_cli.files.inert_pickle import read_inert_pickle, read_inert_stream
 from facerf_cli.logs import one_line
@@ -62,7 +63,7 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
         if not isinstance(raw, dict):
             raise ValueError(f"it holds a {type(raw).__name__}, not a table of arrays")
         source = _source({key: value for key, value in raw.items() if isinstance(key, str)}, path.stem)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
+    except (IndexError, AttributeError, OverflowError, KeyError, ValueError, TypeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))[:160]
         raise InputError(f"{path}: not a FLAME model ({reason}); download it again") from None
     if landmarks or found.is_file():
@@ -153,7 +154,7 @@ def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[
         raise InputError(
             f"{path}: no landmarks (none of {keys}); give an embedding of FLAME's landmarks"
         ) from None
-    except (ValueError, KeyError, TypeError, OSError, EOFError) as error:
+    except (IndexError, *NPZ_ERRORS) as error:
         raise InputError(
             f"{path}: no landmarks ({one_line(str(error))[:160]}); give an embedding of FLAME's landmarks"
         ) from None

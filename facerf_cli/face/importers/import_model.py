@@ -11,6 +11,7 @@ from facerf_cli.face.importers.ict import read_ict_facekit
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import one_line
 
 _MAX_LETTERS = 10_000  # of a list of vertex numbers
@@ -48,6 +49,7 @@ def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
 
 def _listed(path: Path, mean: np.ndarray) -> dict[int, np.ndarray]:
     """The landmarks on a mean [N, 3] by number, from a text file of 68 vertex numbers."""
+    require_regular(path, "give a .txt of 68 vertex numbers")
     try:
         numbers = [int(word) for word in path.read_text(encoding="utf-8")[:_MAX_LETTERS].split()]
     except (OSError, ValueError) as error:

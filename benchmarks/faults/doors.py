@@ -1,0 +1,336 @@
+"""The doors: each reader of files or words that a user gives, with its sound samples and its faults."""
+
+import io
+import json
+import os
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.faults import mutations, samples
+from benchmarks.faults.mutations import Mutation
+from benchmarks.faults.samples import Samples
+
+
+@dataclass(frozen=True)
+class Door:
+    """A reader: `open` gets a file's path. `fixed` files stand beside the damaged one.
+
+    `weight` is its share of a campaign's cases; heavy readers have less.
+    """
+
+    sound: Callable[[], Samples]
+    open: Callable[[Path], object]
+    faults: tuple[Mutation, ...] = (mutations.bytes_,)
+    weight: float = 1.0
+    fixed: Callable[[], Mapping[str, bytes]] = field(default=dict)
+
+
+def _image(path: Path) -> None:
+    from facerf_cli.files.image_metadata import read_header
+    from facerf_cli.files.images import read_image
+    from facerf_cli.files.olat_stack import is_olat_stack
+
+    read_header(path)
+    is_olat_stack(path)
+    read_image(path)
+
+
+def _stack(path: Path) -> None:
+    from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olat_stack
+
+    is_olat_stack(path)
+    read_olat_header(path)
+    read_olat_stack(path)
+
+
+def _light(path: Path) -> None:
+    from facerf_cli.files.light_files import face_model_of_map, read_light_file
+
+    read_light_file(path)
+    face_model_of_map(path)
+
+
+def _numbers(path: Path) -> None:
+    from facerf_cli.files.light_files import read_numbers
+
+    read_numbers(path, (9, 27))
+
+
+def _map(path: Path) -> None:
+    from facerf_cli.files.light_files import read_map_file
+
+    read_map_file(path)
+
+
+def _landmarks(path: Path) -> None:
+    from facerf_cli.face.landmarks import read_landmarks
+
+    read_landmarks(path)
+
+
+def _light_list(path: Path) -> None:
+    from facerf_cli.capture.draft_lights import match_lights, read_light_list
+
+    match_lights(read_light_list(path), ["a", "b"], {"image_00": "a"})
+
+
+def _table(path: Path) -> None:
+    from facerf_cli.capture.yale_b import read_shifts
+    from facerf_cli.evaluation.protocols.pairs import read_facts
+
+    (read_shifts if path.name == "shifts.csv" else read_facts)(path)
+
+
+def _directions(path: Path) -> None:
+    from facerf_cli.cli.values import parse_lights
+
+    parse_lights(str(path))
+
+
+def _checkpoint(path: Path) -> None:
+    from facerf_cli.face.topology import LAYOUT_VERSION
+    from facerf_cli.network.checkpoint import load_checkpoint, load_networks
+
+    load_checkpoint(path)
+    load_networks(path, LAYOUT_VERSION)
+
+
+def _fit(path: Path) -> None:
+    from facerf_cli.face.fit import load_fit
+
+    load_fit(path)
+
+
+def _array(path: Path) -> None:
+    from facerf_cli.evaluation.case import read_array
+
+    read_array(path)
+
+
+def _face_model(path: Path) -> None:
+    from facerf_cli.face.morphable import load_face_model, read_model_facts
+
+    read_model_facts(path)
+    load_face_model(str(path))
+
+
+def _flame(path: Path) -> None:
+    from facerf_cli.face.importers.flame import read_embedding, read_flame
+
+    if path.name.startswith("embedding"):
+        mean, triangles = samples._grid()
+        read_embedding(path, mean, triangles)
+    else:
+        read_flame(path)
+
+
+def _basel_2009(path: Path) -> None:
+    from facerf_cli.face.importers.basel import read_basel_2009
+
+    read_basel_2009(path)
+
+
+def _basel_2017(path: Path) -> None:
+    from facerf_cli.face.importers.basel import read_basel_2017
+
+    read_basel_2017(path)
+
+
+def _ict(path: Path) -> None:
+    from facerf_cli.face.importers.ict import read_ict_facekit
+
+    read_ict_facekit(path)
+
+
+def _stage(path: Path) -> None:
+    from facerf_cli.capture.stage_json import read_stage
+
+    read_stage(path.parent)
+
+
+def _dataset(path: Path) -> None:
+    from facerf_cli.dataset.dataset import read_dataset
+
+    read_dataset(path.parent)
+
+
+def _pairs(path: Path) -> None:
+    from facerf_cli.dataset.dataset import read_dataset
+    from facerf_cli.dataset.pairs import RELIT, read_pairs
+
+    relit = path.parent / RELIT
+    relit.mkdir(exist_ok=True)
+    os.replace(path, relit / path.name)
+    read_pairs(read_dataset(path.parent))
+
+
+def _rig(path: Path) -> None:
+    from facerf_cli.cli.light_entries import lit_images
+
+    lit_images([str(path)])
+
+
+def _configuration(path: Path) -> None:
+    import typer
+
+    from facerf_cli.cli.config import read_config
+    from facerf_cli.main import app
+
+    read_config(path, typer.main.get_command(app))
+
+
+def _index(path: Path) -> None:
+    from facerf_cli.cli.folder_index import FolderIndex, check_outputs
+    from facerf_cli.cli.options import Shard
+
+    list(check_outputs(path.parent))
+    index = FolderIndex(path.parent, "segment", Shard(), lambda _: [{"verb": "segment", "files": {}}])
+    index.why_again(path, [path.parent / "x.png"])
+    index.open()
+
+
+def _report(path: Path) -> None:
+    from facerf_cli.cli.batch import _open_report
+
+    _open_report(path, "segment", [], [], lambda _: [])
+
+
+def _figures(path: Path) -> None:
+    from facerf_cli.evaluation.case_files import images_csv, read_figures
+
+    images_csv(read_figures(path).rows)
+
+
+def _names(path: Path) -> None:
+    """The file's content is a name: of an input, in a report, a page and a message."""
+    from facerf_cli.cli.batch import _rows_of
+    from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.cli.naming import NamePattern
+    from facerf_cli.logs import json_line, shown
+    from facerf_cli.viewer.page import IndexEntry, index_page
+
+    name = os.fsdecode(path.read_bytes().replace(b"/", b"").replace(b"\0", b"")[:180]) + ".png"
+    folder = path.parent / "photos"
+    folder.mkdir(exist_ok=True)
+    for old in folder.iterdir():
+        old.unlink()
+    (folder / name).write_bytes(b"x")
+    out = path.parent / "out"
+    if name.startswith("."):
+        return
+    (item,) = collect_items([str(folder)], out, PHOTO_SUFFIXES)
+    pattern = NamePattern.parse("{dir}/{stem}_{ext}_{frame:04}", "--name")
+    for made in (item.output("_relit.exr"), item.filled(pattern)):
+        assert out in Path(os.path.normpath(made)).parents, f"out of the folder: {made!a}"
+    report = path.parent / "report.jsonl"
+    report.write_text(json_line({"verb": "x", "item": item.name}) + "\n", encoding="utf-8")
+    (row,) = _rows_of(report)
+    assert row["item"] == json.loads(json_line({"item": item.name}))["item"]
+    assert "<script>x" not in index_page([IndexEntry(f"<script>x{name}", name, "")])
+    assert shown(name).isprintable()
+
+
+def _words(path: Path) -> None:
+    """The file's content is the value of an option."""
+    from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.cli.light_entries import lit_images
+    from facerf_cli.cli.naming import NamePattern
+    from facerf_cli.cli.options import Shard
+    from facerf_cli.cli.output_options import parse_formats
+    from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
+    from facerf_cli.errors import FacerfError
+
+    word = path.read_bytes().decode("utf-8", "surrogateescape").replace("\0", "")
+    refused = None
+    readers: tuple[Callable[[str], object], ...] = (
+        lambda text: lit_images([text]),
+        parse_exposure,
+        parse_lights,
+        parse_pose,
+        parse_formats,
+        Shard.parse,
+        lambda text: NamePattern.parse(text, "--name").filled({"stem": "a", "frame": "7"}),
+        lambda text: collect_items([text], path.parent / "out", PHOTO_SUFFIXES),
+    )
+    for read in readers:
+        try:
+            read(word)
+        except FacerfError as error:
+            refused = error
+    if refused is not None:
+        raise refused
+
+
+def _page(path: Path) -> None:
+    from facerf_cli.viewer.page import IndexEntry, index_page, strip_of
+
+    strip = strip_of(path.read_text(encoding="utf-8", errors="replace"))
+    index_page([IndexEntry("a", "a.html", strip)])
+
+
+def _commands(path: Path) -> None:
+    """The file's content is a command line, without files; only what typer and the verbs check first."""
+    from facerf_cli.main import main
+
+    words = path.read_bytes().decode("utf-8", "surrogateescape").replace("\0", "").split("\n")
+    with redirect_stdout(io.StringIO()):
+        code = main([*words[:12], "--dry-run", "-o", str(path.parent / "out"), "no-such-photo.png"])
+    assert code in (0, 1, 2), f"exit code {code}"
+
+
+def _command_lines() -> Samples:
+    lines = {
+        "segment": "segment\n--format\npng\n--overwrite\nchanged\n--jobs\n1",
+        "estimate": "estimate-light\n--seed\n3\n--face\nlargest",
+        "convert": "convert-light\nx.json\n--lights\n20",
+        "relight": "relight\n--light\n30,10\n--exposure\nauto\n--name\n{stem}_{light}\n--shard\n1/2",
+    }
+    return {name: line.encode() for name, line in lines.items()}
+
+
+def _npy_pixels() -> Samples:
+    return {
+        name: content for name, content in samples.arrays().items() if np.lib.format.MAGIC_PREFIX in content
+    }
+
+
+_JSON = (mutations.json_, mutations.json_, mutations.text, mutations.bytes_)
+_TEXT = (mutations.text, mutations.text, mutations.bytes_)
+_FITS = (mutations.zip_, mutations.zip_, mutations.bytes_)
+
+DOORS: dict[str, Door] = {
+    "images": Door(samples.images, _image, (mutations.png, mutations.bytes_), 6),
+    "HEIC": Door(samples.phone_photos, _image, weight=0.03),
+    "environment maps": Door(samples.images, _map, (mutations.png, mutations.bytes_), 1),
+    "OLAT stacks": Door(samples.stacks, _stack, (mutations.json_inside, mutations.bytes_), 3),
+    "light JSON": Door(samples.lights, _light, _JSON, 2),
+    "light numbers": Door(samples.numbers, _numbers, _TEXT, 1),
+    "landmarks": Door(samples.landmarks, _landmarks, (*_JSON, mutations.text), 2),
+    "LP files": Door(samples.light_lists, _light_list, _TEXT, 1),
+    "CSV tables": Door(samples.shifts, _table, _TEXT, 1),
+    "files of --lights": Door(samples.directions, _directions, _TEXT, 1),
+    "safetensors": Door(samples.checkpoints, _checkpoint, (mutations.safetensors, mutations.bytes_), 2),
+    "fits": Door(samples.fits, _fit, _FITS, 2),
+    "npy images": Door(_npy_pixels, _array, (mutations.npy, mutations.bytes_), 1),
+    "face models": Door(samples.face_models, _face_model, _FITS, 0.1),
+    "FLAME": Door(samples.flame, _flame, (mutations.bytes_, mutations.bytes_, mutations.zip_), 2),
+    "Basel 2009": Door(samples.basel_2009, _basel_2009, weight=0.02),
+    "Basel 2017": Door(samples.basel_2017, _basel_2017, weight=0.02),
+    "ICT-FaceKit": Door(samples.ict, _ict, (mutations.zip_, mutations.bytes_), 0.2),
+    "stage.json": Door(samples.stages, _stage, _JSON, 2),
+    "dataset.json": Door(samples.datasets, _dataset, _JSON, 2, samples.beside_datasets),
+    "pairs.jsonl": Door(samples.pairs, _pairs, _JSON, 1, samples.dataset_of_pairs),
+    "rigs": Door(samples.rigs, _rig, _TEXT, 2),
+    "configuration": Door(samples.configurations, _configuration, _TEXT, 0.3),
+    "index": Door(samples.indexes, _index, _JSON, 1),
+    "report": Door(samples.reports, _report, _JSON, 1),
+    "figures": Door(samples.figures, _figures, _JSON, 1),
+    "names": Door(samples.names, _names, _TEXT, 1),
+    "options": Door(samples.words, _words, _TEXT, 0.3),
+    "command lines": Door(_command_lines, _commands, _TEXT, 0.2),
+    "pages of view": Door(samples.pages, _page, _TEXT, 0.2),
+}

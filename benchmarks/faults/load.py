@@ -1,0 +1,94 @@
+"""Thousands of items in one folder: does memory or the time of an item grow, and what does a rerun cost?
+
+    python -m benchmarks.faults.load [--verb convert-light] [--items 10000]
+
+A first run that Ctrl-C ends three times, then to its end; the time of an item at the beginning and the end;
+the most memory of a run over a tenth of the items and over all; and a rerun of the finished folder, with the
+time of a bare `facerf --version` beside it.
+"""
+
+import json
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from benchmarks._common import ROOT, arguments
+from benchmarks.faults.runs import VERBS, Verb, fresh
+from facerf_cli.cli.batch import REPORT_NAME
+
+_INTERRUPTS = 3
+
+
+def main() -> None:
+    parser = arguments(__doc__)
+    parser.add_argument("--verb", choices=sorted(VERBS), default="convert-light")
+    parser.add_argument("--items", type=int, default=10_000)
+    given = parser.parse_args()
+    verb = VERBS[given.verb]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        verb.fill(fresh(folder / "few"), given.items // 10)
+        _, few_mib, _ = _timed(verb.line(folder / "few", folder / "out of few"))
+        verb.fill(fresh(folder / "in"), given.items)
+        _report(verb, folder, given.items, few_mib)
+
+
+def _report(verb: Verb, folder: Path, items: int, few_mib: float) -> None:
+    line, report = verb.line(folder / "in", folder / "out"), folder / "out" / REPORT_NAME
+    done = [_interrupted(line, report, items * (number + 1) // 10) for number in range(_INTERRUPTS)]
+    seconds, mib, code = _timed(line)
+    rows = [json.loads(row) for row in report.read_text().split("\n") if row]
+    times = [row["seconds"] for row in rows if row["status"] == "done"]
+    tenth = max(1, len(times) // 10)
+    first, last = statistics.median(times[:tenth]), statistics.median(times[-tenth:])
+    again = [_timed(line) for _ in range(2)]
+    bare = min(_timed(["--version"])[0] for _ in range(2))
+    print(f"{verb.name}, {items} items; interrupted at {', '.join(map(str, done))} rows; exit {code}")
+    print(f"rows {len(rows)}, of items {len({row['item'] for row in rows})}")
+    print(
+        f"the rest took {seconds:.0f} s; an item {1000 * first:.1f} ms at first, {1000 * last:.1f} ms at last"
+    )
+    print(f"most memory {few_mib:.0f} MiB of {items // 10} items, {mib:.0f} MiB of {items}")
+    rerun = min(run[0] for run in again)
+    print(f"a rerun of the finished folder {rerun:.1f} s, a bare start {bare:.1f} s; {again[0][1]:.0f} MiB")
+
+
+def _command(line: list[str]) -> list[str]:
+    return [sys.executable, "-c", "from facerf_cli.main import run; run()", *line]
+
+
+def _timed(line: list[str]) -> tuple[float, float, int]:
+    """Seconds, most memory in MiB, and the exit code of a command line."""
+    begin = time.monotonic()
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        _command(line), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    _, status, usage = os.wait4(process.pid, 0)
+    return time.monotonic() - begin, usage.ru_maxrss / 1024, os.waitstatus_to_exitcode(status)
+
+
+def _interrupted(line: list[str], report: Path, rows: int) -> int:
+    """Run until the report has so many rows, then press Ctrl-C; return how many rows there are."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        _command(line), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while process.poll() is None and _lines(report) < rows:
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    process.wait()
+    return _lines(report)
+
+
+def _lines(path: Path) -> int:
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+if __name__ == "__main__":
+    main()

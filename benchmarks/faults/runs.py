@@ -1,0 +1,149 @@
+"""Runs of a verb in forks of this process, and what they left: nothing half, one row an item."""
+
+import atexit
+import json
+import os
+import shutil
+import signal
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks._common import ASTRONAUT
+from benchmarks.faults import samples
+from facerf_cli.cli.batch import REPORT_NAME
+
+_OWN = (REPORT_NAME, ".facerf-index.jsonl")
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb on a folder of inputs: its arguments without inputs and output."""
+
+    name: str
+    arguments: tuple[str, ...]
+    fill: Callable[[Path, int], None]  # writes so many inputs into a folder
+
+    def line(self, inputs: Path, output: Path) -> list[str]:
+        """The command line."""
+        return [self.name, str(inputs), *self.arguments, "-o", str(output)]
+
+
+def _fill_with_lights(folder: Path, count: int) -> None:
+    light = json.loads(samples.lights()["both.json"])
+    for number in range(count):
+        light["weights"][0] = [number, 0.5, 0.25]
+        (folder / f"light_{number:03d}.json").write_text(json.dumps(light))
+
+
+def _fill_with_photos(folder: Path, count: int) -> None:
+    import numpy as np
+    from PIL import Image
+
+    photo = Image.open(ASTRONAUT).convert("RGB").resize((128, 128))
+    for number in range(count):
+        pixels = np.asarray(photo).copy()
+        pixels[0, 0] = number % 256, number // 256, 0
+        Image.fromarray(pixels).save(folder / f"photo_{number:05d}.png", compress_level=1)
+
+
+VERBS = {
+    "convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights),
+    "segment": Verb("segment", (), _fill_with_photos),
+}
+
+
+def import_all(verb: Verb) -> None:
+    """Import what the verb needs, so that forks need not."""
+    import importlib
+
+    for name in ("main", "cli.items.convert_lights", "cli.items.segment_photos"):
+        importlib.import_module(f"facerf_cli.{name}")
+    importlib.import_module("zoneinfo")  # late imports fail for a user who cannot read this Python
+    assert verb.name
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The exit code of a run (negative: its signal), and what it said on stderr."""
+
+    code: int
+    said: str
+
+
+def run(line: Sequence[str], before: Callable[[], None] = lambda: None, notes: Path | None = None) -> Ended:
+    """Run a command line in a fork, after `before`, and wait for it."""
+    return wait(start(line, before, notes), notes)
+
+
+def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -> int:
+    """Begin a run in a fork that leads a group of processes; return its id."""
+    process = os.fork()
+    if process:
+        return process
+    code = 70
+    try:
+        os.setsid()
+        descriptor = os.open(notes or os.devnull, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o666)
+        null = os.open(os.devnull, os.O_RDWR)
+        os.dup2(null, 0)
+        os.dup2(null, 1)
+        os.dup2(descriptor, 2)
+        from facerf_cli.main import main
+        from facerf_cli.stopping import end_on_signals
+
+        end_on_signals(2.0)
+        before()
+        try:
+            code = main(line)
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        atexit._run_exitfuncs()
+    finally:
+        os._exit(code)
+
+
+def wait(process: int, notes: Path | None) -> Ended:
+    """Wait for a run, and end what it has left running."""
+    _, status = os.waitpid(process, 0)
+    with suppress(ProcessLookupError):
+        os.killpg(process, signal.SIGKILL)
+    said = notes.read_text(errors="replace") if notes and notes.exists() else ""
+    code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else -os.WTERMSIG(status)
+    return Ended(code, said)
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    """The outputs by name, without reports and hidden files."""
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in files
+        if not any(part.startswith(".") for part in path.relative_to(folder).parts) and path.name not in _OWN
+    }
+
+
+def faults_of(folder: Path, whole: dict[str, bytes], finished: bool) -> list[str]:
+    """What is wrong in an output folder beside the outputs of an undisturbed run."""
+    found = []
+    there = outputs(folder) if folder.exists() else {}
+    found += [f"half or foreign: {name}" for name, content in there.items() if whole.get(name) != content]
+    if not finished:
+        return found
+    found += [f"missing: {name}" for name in whole if name not in there]
+    found += [f"left: {path.name}" for path in folder.rglob(".*part-*")]
+    found += [f"left: {path.name}" for path in folder.rglob(".facerf-lock*")]
+    rows = [json.loads(line) for line in (folder / REPORT_NAME).read_text().split("\n") if line]
+    twice = [item for item, count in Counter(row["item"] for row in rows).items() if count > 1]
+    found += [f"two rows: {item}" for item in twice]
+    found += [f"row of {row['item']}: {row['status']}" for row in rows if row["status"] == "failed"]
+    return found
+
+
+def fresh(folder: Path) -> Path:
+    """The folder, empty."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder

@@ -1,0 +1,83 @@
+"""Readers in a process of their own, for libraries that a damaged file can crash: scipy's .mat, HDF5.
+
+The child sends arrays as an .npz without pickles, so that even a child that a file has taken over can only
+send numbers. Its memory and time are limited; its death is an error in one line.
+"""
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.logs import shown
+
+_MEMORY_BYTES = 6 << 30
+_TIME_S = 300
+_REFUSED = 3  # exit code of a child that says why on stderr
+_CHILD = "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
+_CHILD += "from facerf_cli.files.apart import serve; serve()"
+
+
+def arrays_apart(
+    module: str, reader: str, path: Path, *limits: int, time_s: float = _TIME_S
+) -> dict[str, np.ndarray]:
+    """Call `reader(path, *limits)` of a module, which returns arrays by name, in a process of its own.
+
+    Raises ValueError with what the reader raised there, or how its process ended.
+    """
+    command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), module, reader, os.fspath(path)]
+    command += map(str, limits)
+    with tempfile.TemporaryFile() as file:
+        try:
+            ended = subprocess.run(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.PIPE, timeout=time_s
+            )
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"reading it takes longer than {time_s:.0f} s") from None
+        said = shown(ended.stderr.decode(errors="replace"))
+        if ended.returncode == _REFUSED:
+            raise ValueError(said)
+        if ended.returncode:
+            raise ValueError(f"it makes its reader fail ({_death(ended.returncode)})")
+        file.seek(0)
+        try:
+            with np.load(file, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+        except (OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise ValueError(f"its reader sent no arrays ({error})") from None
+
+
+def _death(code: int) -> str:
+    try:
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    except ValueError:
+        return f"signal {-code}"
+
+
+def serve() -> None:
+    """The child: read and send."""
+    _, _, module, reader, path, *limits = sys.argv
+    _limit()
+    try:
+        arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
+    except Exception as error:  # whatever a damaged file makes its library raise
+        print(str(error) or type(error).__name__, file=sys.stderr)
+        sys.exit(_REFUSED)
+    np.savez(sys.stdout.buffer, **arrays)
+
+
+def _limit() -> None:
+    if sys.platform == "win32":
+        return
+    import resource
+
+    for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CORE, 0)):
+        most = resource.getrlimit(limit)[1]
+        resource.setrlimit(limit, (value if most < 0 else min(value, most), most))

@@ -1,0 +1,31 @@
+"""Which paths are opened: regular files. A pipe or a device could be waited for without end."""
+
+import os
+import stat
+from pathlib import Path
+
+from facerf_cli.errors import InputError
+
+
+def is_regular(path: Path) -> bool:
+    """Return whether a path leads to a regular file; False for names that the system refuses."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def require_regular(path: Path, advice: str = "check the path") -> None:
+    """Raise InputError unless a path leads to a regular file."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
+    except ValueError:  # a null character
+        raise InputError(f"{str(path)!a}: no file can have this name; {advice}") from None
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: is a folder, not a file; {advice}")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")

@@ -1,0 +1,233 @@
+"""Films and sequences from the command line, by the face's field with a network that is Lambert's law."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from skimage.data import astronaut
+
+from facerf_cli.cli.items import relight_photos
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.light.sphere import rig_directions
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_networks
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.raster.texture import normal_map
+
+av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+WIDTHS = (4, 8, 8)
+FRAMES = 3
+CHEAP = ("--reflectance", "field", "--lights", "12")
+
+
+def frame_of(number: int) -> np.ndarray:
+    """The astronaut's head, a little further to the left in each frame."""
+    return np.ascontiguousarray(astronaut()[10:202, 110 + 2 * number : 334 + 2 * number])
+
+
+def write_source(path: Path, frames: Iterator[np.ndarray] | list[np.ndarray]) -> None:
+    """A film of 25 frames a second with silence."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 224, 192, "yuv420p", {"crf": "12"}
+        sound = container.add_stream("aac", rate=48000, layout="mono")
+        for number, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixels)
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+            silence.sample_rate, silence.pts = 48000, 1024 * number
+            container.mux(sound.encode(silence))
+        container.mux(stream.encode(None))
+        container.mux(sound.encode(None))
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a checkpoint and a film."""
+    folder = tmp_path_factory.mktemp("given")
+    torch.manual_seed(0)
+    settings = DefaultReflectanceSettings(64, WIDTHS, WIDTHS, rig_lights=8)
+    network = DefaultReflectanceNetwork(settings)
+    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
+    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
+    save_networks(
+        folder / "lambert.safetensors", {"reflectance": network}, {"layout_version": LAYOUT_VERSION}
+    )
+    write_source(folder / "me.mp4", [frame_of(number) for number in range(FRAMES)])
+    return folder
+
+
+def facerf(given: Path, verb: str, *line: object) -> int:
+    return main(["--checkpoint", str(given / "lambert.safetensors"), verb, *map(str, line)])
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+
+
+def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
+    images = [f"me_light_70_20.{number:04d}.{kind}" for number in range(FRAMES) for kind in ("exr", "png")]
+    assert names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
+    rows = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    assert [row["item"] for row in rows] == [f"me.{number:04d}" for number in range(FRAMES)]
+    assert len({tuple(row["exposure_ev"].values()) for row in rows}) == 1
+    track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:]
+    left = [np.mean(row["landmarks"], 0)[0] for row in track]
+    assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the film moves
+    capsys.readouterr()
+    assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
+    assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
+
+
+def test_an_interrupted_film_goes_on_where_it_was(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, made = tmp_path / "relit.mp4", []
+    line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
+    seen_frame = relight_photos.seen_frame
+
+    def counted(shot: Any, number: int, *rest: Any) -> Any:
+        if len(made) == 1:
+            made.append("stop")
+            raise KeyboardInterrupt
+        made.append(number)
+        return seen_frame(shot, number, *rest)
+
+    monkeypatch.setattr(relight_photos, "seen_frame", counted)
+    assert facerf(given, *line) == 130
+    assert not out.exists() and made == [0, "stop"]
+    assert facerf(given, *line) == 0
+    assert made == [0, "stop", 1, 2]
+    assert names(tmp_path) == ["relit.mp4"]  # the folder of the frames is gone
+    with av.open(str(out)) as container:
+        assert container.streams.video[0].frames == FRAMES and container.streams.video[0].average_rate == 25
+        assert container.streams.audio[0].codec_context.name == "aac"
+        comment = container.metadata["comment"]
+    assert comment.startswith("Synthetic") and "IPTC:DigitalSourceType" in comment
+    before = out.stat().st_mtime_ns
+    assert facerf(given, *line) == 0 and out.stat().st_mtime_ns == before and len(made) == 4
+    assert facerf(given, *line, "--light", "60,20") == 2  # two lights are two films
+
+
+def test_a_still_photo_under_a_turning_map_is_smooth(given: Path, tmp_path: Path) -> None:
+    """Under the map 1 + cos(azimuth) each pixel is a + b cos(turn) + c sin(turn), whatever the face is."""
+    height, turns = 64, 8
+    azimuth = (0.5 - (np.arange(2 * height) + 0.5) / (2 * height)) * 2 * np.pi
+    row = (1 + np.cos(azimuth)).astype(np.float32)[None, :, None]
+    write_exr(tmp_path / "wave.exr", np.broadcast_to(row, (height, 2 * height, 3)).copy())
+    out = tmp_path / "out"
+    line = ("--envmap", tmp_path / "wave.exr", "--rotate", f"0:360:{turns}", "--format", "exr")
+    assert facerf(given, "relight", PHOTO, *line, "-o", out, "--reflectance", "field", "--lights", "60") == 0
+    frames = np.stack([read_image(path).pixels for path in sorted(out.glob("*.exr"))])
+    angles = 2 * np.pi * np.arange(turns) / turns
+    waves = np.stack([np.ones(turns), np.cos(angles), np.sin(angles)], 1)
+    flat = frames.reshape(turns, -1)
+    left = flat - waves @ np.linalg.lstsq(waves, flat, rcond=None)[0]
+    assert np.abs(flat - flat.mean(0)).max() > 0.05 * flat.mean()
+    # half floats have steps of 1 / 2048; cells of the rig and texels of the map do not divide each other
+    assert np.abs(left).max() < 4e-3 * flat.max()
+
+
+def test_a_photo_under_a_turning_map_becomes_a_film(given: Path, tmp_path: Path) -> None:
+    write_exr(tmp_path / "grey.exr", np.full((8, 16, 3), 0.3, np.float32))
+    out = tmp_path / "me.mov"
+    line = ("--envmap", tmp_path / "grey.exr", "--rotate", "0:360:3", "--fps", "30000/1001", "-o", out)
+    assert facerf(given, "relight", PHOTO, *line, *CHEAP) == 0
+    with av.open(str(out)) as container:
+        (stream,) = container.streams
+        assert stream.codec_context.name == "prores" and stream.frames == 3
+        assert float(stream.average_rate) == pytest.approx(30000 / 1001, rel=1e-3)
+
+
+def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
+    given: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    plates = tmp_path / "plates"
+    plates.mkdir()
+    for number in range(3):
+        pixels = frame_of(number) if number != 1 else np.full((192, 224, 3), 90, np.uint8)
+        write_exr(plates / f"plate.{1001 + number}.exr", (pixels / np.float32(255)) ** np.float32(2.2))
+    out = tmp_path / "out"
+    line = (plates / "plate.%04d.exr", "--sequence", "--light", "70,20", "--format", "png", "-o", out)
+    assert facerf(given, "relight", *line, *CHEAP) == 0
+    assert [name for name in names(out) if name.endswith(".png")] == [
+        f"plate_light_70_20.{number}.png" for number in (1001, 1002, 1003)
+    ]
+    track = [json.loads(line) for line in (out / "plate_track.jsonl").read_text().splitlines()][1:]
+    assert [row["landmarks"] is None for row in track] == [False, True, False]
+
+
+def test_a_sequence_with_a_hole_is_said(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in (1, 3):
+        write_exr(tmp_path / f"plate.{number}.exr", frame_of(number) / np.float32(255))
+    line = (tmp_path / "plate.1-3.exr", "--sequence", "--light", "0,0", "-o", tmp_path / "out")
+    assert facerf(given, "relight", *line, *CHEAP) == 1
+    assert "plate.2.exr: no such file; a shot needs all of its frames" in capsys.readouterr().err
+
+
+def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert facerf(given, "estimate-light", given / "me.mp4", "--lights", "20", "-o", out) == 0
+    assert names(out) == ["me_light.exr", "me_light.json", "me_light.png", "me_track.jsonl", "report.jsonl"]
+    (row,) = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    assert row["frames"] == [0, 1, 2] and row["residual"] < 0.3
+
+
+def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(["segment", str(given / "me.mp4"), "-o", str(out)]) == 0
+    mattes = [read_image(out / f"me.{number:04d}_segment.exr").alpha for number in range(FRAMES)]
+    assert all(matte is not None and 0.2 < matte.mean() < 0.9 for matte in mattes)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--format", "png"), "--format"),
+        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--background", "none"), "has no alpha"),
+        (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "25"), "keeps its own times"),
+        (("{film}", "--light", "0,0", "-o", "{film}"), "is the input"),
+        (("{film}", "--light", "0,0", "-o", "{out}.webm"), "give one of these"),
+        (("{film}", "--light", "0,0", "-o", "{out}", "--fps", "25"), "is for -o FILE.mp4"),
+        (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "not a rate"),
+        (("{photo}", "--light", "0,0", "-o", "{out}.mp4"), "is one film"),
+        (("{film}", "--light", "0,0", "-o", "{out}", "--face", "all"), "--face INDEX"),
+        (("{film}", "--light", "0,0", "-o", "{out}", "--geometry", "network"), "fitted to landmarks"),
+        (("{film}", "--light", "0,0", "-o", "{out}", "--landmarks", "{photo}"), "frames of a film"),
+        (("{film}", "--light", "0,0", "-o", "{out}", "--shard", "1/2"), "belong together"),
+    ],
+)
+def test_options_that_a_film_cannot_have(
+    given: Path, tmp_path: Path, line: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    filled = [part.format(film=given / "me.mp4", photo=PHOTO, out=tmp_path / "out") for part in line]
+    assert main(["relight", *filled]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_in_a_folder_of_photos_is_left_alone(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(given / "me.mp4", tmp_path / "live.mp4")
+    shutil.copy(PHOTO, tmp_path / "me.jpg")
+    assert main(["relight", str(tmp_path), "--light", "0,0", "-o", str(tmp_path / "out"), "--dry-run"]) == 0
+    assert {line.split(" -> ")[0] for line in capsys.readouterr().out.splitlines()} == {
+        str(tmp_path / "me.jpg")
+    }

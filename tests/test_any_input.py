@@ -1,0 +1,148 @@
+"""Readers and writers of text with drawn inputs: what is written comes back, the rest is one clean line."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from facerf_cli.capture.draft_lights import read_light_list
+from facerf_cli.cli.light_entries import lit_images
+from facerf_cli.cli.naming import NamePattern
+from facerf_cli.cli.options import Shard
+from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
+from facerf_cli.errors import FacerfError
+from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.files.icc import space_of_profile
+from facerf_cli.files.inert_pickle import read_inert_pickle
+from facerf_cli.files.light_files import (
+    Harmonics,
+    LightRecord,
+    read_light,
+    read_numbers,
+    write_light,
+    write_numbers,
+)
+from facerf_cli.files.rig_files import read_rig
+from facerf_cli.logs import escaped, json_line, shown
+
+# The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.
+DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)
+FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False, min_value=-(2.0**90), max_value=2.0**90)
+FIELDS = st.sampled_from(["dir", "stem", "ext", "frame"])
+TEXT = st.text(st.characters(codec=None), max_size=60)  # surrogates too, as names of files have them
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("drawn")
+
+
+def refused_or_read(read: Callable[[], object]) -> None:
+    """Pass if the reader succeeds or raises an error of one printable line."""
+    try:
+        read()
+    except FacerfError as error:
+        assert shown(str(error)) and shown(str(error)).isprintable()
+
+
+@DRAWN
+@given(rows=st.lists(st.tuples(FINITE, FINITE, FINITE), min_size=1, max_size=5), note=st.text(max_size=20))
+def test_a_light_comes_back(folder: Path, rows: list[tuple[float, float, float]], note: str) -> None:
+    weights = torch.tensor(rows, dtype=torch.float32)
+    directions = torch.nn.functional.normalize(torch.ones(len(rows), 3), dim=1)
+    sh = Harmonics(weights[:1], note)
+    write_light(folder / "a.json", LightRecord(directions, weights, note, sh, {"facerf:input": note}))
+    read = read_light(folder / "a.json")
+    assert torch.equal(read.weights, weights) and read.rig == note
+    assert read.sh is not None and torch.equal(read.sh.coefficients, weights[:1])
+    assert read.attributes == {"facerf:input": note}
+
+
+@DRAWN
+@given(values=st.lists(FINITE, min_size=9, max_size=9))
+def test_numbers_come_back(folder: Path, values: list[float]) -> None:
+    numbers = torch.tensor(values, dtype=torch.float32)
+    write_numbers(folder / "a.txt", numbers)
+    assert torch.equal(read_numbers(folder / "a.txt", (9,)), numbers)
+
+
+@DRAWN
+@given(name=TEXT)
+def test_a_row_of_any_text_is_one_printable_line(name: str) -> None:
+    line = json_line({name: [name, math.inf]})
+    assert line.isprintable() and len(line.splitlines()) == 1
+    # Halves of a pair, which no name of a file has side by side, come back as the character.
+    back = json.loads(line)
+    joined = name.encode("utf-16", "surrogatepass").decode("utf-16", "surrogatepass")
+    assert back == {joined: [joined, None]}
+
+
+@DRAWN
+@given(text=TEXT)
+def test_what_is_shown_is_printable(text: str) -> None:
+    assert escaped(text).isprintable() and shown(text).isprintable()
+
+
+@DRAWN
+@given(
+    pattern=TEXT, values=st.dictionaries(st.sampled_from(["dir", "stem", "ext", "frame"]), st.text("ab/."))
+)
+def test_a_pattern_stays_in_its_folder(pattern: str, values: dict[str, str]) -> None:
+    inside = {name: value.replace("..", "").strip("/") for name, value in values.items()}
+    try:
+        parsed = NamePattern.parse(pattern, "--name")
+    except FacerfError:
+        return
+    filled = parsed.filled(inside)
+    assert not filled.startswith("/") and ".." not in Path(filled).parts
+
+
+OPTIONS = {
+    "--light": lambda text: lit_images([text]),
+    "--exposure": parse_exposure,
+    "--lights": parse_lights,
+    "--pose": parse_pose,
+    "--shard": Shard.parse,
+}
+# Text that looks like options more often than any text does.
+LIKELY = st.lists(
+    st.sampled_from(["1", "-", ".", ",", ";", ":", "e9", "az", "=", "el", "at", "inf", "nan", "/", "٣", "0"]),
+    max_size=12,
+).map("".join)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+@DRAWN
+@given(text=st.one_of(TEXT, LIKELY))
+def test_any_value_of_an_option_is_read_or_refused(option: str, text: str) -> None:
+    refused_or_read(lambda: OPTIONS[option](text.replace("\0", "")))
+
+
+READERS = {
+    "a.pts": read_landmarks,
+    "a.txt": lambda path: read_numbers(path, (9, 27)),
+    "a.lp": read_light_list,
+    "a.toml": read_rig,
+    "a.pkl": read_inert_pickle,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+@DRAWN
+@given(content=st.one_of(st.binary(max_size=80), TEXT.map(lambda text: text.encode(errors="replace"))))
+def test_any_file_is_read_or_refused(folder: Path, name: str, content: bytes) -> None:
+    (folder / name).write_bytes(content)
+    refused_or_read(lambda: READERS[name](folder / name))
+
+
+@DRAWN
+@given(content=st.binary(max_size=300))
+def test_any_profile_is_understood_or_not(content: bytes) -> None:
+    space_of_profile(content, "drawn")
+    header = bytes(36) + b"acsp" + bytes(88)
+    space_of_profile(header + content, "drawn")
