@@ -15,7 +15,7 @@ import numpy as np
 
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
-from facerf_cli.viewer.frame import fitted, resized
+from facerf_cli.resize import fitted, resized
 
 HERE = Path(__file__).parent
 HEIGHT_PX = 360

@@ -6,7 +6,7 @@ view turns scene-linear values into values of a display.
 """
 
 import difflib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -319,16 +319,19 @@ def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> f
 class View:
     """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `shoulder` before it.
 
-    Others are views of an OpenColorIO configuration's default display.
+    Others are views of a display of an OpenColorIO configuration; '' is its default one.
     """
 
     name: str = "none"
     config: str = ""
+    display: str = ""
 
     @property
     def is_srgb(self) -> bool:
         """True if the encoded values are known to be sRGB."""
-        return self.name in ("none", "soft") or "srgb" in ocio.display(self.config).casefold()
+        return (
+            self.name in ("none", "soft") or "srgb" in (self.display or ocio.display(self.config)).casefold()
+        )
 
 
 PLAIN_VIEW, SOFT_VIEW = View("none"), View("soft")
@@ -336,15 +339,26 @@ _ACES_VIEW = View("ACES 2.0 - SDR 100 nits (Rec.709)", "ocio://default")
 _VIEWS = {"none": PLAIN_VIEW, "soft": SOFT_VIEW, "aces": _ACES_VIEW}
 
 
-def named_view(name: str, config: str = "") -> View:
-    """Return the view that a user names; an unknown name raises a UsageError that lists the known ones."""
-    if name in _VIEWS:
+def named_view(name: str, config: str = "", display: str = "") -> View:
+    """Return the view that a user names; an unknown name raises a UsageError that lists the known ones.
+
+    With a display the view is one of its own; "soft", which is nobody's choice then, is its default one.
+    """
+    if not display and name in _VIEWS:
         return _VIEWS[name]
-    known = ocio.views(config)
-    for view in known:
-        if view.casefold() == name.casefold():
-            return View(view, config)
-    raise UsageError(f"unknown view '{name}' (known: {', '.join([*_VIEWS, *known])})")
+    if display:
+        display = _spelt(display, ocio.displays(config), "display")
+        name = ocio.views(config, display)[0] if name == SOFT_VIEW.name else name
+    known = ocio.views(config, display)
+    return View(_spelt(name, known, "view", () if display else tuple(_VIEWS)), config, display)
+
+
+def _spelt(name: str, known: Sequence[str], what: str, more: Sequence[str] = ()) -> str:
+    """A name as OpenColorIO spells it."""
+    for spelt in known:
+        if spelt.casefold() == name.casefold():
+            return spelt
+    raise UsageError(f"unknown {what} '{name}' (known: {', '.join([*more, *known])})")
 
 
 def shoulder(linear: np.ndarray) -> np.ndarray:
@@ -367,7 +381,9 @@ def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = No
         mixed = soft if share is None else linear + share[..., None] * (soft - linear)
         return encode_display(mixed, PLAIN_VIEW)
     for name, matrix in _ocio_bridges():
-        found = ocio.shown(_by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config)
+        found = ocio.shown(
+            _by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config, view.display
+        )
         if found is not None:
             return found.clip(0, 1)
     raise _cannot_convert(ColourSpace(view.name, None))

@@ -32,9 +32,16 @@ def display(config: str = "") -> str:
     return str(_opened(config).getDefaultDisplayName())
 
 
-def views(config: str = "") -> list[str]:
-    """List the views of the configuration's default display."""
-    return list(_opened(config).getViewNames(display(config)))
+def displays(config: str = "") -> list[str]:
+    """List the displays of the configuration."""
+    return list(_opened(config).getDisplayNames())
+
+
+def views(config: str = "", display_name: str = "") -> list[str]:
+    """List the views of a display, its default one first; by default of the configuration's."""
+    name = display_name or display(config)
+    default = _opened(config).getDefaultViewName(name)
+    return sorted(_opened(config).getViewNames(name), key=lambda view: view != default)
 
 
 def converted(pixels: np.ndarray, source: str, target: str, config: str = "") -> np.ndarray | None:
@@ -43,10 +50,12 @@ def converted(pixels: np.ndarray, source: str, target: str, config: str = "") ->
     return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
 
 
-def shown(pixels: np.ndarray, source: str, view: str, config: str = "") -> np.ndarray | None:
-    """Encode values for the configuration's default display by a view; None if OpenColorIO cannot."""
+def shown(
+    pixels: np.ndarray, source: str, view: str, config: str = "", display_name: str = ""
+) -> np.ndarray | None:
+    """Encode values for a display, by default the configuration's, by a view; None if OpenColorIO cannot."""
     result = oiio.ImageBufAlgo.ociodisplay(
-        _buffer(pixels), display(config), view, source, "", False, False, "", "", config
+        _buffer(pixels), display_name or display(config), view, source, "", False, False, "", "", config
     )
     return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
 

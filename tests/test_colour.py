@@ -118,6 +118,9 @@ roles: {{scene_linear: Show Linear, ROLE, default: Show Linear}}
 displays:
   Monitor:
     - !<View> {{name: Show Look, colorspace: Show Monitor}}
+  Projector:
+    - !<View> {{name: Raw, colorspace: Show Half}}
+    - !<View> {{name: Dim, colorspace: Show Half}}
 colorspaces:
   - !<ColorSpace> {{name: ACES2065-1}}
   - !<ColorSpace>
@@ -154,6 +157,22 @@ def test_a_configuration_of_a_show(tmp_path: Path, role: str) -> None:
     assert not view.is_srgb
     with pytest.raises(UsageError, match=r"unknown view 'aCES' \(known: none, soft, aces, Show Look"):
         ours.named_view("aCES", config)
+
+
+def test_views_of_another_display(tmp_path: Path) -> None:
+    (tmp_path / "show.ocio").write_text(SHOW.replace("ROLE", "aces_interchange: ACES2065-1"))
+    config = str(tmp_path / "show.ocio")
+    dim = ours.named_view("dim", config, "projector")
+    assert (dim.name, dim.display) == ("Dim", "Projector") and not dim.is_srgb
+    values = RGB.clip(0.01, 0.9)
+    half = ours.from_linear_rec709(values, ours.ACESCG) / 2
+    np.testing.assert_allclose(ours.encode_display(values, dim), half, atol=1e-4)
+    assert ours.named_view("soft", config, "Projector").name == "Raw"  # its default view
+    with pytest.raises(UsageError, match=r"unknown display 'nope' \(known: Monitor, Projector\)"):
+        ours.named_view("soft", config, "nope")
+    for name in ("Show Look", "aces"):
+        with pytest.raises(UsageError, match=r"unknown view .* \(known: Raw, Dim\)"):
+            ours.named_view(name, config, "Projector")
 
 
 def test_a_file_that_is_no_configuration(tmp_path: Path) -> None:

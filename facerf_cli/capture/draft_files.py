@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from facerf_cli.capture.draft_lights import LIST_NAMES, LIST_SUFFIX
 from facerf_cli.capture.pattern import FIELDS, compile_pattern, require_pattern, unlisted_kind
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.documents import Node, is_name
+from facerf_cli.files.documents import is_name
 
 EXAMPLE = "{subject}/{camera}/{light}.exr"
 _LAYOUTS = ("{light}", "{subject}/{light}", "{subject}/{camera}/{light}")  # by the number of folders
@@ -108,7 +108,7 @@ def _natural_order(text: str) -> tuple[object, str]:
 def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
     """Sort images by the pattern of --pattern; UsageError for a wrong one, or one that no image matches."""
     try:
-        require_pattern(Node("--pattern", pattern), ["light"])
+        require_pattern(pattern, "--pattern", ["light"])
     except InputError as error:
         raise UsageError(str(error)) from None
     frames = sort_frames(images, pattern)

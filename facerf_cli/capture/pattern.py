@@ -4,7 +4,8 @@ import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from facerf_cli.files.documents import Node
+from facerf_cli.errors import InputError
+from facerf_cli.files.documents import is_name
 
 FIELDS = ("subject", "camera", "light")
 FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's place: a frame with all lights on
@@ -13,12 +14,13 @@ _RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that file names c
 _LONGEST = 500
 
 
-def require_pattern(node: Node, needed: Collection[str], fields: tuple[str, ...] = FIELDS) -> str:
-    """Return the pattern of a node; InputError unless it is a relative path with the needed fields alone.
+def require_pattern(
+    pattern: str, where: str, needed: Collection[str], fields: tuple[str, ...] = FIELDS
+) -> str:
+    """Return a pattern; an InputError says `where` one stands that is no path with the needed fields alone.
 
     It must stay below the capture's folder, and hold no braces but those of `fields`.
     """
-    pattern = node.text()
     parts = pattern.split("/")
     plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
     words = [f"{{{field}}}" for field in fields if field in needed]
@@ -31,7 +33,7 @@ def require_pattern(node: Node, needed: Collection[str], fields: tuple[str, ...]
     ):
         named = " that names " * bool(words) + " and ".join(words)
         free = f", without {' '.join(map(ascii, odd))} elsewhere," * bool(odd)
-        raise node.wrong(f"a path below the capture{named}{free}")
+        raise InputError(f"{where} is {pattern!r}; a path below the capture{named}{free} is needed")
     return pattern
 
 
@@ -64,7 +66,9 @@ def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[s
             folder / fill_pattern(pattern, subject=name, camera=c, light=i) for c in cameras for i in lights
         )
         if any(path.exists() for path in paths):
-            yield Node(f"{folder}: a subject", name).name()
+            if not is_name(name):
+                raise InputError(f"{folder}: the subject {name!r} is no name of letters, digits, - and _")
+            yield name
 
 
 def unlisted_kind(name: str) -> str:

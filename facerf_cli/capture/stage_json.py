@@ -20,19 +20,23 @@ lists one.
 """
 
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.pattern import FIELDS, find_subjects, require_pattern
 from facerf_cli.colour import named_space
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import UsageError
 from facerf_cli.face.joint_fit import PosedCamera
-from facerf_cli.files.documents import Node, read_document, unique_ids
+from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
 from facerf_cli.files.images import PHOTO_LIMIT_PX
 
-STAGE_FILE, STAGE_FORMAT = "stage.json", "facerf-stage-1"
+StageFormat = Literal["facerf-stage-1"]
+STAGE_FORMAT: StageFormat = "facerf-stage-1"
+STAGE_FILE = "stage.json"
 MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 _LONGEST_SIDE_PX = 65_536
 _ORTHONORMAL_OFF = 1e-3  # of a singular value from 1, in rotations written with few digits
@@ -41,102 +45,134 @@ _ASPECT_OFF = 0.01  # of fx / fy from 1: a face crop has square pixels
 _OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
 
 
-def read_stage(folder: Path) -> Capture:
-    """Read the capture that `stage.json` in a folder describes; InputError names the first wrong entry."""
-    root = read_document(folder / STAGE_FILE, "--describe drafts one from the images")
-    _require_filled(root)
-    for key, value in (("format", STAGE_FORMAT), ("axes", "opencv"), ("unit", "m")):
-        if root[key].value != value:
-            raise root[key].wrong(f"'{value}'")
-    lights, cameras = root["lights"].items(MOST_LIGHTS), root["cameras"].items(MOST_CAMERAS)
-    for key, nodes in (("lights", lights), ("cameras", cameras)):
-        if not nodes:
-            raise root[key].wrong("one entry at least")
-    light_ids, camera_ids = unique_ids(lights), unique_ids(cameras)
-    subjects = root.get("subjects")
-    needed = _needed_fields(camera_ids, subjects)
-    pattern = require_pattern(root["pattern"], needed)
-    return Capture(
-        folder=folder,
-        pattern=pattern,
-        colour_space=_colour_space(root["colour_space"]),
-        black_level=float(root["black_level"].array()),
-        light_ids=tuple(light_ids),
-        directions_world=np.stack([node["direction"].unit() for node in lights]),
-        intensities=np.stack([_intensity(node) for node in lights]),
-        cameras={name: _camera(node) for name, node in zip(camera_ids, cameras, strict=True)},
-        subjects=(
-            {name: {} for name in find_subjects(folder, pattern, camera_ids, light_ids)}
-            if subjects is None
-            else {name: node.table() for name, node in sorted(subjects.entries(MOST_SUBJECTS).items())}
-        ),
-        provenance={} if (node := root.get("provenance")) is None else node.table(),
-        ambient_pattern=(
-            "" if (node := root.get("ambient")) is None else require_pattern(node, needed, FIELDS[:2])
-        ),
-    )
-
-
-def _require_filled(root: Node) -> None:
-    """Raise for null values, which a draft of --describe has; traits and provenance may hold them."""
-    required = (root[key] for key in root.table() if key not in ("subjects", "provenance"))
-    if gaps := [gap for node in required for gap in node.nulls()]:
-        more = f" (and {len(gaps) - 1} more)" if len(gaps) > 1 else ""
-        raise InputError(f"{gaps[0].where} is null; fill it in{more}")
-
-
-def _colour_space(node: Node) -> str:
+def _colour_space(name: str) -> str:
     try:
-        named_space(node.text())
+        named_space(name)
     except UsageError as error:
-        raise InputError(f"{node.where}: {error}") from None
-    return node.text()
+        raise ValueError(str(error)) from None
+    return name
 
 
-def _intensity(light: Node) -> np.ndarray:
-    intensity = light["intensity"].array(3)
-    if not (intensity > _LEAST_INTENSITY).all():
-        name = light["id"].name()
-        raise light["intensity"].wrong(
-            f"a positive value in every channel (frames of light {name} are divided by it)"
-        )
-    return intensity
+def _intensity(rgb: np.ndarray) -> np.ndarray:
+    if not (rgb > _LEAST_INTENSITY).all():
+        raise ValueError("a positive value in every channel is needed (frames are divided by it)")
+    return rgb
 
 
-def _camera(node: Node) -> PosedCamera:
-    width, height = (node[key].whole(1, _LONGEST_SIDE_PX) for key in ("width", "height"))
-    if width * height > PHOTO_LIMIT_PX:
-        raise node["width"].wrong(f"an image of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels")
-    k = node["K"].array(3, 3)
+def _intrinsics(k: np.ndarray) -> np.ndarray:
     fx, fy, cx, cy = k[0, 0], k[1, 1], k[0, 2], k[1, 2]
     if not (min(fx, fy) > 0 and np.allclose(k, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * fx)):
-        raise node["K"].wrong("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0")
+        raise ValueError("[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above 0 is needed")
     if abs(fx / fy - 1) > _ASPECT_OFF:
-        raise node["K"].wrong("fx within 1 % of fy (square pixels)")
-    rotation, translation_m = _pose(node["world_to_camera"])
-    return PosedCamera(
-        focal_px=(float(fx), float(fy)),
-        centre_px=(float(cx), float(cy)),
-        width_px=width,
-        height_px=height,
-        rotation=torch.from_numpy(_OPENCV_TO_OURS @ rotation),
-        translation_m=torch.from_numpy(_OPENCV_TO_OURS @ translation_m),
-    )
+        raise ValueError("fx within 1 % of fy (square pixels) is needed")
+    return k
 
 
-def _pose(node: Node) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] nearest to the given one, and translation [3]."""
-    rows = len(node.value) if isinstance(node.value, list) else 0
-    matrix = node.array(4 if rows == 4 else 3, 4)
-    if rows == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise node.wrong("0 0 0 1 in the last row")
+def _pose(value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] nearest to the given one, and translation [3], of 3 x 4 or 4 x 4 numbers."""
+    try:
+        matrix = np.array(value, np.float64)
+    except (ValueError, TypeError):
+        matrix = np.zeros(())
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        raise ValueError("3 x 4 finite numbers are needed")
+    if len(matrix) == 4 and not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise ValueError("0 0 0 1 in the last row is needed")
     u, stretch, vh = np.linalg.svd(matrix[:3, :3])
     if not np.abs(stretch - 1).max() < _ORTHONORMAL_OFF or np.linalg.det(u @ vh) < 0:
-        raise node.wrong("a rotation without stretch or reflection, and a translation in metres")
+        raise ValueError("a rotation without stretch or reflection, and a translation in metres, are needed")
     return u @ vh, matrix[:3, 3]
 
 
-def _needed_fields(camera_ids: list[str], subjects: Node | None) -> set[str]:
-    """Fields that a pattern must name: all but those with a single value."""
-    single = {"camera": len(camera_ids) == 1, "subject": subjects is not None and len(subjects.table()) == 1}
-    return {field for field in FIELDS if not single.get(field)}
+Side = Annotated[int, Field(ge=1, le=_LONGEST_SIDE_PX)]
+
+
+class LightEntry(Document):
+    """A light of the stage."""
+
+    id: Name
+    direction: Direction
+    intensity: Annotated[Three, AfterValidator(_intensity)]
+
+
+class CameraEntry(Document):
+    """A calibrated camera, with OpenCV's axes."""
+
+    id: Name
+    width: Side
+    height: Side
+    K: Annotated[Matrix3, AfterValidator(_intrinsics)]
+    world_to_camera: Annotated[tuple[np.ndarray, np.ndarray], PlainValidator(_pose)]
+
+    @model_validator(mode="after")
+    def _is_readable(self) -> "CameraEntry":
+        if self.width * self.height > PHOTO_LIMIT_PX:
+            raise ValueError(f"images of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels are read")
+        return self
+
+    def posed(self) -> PosedCamera:
+        """The camera with the axes of the package."""
+        rotation, translation_m = self.world_to_camera
+        return PosedCamera(
+            focal_px=(float(self.K[0, 0]), float(self.K[1, 1])),
+            centre_px=(float(self.K[0, 2]), float(self.K[1, 2])),
+            width_px=self.width,
+            height_px=self.height,
+            rotation=torch.from_numpy(_OPENCV_TO_OURS @ rotation),
+            translation_m=torch.from_numpy(_OPENCV_TO_OURS @ translation_m),
+        )
+
+
+class StageDocument(Document):
+    """The document."""
+
+    format: StageFormat
+    axes: Literal["opencv"]
+    unit: Literal["m"]
+    colour_space: Annotated[str, AfterValidator(_colour_space)]
+    black_level: Annotated[float, Field(ge=-1e12, le=1e12)]
+    pattern: str
+    lights: Annotated[list[LightEntry], Field(min_length=1, max_length=MOST_LIGHTS)]
+    cameras: Annotated[list[CameraEntry], Field(min_length=1, max_length=MOST_CAMERAS)]
+    subjects: Annotated[dict[Name, dict[str, Any]], Field(max_length=MOST_SUBJECTS)] | None = None
+    ambient: str | None = None
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _has_distinct_ids(self) -> "StageDocument":
+        distinct([light.id for light in self.lights], "the light")
+        distinct([camera.id for camera in self.cameras], "the camera")
+        return self
+
+    def needed_fields(self) -> set[str]:
+        """Fields that a pattern must name: all but those with a single value."""
+        single = {"camera": len(self.cameras) == 1, "subject": len(self.subjects or ()) == 1}
+        return {field for field in FIELDS if not single.get(field)}
+
+
+def read_stage(folder: Path) -> Capture:
+    """Read the capture that `stage.json` in a folder describes; InputError names the first wrong entry."""
+    path = folder / STAGE_FILE
+    stage = read_document(path, StageDocument, "--describe drafts one from the images")
+    needed = stage.needed_fields()
+    pattern = require_pattern(stage.pattern, f"{path}: pattern", needed)
+    light_ids, camera_ids = ([entry.id for entry in entries] for entries in (stage.lights, stage.cameras))
+    return Capture(
+        folder=folder,
+        pattern=pattern,
+        colour_space=stage.colour_space,
+        black_level=stage.black_level,
+        light_ids=tuple(light_ids),
+        directions_world=np.stack([light.direction for light in stage.lights]),
+        intensities=np.stack([light.intensity for light in stage.lights]),
+        cameras={camera.id: camera.posed() for camera in stage.cameras},
+        subjects=(
+            {name: {} for name in find_subjects(folder, pattern, camera_ids, light_ids)}
+            if stage.subjects is None
+            else dict(sorted(stage.subjects.items()))
+        ),
+        provenance=stage.provenance,
+        ambient_pattern=(
+            require_pattern(stage.ambient, f"{path}: ambient", needed, FIELDS[:2]) if stage.ambient else ""
+        ),
+    )

@@ -6,7 +6,6 @@ raises `InputError` for a faulty item (the run continues); any other `FacerfErro
 ends it.
 """
 
-import json
 import logging
 import os
 import sys
@@ -22,11 +21,13 @@ from typing import Any
 from facerf_cli import memory
 from facerf_cli.cli.folder_index import FolderIndex, Made, read_row
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path, sweep_leftovers
 from facerf_cli.files.folder_lock import alone_in
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
 from facerf_cli.workers import process_died, spread
@@ -78,9 +79,10 @@ def run_batch(
     recipes_of: RecipesOf,
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
     prepare: Callable[[], object] | None = None,
+    name: str | None = None,
 ) -> int:
-    """Process the files that `inputs` name: `run_files` over `collect_items`."""
-    items = collect_items(inputs, options.output, suffixes, null_separated=settings.null_separated)
+    """Process the files that `inputs` name: `run_files` over `collect_items`, with the pattern of --name."""
+    items = collect_items(inputs, options.output, suffixes, file_pattern(name), settings.null_separated)
     return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
 
 
@@ -93,9 +95,10 @@ def run_files(
     settings: Settings,
     recipes_of: RecipesOf,
     prepare: Callable[[], object] | None = None,
+    index: FolderIndex | None = None,
 ) -> int:
     """Process items that are files: `run_items`, and a missing file is an error of its item."""
-    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of)
+    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of, index)
     missing = [item for item in items if options.dry_run and not os.path.exists(item.input_path)]
     for item in missing:
         log.error("%s: no such file; check the path", item.input_path)
@@ -111,13 +114,15 @@ def run_items(
     settings: Settings,
     prepare: Callable[[], object] | None = None,
     recipes_of: RecipesOf | None = None,
+    index: FolderIndex | None = None,
 ) -> int:
     """Process the items and return the exit code: 0 all done, 1 some failed.
 
     An item is finished if its outputs exist and, with `recipes_of`, were made from the same input by the
     same recipe. With `--shard` only this process's share of them, which has a report of its own. `prepare` is
     called once, before the first item, and not at all where everything is finished: it loads what `process`
-    needs, so that an error in that is reported once; in a dry run, too. With several workers `process` runs
+    needs, so that an error in that is reported once; in a dry run, too. An `index` that was read stands for
+    that of `recipes_of`. With several workers `process` runs
     in other processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be
     used.
     """
@@ -130,7 +135,9 @@ def run_items(
             except OSError as error:
                 raise _unusable(options.output, error) from error
         batch = _Batch(verb, items, process, outputs_of, options, settings)
-        return _run_alone(batch, is_new, prepare, recipes_of)
+        if index is None and recipes_of:
+            index = FolderIndex(options.output, verb, settings.shard, recipes_of)
+        return _run_alone(batch, is_new, prepare, index)
 
 
 @dataclass(frozen=True)
@@ -146,11 +153,10 @@ class _Batch:
 
 
 def _run_alone(
-    batch: _Batch, is_new: bool, prepare: Callable[[], object] | None, recipes_of: RecipesOf | None
+    batch: _Batch, is_new: bool, prepare: Callable[[], object] | None, index: FolderIndex | None
 ) -> int:
     """Run the share while no other process writes to the folder; `is_new`: it did not exist before."""
     verb, outputs_of, options, settings = batch.verb, batch.outputs_of, batch.options, batch.settings
-    index = FolderIndex(options.output, verb, settings.shard, recipes_of) if recipes_of else None
     states = {item: _why_again(item, outputs_of(item), options, index) for item in batch.items}
     reasons = {item: reason for item, (reason, _) in states.items()}
     todo = [replace(item, stale=states[item][1]) for item in batch.items if reasons[item] is not None]
@@ -158,6 +164,7 @@ def _run_alone(
     if todo and prepare:
         prepare()
     if options.dry_run:
+        _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if index:
@@ -199,15 +206,13 @@ def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderInd
 
 
 def all_finished(
-    verb: str,
     items: Sequence[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
-    recipes_of: RecipesOf,
+    index: FolderIndex,
 ) -> bool:
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
-    index = FolderIndex(options.output, verb, settings.shard, recipes_of)
     share = settings.shard.share(items)
     return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
 
@@ -320,12 +325,15 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
 
 def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:
     """Log how many items are finished, and how many are made again for each reason."""
-    counts = Counter(reasons.values())
-    if finished := counts.pop(None, 0):
+    if finished := sum(reason is None for reason in reasons.values()):
         advice = "" if options.overwrite == "never" else " from the same inputs and options"
         log.info("%d of %d already finished%s", finished, len(reasons), advice)
-    counts.pop("", None)
-    for reason, count in sorted(counts.items(), key=str):
+    _say_what_is_made_again(reasons)
+
+
+def _say_what_is_made_again(reasons: Mapping[Item, str | None]) -> None:
+    counts = Counter(filter(None, reasons.values()))
+    for reason, count in sorted(counts.items()):
         log.info("%d made again: %s", count, reason)
 
 
@@ -379,8 +387,8 @@ def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
         return
     for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
         try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):  # a run that was killed may leave half a line
+            row = parse_json(line)
+        except ValueError:  # a run that was killed may leave half a line
             continue
         if isinstance(row, dict) and isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
             yield row

@@ -78,7 +78,8 @@ def config(
 ) -> None:
     """Show the defaults in force, and where each comes from: a configuration file, or facerf itself.
 
-    Without VERB: those that the file of --config (or FACERF_CONFIG) sets. The file is TOML with a table for
+    Without VERB: those that the file of --config (or FACERF_CONFIG) sets. With VERB the others follow, each
+    after a #. The file is TOML with a table for
     each verb ([relight], [evaluate.yale-b]) and one for global options ([global]); options have the names of
     the command line, without dashes in front. What the command line gives comes first.
     """
@@ -94,11 +95,13 @@ def config(
         command, given = getattr(command, "commands", {}).get(name), given.get(name, {})
         if command is None:
             raise UsageError(f"config {verb}: no such verb; see `facerf --help`")
+    defaults = []
     for parameter in _options(command):
-        in_file = parameter.name in given
-        value = given[parameter.name] if in_file else parameter.get_default(context)
-        if parameter.name != "help":
-            print(f"{parameter.opts[0]} = {_shown(value)}  ({source if in_file else 'default'})")
+        if parameter.name in given:
+            print(f"{parameter.opts[0]} = {_shown(given[parameter.name])}  ({source})")
+        elif parameter.name != "help" and not parameter.required:
+            defaults.append(f"# {parameter.opts[0]} = {_shown(parameter.get_default(context))}")
+    print("\n".join(["# not set, and so by default:", *defaults]))
 
 
 def _print_given(tables: Mapping[str, Any], source: str, above: str) -> None:

@@ -11,6 +11,7 @@ from facerf_cli.baselines import Kind
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_files
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
+from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import (
     FACE,
     LIGHT,
@@ -19,6 +20,7 @@ from facerf_cli.cli.options import (
     FaceModelOption,
     InputColourspaceOption,
     JobsOption,
+    NameOption,
     OutputOption,
     OverwriteOption,
     settings_of,
@@ -156,6 +158,7 @@ def estimate_light(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    name: NameOption = None,
     sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
@@ -188,7 +191,7 @@ def estimate_light(
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()
-    items, shots = collect_frames(inputs, output, photo.settings, sequence)
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name))
     check_shots(shots, photo)
     if shots and (refine != "none" or reflectance != "field" or matte is not None):
         raise UsageError(

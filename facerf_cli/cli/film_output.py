@@ -10,6 +10,7 @@ from typing import Annotated, Protocol, Self
 import typer
 
 from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.folder_index import FolderIndex
 from facerf_cli.cli.inputs import FILM_SUFFIXES, Item
 from facerf_cli.cli.options import IMAGE, Overwrite, Settings
 from facerf_cli.cli.output_options import Format
@@ -148,7 +149,8 @@ def run_to_film(
     if film.is_finished(key, options.overwrite):
         log.info("%s: already finished", film.path)
         return 0
-    if not all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of):
+    index = FolderIndex(options.output, "relight", settings.shard, work.recipes_of)
+    if not all_finished(items, work.outputs_of, options, settings, index):
         work = work.readable(dry_run=False)
     code = run_files("relight", items, work, work.outputs_of, options, settings, work.recipes_of)
     if code or not all(path.exists() for path in images):

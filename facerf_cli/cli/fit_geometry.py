@@ -13,6 +13,7 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
+    NameOption,
     OutputOption,
     OverwriteOption,
     settings_of,
@@ -69,6 +70,7 @@ def fit_geometry(
     texture_size: TextureSizeOption = None,
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    name: NameOption = None,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -102,5 +104,6 @@ def fit_geometry(
         photo.settings,
         OneRecipe(work),
         prepare=photo.preparation(dry_run),
+        name=name,
     )
     raise typer.Exit(code)

@@ -19,6 +19,7 @@ from facerf_cli.cli.recipe import Recipe, RecipesOf, differences
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import json_line
 
@@ -64,8 +65,8 @@ class _Rows:
 
     def _take(self, line: str) -> None:
         try:
-            row = json.loads(line)
-        except (ValueError, RecursionError):  # a run that was killed may leave half a line
+            row = parse_json(line)
+        except ValueError:  # a run that was killed may leave half a line
             return
         if not isinstance(row, dict):
             return
@@ -101,6 +102,10 @@ class FolderIndex:
         self.edited: list[Path] = []  # finished outputs that are not as they were written
         name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
         self.path = folder / f".facerf-index{name}.jsonl"
+        self.want(recipes_of)
+
+    def want(self, recipes_of: RecipesOf) -> None:
+        """Judge outputs by other recipes from now on."""
         self._wanted = [(_key(recipe), recipe) for recipe in recipes_of(self.digest_of)]
 
     def digest_of(self, path: Path) -> str:
@@ -139,7 +144,7 @@ class FolderIndex:
         key, recipe = self._wanted_of(number)
         if row.get("recipe") != key:
             old = self._rows.recipes.get(str(row.get("recipe")), {})
-            return differences(old, recipe) if old else "other options"
+            return differences(old, recipe) or "other options" if old else "other options"
         if self._digest_or_none(input_path) != row.get("input"):
             return "the input changed"
         if path.stat().st_size == 0:

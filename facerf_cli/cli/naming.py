@@ -8,6 +8,7 @@ from string import Formatter
 from facerf_cli.errors import UsageError
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
+OF_FILES = (*OF_PHOTOS, "frame")
 OF_IMAGES = (*OF_PHOTOS, "light", "frame")
 _SEPARATORS = "._-"  # one of these before an empty field goes with it
 _WIDTH = re.compile(r"0?[1-9]?")
@@ -52,6 +53,11 @@ class NamePattern:
                 result = result[:-1]
             result += value.zfill(int(width)) if width and value else value
         return PurePosixPath(result.lstrip("/")).as_posix()
+
+
+def file_pattern(text: str | None) -> NamePattern | None:
+    """Parse the --name of a verb that writes files a photo, where it is given."""
+    return NamePattern.parse(text, "--name", OF_FILES) if text else None
 
 
 def _fits(name: str, spec: str) -> bool:

@@ -129,6 +129,17 @@ OutputOption = Annotated[
     ),
 ]
 Overwrite = Literal["never", "changed", "always"]
+NameOption = Annotated[
+    str | None,
+    typer.Option(
+        "--name",
+        metavar="PATTERN",
+        help="Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is "
+        "follows it.",
+        show_default="{dir}/{stem}.{frame}",
+        rich_help_panel=BATCH,
+    ),
+]
 OverwriteOption = Annotated[
     Overwrite,
     typer.Option(

@@ -22,6 +22,7 @@ _NEEDS: dict[str, tuple[Format, ...]] = {
     "compression": ("exr",),
     "output_colourspace": ("exr", "tiff"),
     "view": _DISPLAYED,
+    "display": _DISPLAYED,
 }
 
 FormatOption = Annotated[
@@ -29,8 +30,7 @@ FormatOption = Annotated[
     typer.Option(
         "--format",
         metavar="NAME,...",
-        help="Write each image as exr (half floats, layers), tiff (floats), png, png16 (16 bits), jpg; "
-        "these three exposed for a display.",
+        help="Write each image as exr (half floats, layers), tiff (floats), png, png16 or jpg.",
         show_default="exr,png; with -o - png",
         rich_help_panel=IMAGE,
     ),
@@ -40,8 +40,7 @@ ColourspaceOption = Annotated[
     typer.Option(
         "--output-colourspace",
         metavar="NAME",
-        help="Write EXR and TIFF in this colour space: ACEScg, lin_rec2020, or any name of the OCIO "
-        "configuration.",
+        help="Write EXR and TIFF in this space: ACEScg, lin_rec2020, any name of OCIO.",
         show_default="linear Rec.709",
         rich_help_panel=IMAGE,
     ),
@@ -50,7 +49,8 @@ CompressionOption = Annotated[
     Compression,
     typer.Option(
         "--compression",
-        help="Compress EXR files; zip, zips, piz and rle lose nothing.",
+        metavar="NAME",
+        help="Compress EXR files: zip, zips, piz, rle (lossless), none, pxr24, b44, b44a, dwaa, dwab.",
         rich_help_panel=IMAGE,
     ),
 ]
@@ -58,9 +58,18 @@ ViewOption = Annotated[
     str,
     typer.Option(
         "--view",
-        metavar="soft|none|aces|NAME",
-        help="Show PNG and JPEG by the sRGB curve with a soft shoulder, clipped at 1, by ACES 2, or by a "
-        "view of the OCIO configuration.",
+        metavar="NAME",
+        help="Show PNG and JPEG by sRGB with a soft shoulder, clipped (none), by aces, or a view of OCIO.",
+        rich_help_panel=IMAGE,
+    ),
+]
+DisplayOption = Annotated[
+    str,
+    typer.Option(
+        "--display",
+        metavar="NAME",
+        help="Take --view, or the default view, from this display of OCIO.",
+        show_default="the configuration's",
         rich_help_panel=IMAGE,
     ),
 ]
@@ -69,7 +78,7 @@ OcioOption = Annotated[
     typer.Option(
         "--ocio",
         metavar="FILE",
-        help="Look up colour spaces and views in this OpenColorIO configuration.",
+        help="Use this OpenColorIO configuration.",
         show_default="$OCIO, or the built-in one",
         rich_help_panel=IMAGE,
     ),
@@ -81,9 +90,10 @@ class OutputOptions:
     """Formats and colours of written images, which can be sent to other processes."""
 
     formats: tuple[Format, ...] = field(default=("exr", "png"), metadata=NOT_IN_RECIPE)  # each in its own
-    colourspace: str | None = None  # of EXR and TIFF; None: linear Rec.709
+    output_colourspace: str | None = None  # of EXR and TIFF; None: linear Rec.709
     compression: Compression = "zip"
     view: str = "soft"
+    display: str = ""  # of the configuration; '' is its default one
     config: str = ""  # OpenColorIO's; '' is $OCIO, or the built-in one
 
     @property

@@ -17,6 +17,7 @@ from facerf_cli.cli.options import (
     InputColourspaceOption,
     InputsArgument,
     JobsOption,
+    NameOption,
     NetworkAloneOption,
     OutputOption,
     OverwriteOption,
@@ -134,6 +135,7 @@ def predict_olat(
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
+    name: NameOption = None,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -172,5 +174,6 @@ def predict_olat(
         settings,
         OneRecipe(work),
         prepare=photo.preparation(dry_run),
+        name=name,
     )
     raise typer.Exit(code)

@@ -35,7 +35,7 @@ class PrepareOptions:
     checks: Checks
     strict: bool
     split: str
-    crop_px: int
+    crop_px: int | None  # None: 256, nothing enlarged
     face_model: str
     overwrite: Overwrite
     dry_run: bool
@@ -151,11 +151,14 @@ def prepare_dataset(
         ),
     ] = "0.8/0.1/0.1",
     crop: Annotated[
-        int,
+        int | None,
         typer.Option(
-            metavar="PX", help="Write crops of this side, a multiple of 8.", rich_help_panel=_DATASET
+            metavar="PX",
+            help="Write crops of this side, a multiple of 8.",
+            show_default="256, or less where the face has fewer pixels",
+            rich_help_panel=_DATASET,
         ),
-    ] = 256,
+    ] = None,
     face_model: FaceModelOption = "builtin",
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,

@@ -10,6 +10,27 @@ RESULTS_VERSION = 2  # raised where the same recipe gives other pixels
 SHIPPED = Path(__file__).parents[1] / "assets"
 NOT_IN_RECIPE = {"in_recipe": False}  # metadata of a field that shapes no output
 
+# Entries of recipes that are not called as the option that sets them is.
+_OPTIONS = {
+    "colour": "the colour of --background",
+    "colourspace": "--input-colourspace",
+    "config": "--ocio",
+    "kind": "--background",
+    "leaders": "the first photo of --exposure-group",
+    "names": "the layers of --light",
+    "non_negative": "--signed",
+    "ocio_config": "--ocio",
+    "path": "the image of --background",
+    "photo_of_stack": "--photo",
+    "results": "facerf's version of results",
+    "rig": "--lights",
+    "rotate_deg": "--rotate",
+    "sampling": "--envmap-sampling",
+    "size_px": "--size",
+    "texture_side": "--texture-size",
+    "width_px": "--width",
+}
+
 Recipe = dict[str, Any]  # names and JSON values
 DigestOf = Callable[[Path], str]  # SHA-256 of a file
 RecipesOf = Callable[[DigestOf], Sequence[Recipe]]  # of each output of an item, or one for all of them
@@ -37,13 +58,14 @@ def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
 
 
 def differences(old: Recipe, new: Recipe) -> str:
-    """Say in words which entries of a recipe changed; empty if none did."""
+    """Say which options of a recipe changed, as they are typed; empty if none did."""
     parts = []
     for name in sorted(old.keys() | new.keys()):
         before, now = old.get(name), new.get(name)
         if before != now:
             both = [_short(value) for value in (before, now)]
-            parts.append(f"{name} is {both[1]}, was {both[0]}" if both[0] != both[1] else f"{name} changed")
+            said = _OPTIONS.get(name, f"--{name.replace('_', '-')}")
+            parts.append(f"{said} is {both[1]}, was {both[0]}" if both[0] != both[1] else f"{said} changed")
     return "; ".join(parts)
 
 

@@ -2,21 +2,21 @@
 
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
 from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.cli.backgrounds import BackgroundChoice, parse_aov, parse_background
-from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.backgrounds import parse_aov, parse_background
+from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
 from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.cli.folder_index import FolderIndex
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
-from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling, collect_setups, photo_lights
-from facerf_cli.cli.naming import NamePattern, split_frame
+from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
+from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import (
     BATCH,
     IMAGE,
@@ -35,6 +35,7 @@ from facerf_cli.cli.output_options import (
     STDOUT,
     ColourspaceOption,
     CompressionOption,
+    DisplayOption,
     FormatOption,
     OcioOption,
     OutputOptions,
@@ -53,127 +54,16 @@ from facerf_cli.cli.photo_options import (
     TextureSizeOption,
     check_companion,
 )
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.relight_work import Composite, ExposureGroup, Relight
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
     PhotosArgument,
     SequenceOption,
-    Shot,
     check_shots,
     collect_frames,
-    follow_all,
-    recipe_of_shots,
 )
-from facerf_cli.cli.values import Exposure, is_sweep, parse_exposure, parse_lights, parse_pose
-from facerf_cli.errors import FacerfError, UsageError
-
-Composite = Literal["photo", "face"]
-ExposureGroup = Literal["photo", "folder", "sequence"]
-
-
-@dataclass(frozen=True)
-class Relight:
-    """Relights one item under every light setup; settings only."""
-
-    photo: PhotoOptions
-    setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)  # each is in that of its own images
-    rig: str
-    sampling: Sampling
-    pose: str | None
-    composite: Composite
-    background: BackgroundChoice
-    background_blur: float
-    aov: tuple[str, ...]
-    matte: Path | None
-    exposure: Exposure
-    asked_for_photo: bool = field(metadata=NOT_IN_RECIPE)  # --composite photo is on the command line
-    output: OutputOptions
-    reflectance: RelightKind = "portrait"
-    network_alone: bool = False
-    name: NamePattern | None = field(default=None, metadata=NOT_IN_RECIPE)
-    exposure_group: ExposureGroup = "photo"
-    photo_of_stack: Path | None = None
-    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
-    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
-
-    def outputs_of(self, item: Item) -> list[Path]:
-        """A file of each format for each setup."""
-        tag = "" if self.composite == "photo" else self.photo.first_tag
-        suffixes = self.output.suffixes
-        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in suffixes]
-
-    def for_stale(self, item: Item) -> "Relight":
-        """These settings with the lights of the item's stale images; a light has all of its frames."""
-        tag = "" if self.composite == "photo" else self.photo.first_tag
-        stale = {
-            setup.name
-            for setup in self.setups
-            for suffix in self.output.suffixes
-            if not item.stale or setup.output(item, tag, suffix, self.name) in item.stale
-        }
-        return replace(self, setups=tuple(setup for setup in self.setups if setup.name in stale))
-
-    def with_leaders(self, items: Sequence[Item]) -> "Relight":
-        """These settings with the first photo of each group of --exposure-group."""
-        groups = {self._group(item): item for item in reversed(items)}
-        return replace(self, leaders=tuple(groups.values())) if self.exposure_group != "photo" else self
-
-    def leader_of(self, item: Item) -> Item | None:
-        """The photo whose exposure an item shares; None without groups."""
-        own = self._group(item)
-        return next((leader for leader in self.leaders if self._group(leader) == own), None)
-
-    def _group(self, item: Item) -> Path:
-        if self.exposure_group == "folder":
-            return item.output_base.parent
-        return item.output_base.with_name(split_frame(item.output_base.name)[0])
-
-    def refuse_meeting(self, items: Sequence[Item]) -> None:
-        """Raise UsageError where two images would have one path, as a --name may make them."""
-        seen: set[Path] = set()
-        for item in items:
-            for path in self.outputs_of(item):
-                if path in seen:
-                    raise UsageError(
-                        f"{item.input_path}: {path} would be the name of two images; give --name more fields"
-                    )
-                seen.add(path)
-
-    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """The recipe of every output, which holds the light of its own setup alone."""
-        shared = recipe_of(self, digest_of)
-        if self.leaders:
-            shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
-        shared |= recipe_of_shots(self.shots, digest_of)
-        lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
-        return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
-
-    def readable(self, dry_run: bool) -> "Relight":
-        """Load the models, and keep the setups whose maps can be read.
-
-        A dry run loads no networks, and so estimates no light of a photo.
-        """
-        from facerf_cli.cli.items.light_weights import readable
-        from facerf_cli.cli.items.outputs import check_output
-
-        check_output(self.output)
-        self.photo.preparation(dry_run)()
-        follow_all(self.shots, self.photo, dry_run)
-        if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
-            return self
-        setups = readable(self.setups)
-        if not setups:
-            raise FacerfError("no map can be read; give others")
-        return replace(self, setups=setups)
-
-    def __call__(self, item: Item) -> Outcome:
-        """Relight a photo, a frame or a stack."""
-        from facerf_cli.cli.items.relight_photos import relight_item
-
-        written, facts = relight_item(item, self.for_stale(item))
-        outputs = [path.with_suffix(suffix) for path in written for suffix in self.output.suffixes]
-        exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
-        return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
+from facerf_cli.cli.values import is_sweep, parse_exposure, parse_lights, parse_pose
+from facerf_cli.errors import UsageError
 
 
 def relight(
@@ -184,10 +74,9 @@ def relight(
         list[str] | None,
         typer.Option(
             "--envmap",
-            metavar="SKY.exr|DIR|procedural:N",
-            help="Relight under lat-long maps (.exr, .hdr): files, folders or quoted patterns; a light of "
-            "estimate-light or convert-light (.json); or the first N maps that facerf envmap draws from "
-            "--seed. Repeatable; .exr and .hdr files that follow it directly are maps, too.",
+            metavar="MAP|DIR",
+            help="Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of "
+            "estimate-light (.json), or procedural:N, maps of facerf envmap. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -197,9 +86,8 @@ def relight(
         typer.Option(
             "--light",
             metavar="LIGHT",
-            help="Relight under AZ,EL[,R,G,B] in degrees (AZ > 0: from the image's right), several by ;, "
-            "a light by its keys (at=, from=, size=, kelvin=, ...), a rig file or a preset "
-            "(rembrandt). NAME= makes a layer. Repeatable.",
+            help="Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig "
+            "file or a preset (rembrandt); docs/lights.md. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -209,8 +97,7 @@ def relight(
         typer.Option(
             "--light-from",
             metavar="PHOTO|DIR",
-            help="Relight under the light of another photo, estimated from its largest face as `facerf "
-            "estimate-light` does by default (with this --reflectance). Repeatable.",
+            help="Relight under the light of another photo, as estimate-light finds it. Repeatable.",
             show_default=False,
             rich_help_panel=LIGHT,
         ),
@@ -246,8 +133,9 @@ def relight(
     reflectance: Annotated[
         RelightKind,
         typer.Option(
-            help="Relight the whole portrait, or only the face by the paper's field; or, to compare, diffuse "
-            "under spherical harmonics, with a specular lobe, or diffuse with shadows (docs/baselines.md).",
+            metavar="KIND",
+            help="Relight the whole portrait, or the face by the paper's field; or by a baseline: "
+            "diffuse-sh, specular-sh, prt.",
             rich_help_panel=METHOD,
         ),
     ] = "portrait",
@@ -255,20 +143,20 @@ def relight(
         str,
         typer.Option(
             metavar="auto|face|EV",
-            help="Expose PNG and JPEG so that the face is as bright as in the photo (auto) or well lit "
-            "(face); or by a number of EV.",
+            help="Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.",
             rich_help_panel=IMAGE,
         ),
     ] = "auto",
     exposure_group: Annotated[
         ExposureGroup,
         typer.Option(
-            help="Choose an exposure for each photo, or from the first one for a whole folder or sequence "
-            "of frames.",
+            metavar="KIND",
+            help="Share an exposure: of each photo, or the first one's by folder or sequence of frames.",
             rich_help_panel=IMAGE,
         ),
     ] = "photo",
     view: ViewOption = OutputOptions.view,
+    display: DisplayOption = OutputOptions.display,
     format_: FormatOption = "",
     output_colourspace: ColourspaceOption = None,
     compression: CompressionOption = OutputOptions.compression,
@@ -284,9 +172,9 @@ def relight(
     background: Annotated[
         str,
         typer.Option(
-            metavar="photo|envmap|none|FILE|COLOUR",
-            help="Show behind the person the photo's background, as it was; the map, seen by the photo's "
-            "camera; nothing (alpha); an image; or a colour, #RRGGBB or linear R,G,B.",
+            metavar="KIND|FILE|COLOUR",
+            help="Show behind the person the photo, the envmap, none (alpha), an image, or a colour: "
+            "#RRGGBB or linear R,G,B.",
             rich_help_panel=IMAGE,
         ),
     ] = "photo",
@@ -305,7 +193,7 @@ def relight(
         typer.Option(
             metavar="NAME,...",
             help="Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the "
-            "face alone face (its soft mask) and uv. The matte, person.A, is always there.",
+            "face alone face and uv.",
             show_default="none",
             rich_help_panel=IMAGE,
         ),
@@ -314,8 +202,7 @@ def relight(
         Path | None,
         typer.Option(
             metavar="FILE|DIR|PATTERN",
-            help="Change only what a grey image, or its alpha, of the photo's size shows "
-            "(mattes/{stem}.png: of each its own).",
+            help="Change only what a grey image shows (mattes/{stem}.png: of each its own).",
             show_default=False,
             rich_help_panel=IMAGE,
         ),
@@ -325,7 +212,7 @@ def relight(
         typer.Option(
             "--photo",
             metavar="FILE|DIR|PATTERN",
-            help="Put an OLAT stack of predict-olat back on its photo, at the photo's resolution.",
+            help="Put an OLAT stack back on its photo, at the photo's resolution.",
             show_default=False,
             rich_help_panel=IMAGE,
         ),
@@ -370,19 +257,15 @@ def relight(
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
 ) -> None:
-    """Relight photos under environment maps and single lights.
+    """Relight photos, or OLAT stacks, under environment maps and single lights.
 
-    Each image is written as a scene-linear EXR, with the layer person.A (the matte) and those of --aov, and
-    as a PNG at --exposure, or as --format says; -o - writes one image to standard output. One prediction
-    serves all maps and rotations of a photo. Frame numbers at the end of a name (sky.0001.exr) stay at the
-    end.
-
+    Each image is written as a scene-linear EXR with the matte as layer person.A, and as a PNG at --exposure.
     A film, or images with --sequence, is one shot: one identity, and one light by which the field is
     corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or FILE.mov joins
     frames to a film, with the sound of the film that they come from.
 
-    An OLAT stack in place of a photo is relit by its own lights: --lights does not apply, and --light takes
-    the nearest of them.
+    -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
+    --light takes the nearest of them.
     """
     settings = settings_of(context)
     pattern = NamePattern.parse(name, "--name") if name else None
@@ -433,7 +316,7 @@ def relight(
         matte=matte,
         exposure=parse_exposure(exposure),
         asked_for_photo=composite == "photo",
-        output=OutputOptions(formats, output_colourspace, compression, view, config_of(ocio)),
+        output=OutputOptions(formats, output_colourspace, compression, view, display, config_of(ocio)),
         reflectance="field" if shown == "face" and reflectance == "portrait" else reflectance,
         network_alone=network_alone,
         name=pattern,
@@ -452,9 +335,15 @@ def relight(
     work.refuse_meeting(items)
     if film is not None:
         raise typer.Exit(run_to_film(film, items, shots, work, options, settings))
-    finished = all_finished("relight", items, work.outputs_of, options, settings, work.recipes_of)
-    usable = work if finished else work.readable(dry_run)
-    code = run_files("relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of)
+    index = FolderIndex(output, "relight", settings.shard, work.recipes_of)
+    usable, finished = work, all_finished(items, work.outputs_of, options, settings, index)
+    index.edited.clear()  # they are judged again
+    if not finished:
+        usable = work.readable(dry_run)
+        index.want(usable.recipes_of)
+    code = run_files(
+        "relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of, index=index
+    )
     if ball and not dry_run and settings.shard.number == 1:
         _write_balls(usable, options)
     raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))

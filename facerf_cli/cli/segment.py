@@ -8,10 +8,12 @@ import typer
 
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_files
 from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import (
     DryRunOption,
     InputColourspaceOption,
     JobsOption,
+    NameOption,
     OutputOption,
     OverwriteOption,
     settings_of,
@@ -63,6 +65,7 @@ def segment(
     landmarks: LandmarksOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
+    name: NameOption = None,
     sequence: SequenceOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
@@ -85,7 +88,7 @@ def segment(
         landmarks_from=landmarks_from,
     )
     photo.check()
-    items, shots = collect_frames(inputs, output, photo.settings, sequence)
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name))
     check_shots(shots, photo)
     work = Segment(photo, shots)
     options = BatchOptions(output, overwrite, dry_run, jobs, FRAMES_IN_A_ROW if shots else 1)

@@ -75,7 +75,7 @@ class PairReader:
         target_stack = _stack_info(path)
         source = self._read_source(pair)
         target = read_olats(path, slice(pair.target_light, pair.target_light + 1))[0].float()
-        if source.shape != target.shape or source.shape[-1] != source_stack.side_px:
+        if source.shape[-1] != source_stack.side_px or target.shape[-1] != target_stack.side_px:
             raise InputError(
                 f"{path}: the source has another size than the stack; "
                 "run relight-dataset with --overwrite always"

@@ -19,19 +19,21 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
+from pydantic import Field, model_validator
 
 from facerf_cli import __version__
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.stage_json import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.files.documents import Node, digest, read_document, unique_ids
+from facerf_cli.files.documents import Direction, Document, Name, digest, distinct, read_document
 
-FORMAT = "facerf-dataset-1"
+Format = Literal["facerf-dataset-1"]
+FORMAT: Format = "facerf-dataset-1"
 DATASET_FILE = "dataset.json"
 SPLITS = ("train", "validation", "test")
 LARGEST_CROP_PX = 4096
@@ -44,7 +46,7 @@ class Dataset:
 
     folder: Path
     face_model: str  # name of the fitted model
-    crop_px: int
+    crop_px: int  # side of the largest crop
     light_ids: tuple[str, ...]
     directions_world: np.ndarray  # [L, 3] unit, toward the lights
     splits: dict[str, tuple[str, ...]]  # by 'train', 'validation' and 'test'
@@ -107,88 +109,98 @@ def sheet_path(folder: Path, subject: str) -> Path:
     return folder / "sheets" / f"{subject}.jpg"
 
 
+class _RigLight(Document):
+    id: Name
+    direction_world: Direction
+
+
+class _CameraId(Document):
+    id: Name
+
+
+class _RigDocument(Document):
+    lights: Annotated[list[_RigLight], Field(min_length=1, max_length=MOST_LIGHTS)]
+
+
+class _SubjectEntry(Document):
+    status: str
+    cameras: Annotated[list[Name], Field(max_length=MOST_CAMERAS, default_factory=list)]
+    lights: Annotated[list[str], Field(max_length=MOST_LIGHTS)] | None = None  # None: all
+    traits: dict[str, Any] = Field(default_factory=dict)
+
+
+_Members = Annotated[list[Name], Field(max_length=MOST_SUBJECTS)]
+
+
+class _SplitLists(Document):
+    train: _Members
+    validation: _Members
+    test: _Members
+
+
+class _DatasetDocument(Document):
+    format: Format
+    face_model: str
+    crop_px: Annotated[int, Field(ge=1, le=LARGEST_CROP_PX)]
+    rig: _RigDocument
+    cameras: Annotated[list[_CameraId], Field(max_length=MOST_CAMERAS)]
+    subjects: Annotated[dict[Name, _SubjectEntry], Field(max_length=MOST_SUBJECTS)]
+    splits: _SplitLists
+    normalisation: dict[str, Any]
+    provenance: dict[str, Any]
+
+    @property
+    def done(self) -> dict[str, _SubjectEntry]:
+        """The subjects that did not fail, sorted."""
+        return {name: entry for name, entry in sorted(self.subjects.items()) if entry.status == "done"}
+
+    @model_validator(mode="after")
+    def _is_consistent(self) -> "_DatasetDocument":
+        light_ids = distinct([light.id for light in self.rig.lights], "the light")
+        known = set(distinct([camera.id for camera in self.cameras], "the camera"))
+        for name, subject in self.done.items():
+            unknown = set(distinct(subject.cameras, f"in {name}, the camera")) - known
+            if unknown or not subject.cameras:
+                raise ValueError(f"subject {name} needs at least one camera, each of the dataset")
+            lights = light_ids if subject.lights is None else subject.lights
+            if not lights or [light for light in light_ids if light in set(lights)] != lights:
+                raise ValueError(f"subject {name} needs some of the rig's lights, in the rig's order")
+        members = self.splits.train + self.splits.validation + self.splits.test
+        for name in distinct(members, "in the splits, one split only may hold a subject:"):
+            if name not in self.done:
+                raise ValueError(f"the splits name {name}, which is no prepared subject")
+        return self
+
+
 def read_dataset(folder: Path) -> Dataset:
     """Read and check `dataset.json`; raise InputError where a stack or fit that it lists is missing."""
     advice = "make it with `facerf prepare-dataset CAPTURE -o DATASET`"
-    root = read_document(folder / DATASET_FILE, advice)
-    if root["format"].value != FORMAT:
-        raise root["format"].wrong(f"'{FORMAT}'")
-    lights = root["rig"]["lights"].items(MOST_LIGHTS)
-    directions = np.array([light["direction_world"].unit() for light in lights]).reshape(-1, 3)
-    if not lights:
-        raise root["rig"]["lights"].wrong("at least one light")
-    cameras, light_ids = _prepared_cameras(root), unique_ids(lights)
+    content = read_document(folder / DATASET_FILE, _DatasetDocument, advice)
+    light_ids = tuple(light.id for light in content.rig.lights)
+    places = {name: place for place, name in enumerate(light_ids)}
     dataset = Dataset(
         folder=folder,
-        face_model=root["face_model"].text(),
-        crop_px=root["crop_px"].whole(1, LARGEST_CROP_PX),
-        light_ids=tuple(light_ids),
-        directions_world=directions,
-        splits=_read_splits(root["splits"], set(cameras)),
-        cameras=cameras,
-        normalisation=root["normalisation"].table(),
-        provenance=root["provenance"].table(),
-        traits=_read_traits(root, cameras),
-        fewer_lights=_read_lights(root, cameras, light_ids),
+        face_model=content.face_model,
+        crop_px=content.crop_px,
+        light_ids=light_ids,
+        directions_world=np.array([light.direction_world for light in content.rig.lights]),
+        splits={split: tuple(getattr(content.splits, split)) for split in SPLITS},
+        cameras={name: tuple(subject.cameras) for name, subject in content.done.items()},
+        normalisation=content.normalisation,
+        provenance=content.provenance,
+        traits={name: subject.traits for name, subject in content.done.items()},
+        fewer_lights={
+            name: tuple(places[light] for light in subject.lights)
+            for name, subject in content.done.items()
+            if subject.lights is not None
+        },
     )
-    for subject, ids in cameras.items():
+    for subject, ids in dataset.cameras.items():
         for camera in ids:
             for path in (dataset.stack_path(subject, camera), dataset.fit_path(subject, camera)):
                 if not path.is_file():
                     raise InputError(f"{path}: missing from the dataset; run prepare-dataset again")
     return dataset
-
-
-def _read_traits(root: Node, subjects: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Traits of subjects, as in the capture."""
-    nodes = root["subjects"].entries(MOST_SUBJECTS)
-    found = {subject: nodes[subject].get("traits") for subject in subjects}
-    return {subject: traits.table() if traits else {} for subject, traits in found.items()}
-
-
-def _read_lights(root: Node, subjects: Iterable[str], light_ids: list[str]) -> dict[str, tuple[int, ...]]:
-    """Lights of the subjects that lack some; an entry without `lights` has all."""
-    nodes = root["subjects"].entries(MOST_SUBJECTS)
-    places = {name: place for place, name in enumerate(light_ids)}
-    lights = {}
-    for subject in subjects:
-        if found := nodes[subject].get("lights"):
-            named = [node.text() for node in found.items(MOST_LIGHTS)]
-            if not named or [name for name in light_ids if name in named] != named:
-                raise found.wrong("some of the rig's lights, in the rig's order")
-            lights[subject] = tuple(places[name] for name in named)
-    return lights
-
-
-def _prepared_cameras(root: Node) -> dict[str, tuple[str, ...]]:
-    """Cameras of every subject that did not fail."""
-    known = set(unique_ids(root["cameras"].items(MOST_CAMERAS)))
-    cameras = {}
-    for subject, node in sorted(root["subjects"].entries(MOST_SUBJECTS).items()):
-        if node["status"].text() == "done":
-            nodes = node["cameras"].items(MOST_CAMERAS)
-            cameras[subject] = tuple(camera.name() for camera in nodes)
-            if not nodes:
-                raise node["cameras"].wrong("at least one camera")
-            for camera in nodes:
-                if camera.value not in known or cameras[subject].count(camera.value) > 1:
-                    raise camera.wrong("a camera of the dataset, listed once")
-    return cameras
-
-
-def _read_splits(node: Node, subjects: set[str]) -> dict[str, tuple[str, ...]]:
-    splits: dict[str, tuple[str, ...]] = {}
-    placed: set[str] = set()
-    for split in SPLITS:
-        members = node[split].items(MOST_SUBJECTS)
-        for member in members:
-            if member.name() not in subjects:
-                raise member.wrong("a prepared subject")
-            if member.name() in placed:
-                raise member.wrong("a subject of one split only")
-            placed.add(member.name())
-        splits[split] = tuple(member.name() for member in members)
-    return splits
 
 
 @dataclass(frozen=True)
@@ -248,7 +260,7 @@ class Split:
         return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
 
 
-def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int) -> str:
+def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int | None) -> str:
     """Short digest of all that a subject's files depend on besides its images."""
     content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
     return digest(json.dumps(content, sort_keys=True).encode())
@@ -261,7 +273,6 @@ def describe_dataset(
     seed: int,
     model: MorphableModel,
     face_model_sha256: str,
-    crop_px: int,
 ) -> dict[str, Any]:
     """Make the content of `dataset.json`; subjects without a record are marked as failed."""
     splits = split.of(capture.subjects, seed)
@@ -269,7 +280,7 @@ def describe_dataset(
         "format": FORMAT,
         "capture": capture.folder.resolve().name,
         "face_model": model.name,
-        "crop_px": crop_px,
+        "crop_px": max(entry["crop_px"] for one in records.values() for entry in one["cameras"].values()),
         "colour_space": _COLOUR_SPACE,
         "axes": "x right, y up, z toward the camera; metres; pixel centres at index + 0.5",
         **_calibration(capture),

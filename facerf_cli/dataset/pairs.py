@@ -7,7 +7,6 @@ A pair is a recipe: subject, camera, envmap, rotation and target. `dataset/weigh
 """
 
 import hashlib
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +16,8 @@ import numpy as np
 
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.errors import InputError
+from facerf_cli.files.documents import checked
+from facerf_cli.files.json_reader import parse_json
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 _TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1
@@ -40,14 +41,6 @@ class Pair:
     exposure_ev: int
     target_camera: str
     target_light: int  # part of the target camera's stack, from 0
-
-    @staticmethod
-    def from_row(row: dict[str, object]) -> "Pair":
-        """Read a pair from a line's JSON; raise ValueError or TypeError for anything else."""
-        kinds = {name: field.type for name, field in Pair.__dataclass_fields__.items()}
-        if set(row) != set(kinds) or any(type(row[name]) is not kind for name, kind in kinds.items()):
-            raise ValueError(f"not a pair: {row}")
-        return Pair(**row)  # type: ignore[arg-type]
 
     @property
     def key(self) -> tuple[str, int]:
@@ -105,11 +98,11 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
         return []
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
         try:
-            pair = Pair.from_row(json.loads(line))
+            pair = checked(Pair, parse_json(line), f"line {number}")
             _check_pair(dataset, pair)
             if pairs and pair.key <= pairs[-1].key:
                 raise ValueError("not sorted, or repeated")
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        except (ValueError, KeyError, InputError):
             raise InputError(
                 f"{path}: line {number} is not a pair of this dataset; "
                 "run relight-dataset with --overwrite always"

@@ -21,7 +21,7 @@ from torch import Tensor
 from facerf_cli.dataset.crop_move import CropMove
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.files.documents import digest, read_document, write_document
+from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.portrait.find import find_faces
@@ -29,6 +29,10 @@ from facerf_cli.workers import in_shards
 
 CACHED_SIDE_PX = 512  # the side of the paper's crops
 log = logging.getLogger(LOGGER_NAME)
+
+
+class _PhotoRecord(Document):
+    landmarks_px: Points68 | None
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,10 @@ def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1)
             work(missing)
     found, landmarks = [], []
     for record in known.values():
-        content = read_document(record, "delete the folder")["landmarks_px"]
-        if content.value is not None:
+        landmarks_px = read_document(record, _PhotoRecord, "delete the folder").landmarks_px
+        if landmarks_px is not None:
             found.append(record.with_suffix(".jpg"))
-            landmarks.append(content.array(68, 2))
+            landmarks.append(landmarks_px)
     if not found:
         raise InputError(f"--photos: no face in any of {len(known)} photos; give a folder of photos of faces")
     return Photos(tuple(found), torch.from_numpy(np.stack(landmarks)).float(), side_px)

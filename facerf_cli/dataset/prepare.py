@@ -28,7 +28,7 @@ from facerf_cli.face.landmarks import choose_face, to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.documents import read_document, write_document
+from facerf_cli.files.documents import Document, Name, read_document, write_document
 from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
@@ -42,10 +42,14 @@ _DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half f
 log = logging.getLogger(LOGGER_NAME)
 
 
+class _SubjectRecord(Document):
+    cameras: dict[Name, Any]
+
+
 def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
     """All files of a subject, from its record if it has one; the last one is written last."""
     record = record_path(folder, subject)
-    cameras = read_document(record, "")["cameras"].table() if record.exists() else capture.cameras
+    cameras = read_document(record, _SubjectRecord, "").cameras if record.exists() else capture.cameras
     paths = [place(folder, subject, camera) for camera in cameras for place in (stack_path, fit_path)]
     return [*paths, sheet_path(folder, subject), record]
 
@@ -56,7 +60,7 @@ def prepare_subject(
     chosen: Selection,
     model: MorphableModel,
     folder: Path,
-    crop_px: int,
+    crop_px: int | None,
     key: str,
     strict: bool = False,
 ) -> dict[str, Any]:
@@ -100,7 +104,7 @@ def prepare_subject(
 def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
     """Records of the finished subjects, by subject; 'prepared' is the key of `prepare_subject`."""
     return {
-        subject: read_document(record_path(folder, subject), "").table()
+        subject: read_document(record_path(folder, subject), dict[str, Any], "")
         for subject in capture.subjects
         if all(path.exists() for path in subject_outputs(capture, subject, folder))
     }
@@ -112,6 +116,7 @@ def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, 
         "face_found": face_found,
         "error_iod": round(fit.error_iod, 5),
         "quality": fit.quality,
+        "crop_px": fit.crop.size_px,
         "crop_off_iod": round(off_iod, 5),
     }
 

@@ -19,6 +19,7 @@ from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path
 from facerf_cli.dataset.weights import pair_weights
 from facerf_cli.errors import InputError
+from facerf_cli.files.documents import checked
 from facerf_cli.files.images import HALF_MAX, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.logs import attributes_of_sum
@@ -57,7 +58,7 @@ def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
 
     The result equals the file that `relight-dataset` writes, bit for bit.
     """
-    pair = row if isinstance(row, Pair) else Pair.from_row(dict(row))
+    pair = row if isinstance(row, Pair) else checked(Pair, row, "a line of pairs")
     weights = pair_weights(dataset, pair)
     return next(relit_images(dataset.stack_path(pair.subject, pair.source_camera), weights[None]))
 

@@ -2,20 +2,22 @@
 
 import csv
 import io
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Row
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.documents import Document, read_document
 from facerf_cli.logs import json_line
 
-FORMAT = "facerf-evaluation-2"
+Format = Literal["facerf-evaluation-2"]
+FORMAT: Format = "facerf-evaluation-2"
 
 
 @dataclass(frozen=True)
@@ -56,33 +58,31 @@ def write_figures(path: Path, figures: ItemFigures) -> None:
         temporary.write_text(json_line(content) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
+def _with_nan(row: Any) -> Any:
+    """A row whose figures are null where they are NaN."""
+    if isinstance(row, dict) and isinstance(values := row.get("values"), dict):
+        return row | {"values": {name: math.nan if v is None else v for name, v in values.items()}}
+    return row
+
+
+class _FiguresDocument(Document):
+    model_config = ConfigDict(strict=False)  # lists become tuples
+
+    format: Format
+    key: str
+    rows: tuple[Annotated[Row, BeforeValidator(_with_nan)], ...]
+    strips: tuple[KeptStrip, ...]
+    pictures: tuple[str, ...]
+
+
 def read_figures(path: Path) -> ItemFigures:
     """Read an item's figures; null becomes NaN. Raises InputError for any other file."""
-    require_regular(path, "give --overwrite always")
+    advice = "no figures of an evaluation; remove it, or give --overwrite always"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        if content["format"] != FORMAT:
-            raise ValueError(f"its format is {content['format']!r}")
-        rows = tuple(_row(entry) for entry in content["rows"])
-        strips = tuple(_strip(entry) for entry in content["strips"])
-        return ItemFigures(content["key"], rows, strips, tuple(map(str, content["pictures"])))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
-        raise InputError(
-            f"{path}: no figures of an evaluation ({error}); remove it, or give --overwrite always"
-        ) from None
-
-
-def _row(entry: Mapping[str, Any]) -> Row:
-    values = {name: math.nan if value is None else float(value) for name, value in entry["values"].items()}
-    facts = entry["facts"].items() if isinstance(entry["facts"], dict) else ()
-    if len(facts) != len(entry["facts"]) or not all(isinstance(fact, str | int | float) for _, fact in facts):
-        raise ValueError("its facts are not names and values")
-    return Row(**{**entry, "values": values})
-
-
-def _strip(entry: Mapping[str, Any]) -> KeptStrip:
-    lists = {name: tuple(entry[name]) for name in ("methods", "scales", "size_px")}
-    return KeptStrip(**{**entry, **lists})
+        content = read_document(path, _FiguresDocument, advice)
+    except InputError as error:
+        raise InputError(str(error) if advice in str(error) else f"{error}; {advice}") from None
+    return ItemFigures(content.key, content.rows, content.strips, content.pictures)
 
 
 def images_csv(rows: Sequence[Row]) -> str:

@@ -73,7 +73,7 @@ class Row:
     case: str
     person: str
     method: str
-    facts: Mapping[str, str | float]
+    facts: Mapping[str, str | int | float]
     values: Mapping[str, float]
 
 

@@ -218,24 +218,33 @@ def _trust(camera: PosedCamera, landmarks_px: np.ndarray) -> np.ndarray:
     return trust_inside(crop.to_crop(landmarks_px), crop, camera.height_px, camera.width_px)
 
 
+CROP_PX, CROP_STEP_PX = 256, 8  # side of a prepared crop, at most by default, and what divides it
+
+
 def fit_in_crop(
     model: MorphableModel,
     joint: JointFit,
     camera: PosedCamera,
     landmarks_px: np.ndarray | None,
     error_iod: float,
-    crop_px: int,
+    crop_px: int | None,
 ) -> tuple[FaceFit, float]:
     """Pose the head in the fixed camera of its crop from a camera's image; keep identity and expression.
 
-    The crop follows the fitted landmarks. The pose brings the vertices that face the camera as close as
+    The crop follows the fitted landmarks; `crop_px` None is `CROP_PX`, or less where the camera's image has
+    fewer pixels there, so that nothing is enlarged.
+
+    The pose brings the vertices that face the camera as close as
     possible to their pixels in the true camera. The second result is the mean distance that remains, over the
     inter-ocular distance. Without landmarks_px the fit stores the fitted landmarks. Raises InputError where
     the camera sees the head from behind.
     """
     vertices_world = joint.vertices_world(model)
     fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
-    crop = _rounded(from_landmarks(fitted_px, crop_px))
+    crop = _rounded(from_landmarks(fitted_px, crop_px or CROP_PX))
+    if crop_px is None:
+        own_px = int(crop.side_px) // CROP_STEP_PX * CROP_STEP_PX
+        crop = replace(crop, size_px=min(crop.size_px, max(own_px, CROP_STEP_PX)))
     in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
     facing = _facing(in_camera)
     if len(facing) < _LEAST_FACING * len(in_camera):

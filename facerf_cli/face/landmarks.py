@@ -3,22 +3,24 @@
 Positions are in the photo's pixels with pixel centres at index + `PIXEL_CENTRE` (`raster/camera.py`).
 """
 
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, check_landmarks
+from facerf_cli.files.documents import Document, Points68, checked
+from facerf_cli.files.json_reader import read_json
 from facerf_cli.files.regular import require_regular
 from facerf_cli.strips import strips
 
 _MAX_BYTES = 1 << 20  # of a landmark file
 _BLOCK_PX = 1 << 16  # converted at a time, so that they stay in the processor's cache
+_ADVICE = "give 68 landmarks as .pts or JSON"
 _PTS_FIRST_PIXEL = 0.5  # .pts counts pixels from 1: the first pixel's centre is 1.0 there and 0.5 here
 
 
@@ -101,44 +103,36 @@ def read_landmarks(path: Path) -> np.ndarray:
     The file is iBUG's `.pts`, whose pixels count from 1, or JSON with pixel centres at index + 0.5: a list of
     68 [x, y], or an object with this list as "landmarks".
     """
-    require_regular(path, "give 68 landmarks as .pts or JSON")
+    require_regular(path, _ADVICE)
     try:
-        size = path.stat().st_size
-        text = path.read_text(encoding="utf-8") if size <= _MAX_BYTES else ""
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({_reason(error)}); give 68 landmarks as .pts or JSON"
-        ) from None
-    if size > _MAX_BYTES:
-        raise InputError(f"{path}: too large ({size} bytes); give 68 landmarks as .pts or JSON")
-    try:
-        points = _parse_pts(text) if path.suffix.lower() == ".pts" else _parse_json(text)
-        return check_landmarks(points)
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            f"{path}: no landmarks ({_reason(error)}); give 68 landmarks as .pts or JSON"
-        ) from None
+        if path.suffix.lower() == ".pts":
+            return check_landmarks(_read_pts(path))
+        content = read_json(path, _ADVICE, _MAX_BYTES)
+        points = (
+            checked(_LandmarksDocument, content, str(path)).landmarks
+            if isinstance(content, dict)
+            else content
+        )
+        return check_landmarks(checked(Points68, points, str(path)))
     except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        named = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{named}{error}") from None
 
 
-def _reason(error: Exception) -> str:
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)
+class _LandmarksDocument(Document):
+    landmarks: Points68
 
 
-def _parse_pts(text: str) -> np.ndarray:
-    _, opening, rest = text.partition("{")
-    body, closing, _ = rest.partition("}")
-    if not opening or not closing:
-        raise ValueError("it has no points between { and }")
-    rows = [[float(token) for token in line.split()] for line in body.splitlines() if line.strip()]
-    return np.array(rows, np.float64) - _PTS_FIRST_PIXEL
-
-
-def _parse_json(text: str) -> np.ndarray:
-    content: Any = json.loads(text)
-    if isinstance(content, dict):
-        if "landmarks" not in content:
-            raise ValueError('the object has no "landmarks"')
-        content = content["landmarks"]
-    return np.array(content, np.float64)
+def _read_pts(path: Path) -> np.ndarray:
+    try:
+        with path.open("rb") as stream:
+            _, opening, rest = stream.read(_MAX_BYTES).decode().partition("{")
+        body, closing, _ = rest.partition("}")
+        if not opening or not closing:
+            raise ValueError("it has no points between { and }")
+        rows = [[float(token) for token in line.split()] for line in body.splitlines() if line.strip()]
+        return np.array(rows, np.float64) - _PTS_FIRST_PIXEL
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {_ADVICE}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: no landmarks ({error}); {_ADVICE}") from None

@@ -1,8 +1,7 @@
-"""Overviews for people: contact sheets of images, labels, and the frame of an HTML page."""
+"""Overviews for people: contact sheets of images, and labels."""
 
 import math
-from collections.abc import Iterable, Sequence
-from html import escape
+from collections.abc import Sequence
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -45,13 +44,3 @@ def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> No
     distance = np.hypot(x - 0.7 * direction[0], y - 0.7 * direction[1])
     corner[np.hypot(x, y) < 1] = 0.08 * brightness
     corner[(distance < 0.28) & ((direction[2] >= 0) | (distance > 0.14))] = brightness
-
-
-def html_page(title: str, style: str, body: Iterable[str]) -> str:
-    """Return a page that is one file and loads nothing; `body` is lines of markup, `style` is CSS."""
-    head = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{style}</style>\n</head>\n<body>"
-    )
-    return "\n".join([head, *body, "</body>\n</html>\n"])

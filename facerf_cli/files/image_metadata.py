@@ -28,6 +28,7 @@ from facerf_cli.colour import (
     linear_space,
 )
 from facerf_cli.errors import InputError
+from facerf_cli.files.heif import decode_heif, is_heif
 from facerf_cli.files.icc import space_of_profile
 from facerf_cli.logs import LOGGER_NAME, one_line
 
@@ -36,6 +37,7 @@ Attributes = Mapping[str, str | int | float]
 # Colour spaces by a part of the description, in lower case, of ICC profiles that hold tables; the first match
 # counts.
 _ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
+_HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
 OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
 _SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
@@ -77,17 +79,29 @@ def oiio_error(stream: Any = oiio) -> str:
 
 def read_header(path: Path) -> Header | None:
     """Read the header of an image's first part; return None if the file is not a readable image."""
-    stream = oiio.ImageInput.open(utf8_path(path)) if path.is_file() else None
-    if stream is None:
-        oiio_error()
+    spec = _spec_of(path) if path.is_file() else None
+    if spec is None:
         return None
-    spec = stream.spec()
-    stream.close()
     width, height = spec.full_width, spec.full_height
     if spec.get_int_attribute("Orientation", 1) >= 5:  # rotated by 90 degrees
         width, height = height, width
     floating, bits = is_floating(spec), 8 * spec.format.size()
     return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+
+
+def _spec_of(path: Path) -> oiio.ImageSpec | None:
+    if is_heif(path):
+        try:
+            return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
+        except InputError:  # damaged, or pi-heif is not there
+            return None
+    stream = oiio.ImageInput.open(utf8_path(path))
+    if stream is None:
+        oiio_error()
+        return None
+    spec = stream.spec()
+    stream.close()
+    return spec
 
 
 def utf8_path(path: Path) -> str:

@@ -8,16 +8,18 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
+from pydantic import AfterValidator, Field, PlainValidator, model_validator
 from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.documents import json_text
+from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.files.regular import require_regular
@@ -26,7 +28,8 @@ from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import RigLight
 
-FORMAT = "facerf-light-1"
+Format = Literal["facerf-light-1"]
+FORMAT: Format = "facerf-light-1"
 AXES = "camera: x to the picture's right, y up, z toward the camera; directions point to the light"
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _LIMIT_BYTES = 4 << 20
@@ -93,82 +96,79 @@ def _number(value: float) -> str:
     return f"{value:.9g}"
 
 
+def _rows(most: int, value: Any) -> np.ndarray:
+    """Finite numbers [N, 3], N of 1 to `most`."""
+    try:
+        rows = np.array(value)
+    except ValueError:  # rows of different lengths
+        rows = np.zeros(())
+    if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind not in "if" or not 1 <= len(rows) <= most:
+        raise ValueError(f"1 to {most} rows of 3 finite numbers are needed")
+    if not (np.abs(rows) < _LARGEST).all():
+        raise ValueError(f"numbers below {_LARGEST:g} are needed")
+    return rows.astype(np.float32)
+
+
+def _units(rows: np.ndarray) -> np.ndarray:
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    if np.abs(lengths - 1).max() > _LENGTH_TOLERANCE:
+        raise ValueError("unit vectors are needed")
+    return rows / lengths
+
+
+def _whole_orders(coefficients: np.ndarray) -> np.ndarray:
+    if math.isqrt(len(coefficients)) ** 2 != len(coefficients):
+        raise ValueError(f"1, 4, 9, 16, ... rows are needed, not {len(coefficients)}")
+    return coefficients
+
+
+_Rows = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_LIGHTS))]
+_Coefficients = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_COEFFICIENTS))]
+
+
+class _HarmonicsEntry(Document):
+    coefficients: Annotated[_Coefficients, AfterValidator(_whole_orders)]
+    convention: str = ""
+
+
+class _LightDocument(Document):
+    """The document; a light has directions and weights, or coefficients, or both."""
+
+    format: Format
+    rig: str = ""
+    directions: Annotated[_Rows, AfterValidator(_units)] | None = None
+    weights: _Rows | None = None
+    sh: _HarmonicsEntry | None = None
+    provenance: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _is_light(self) -> "_LightDocument":
+        counts = [0 if rows is None else len(rows) for rows in (self.directions, self.weights)]
+        if counts[0] != counts[1]:
+            raise ValueError(f"{counts[0]} directions but {counts[1]} weights")
+        if not counts[0] and self.sh is None:
+            raise ValueError("both directions and sh are missing")
+        return self
+
+
 def read_light(path: Path) -> LightRecord:
     """Read and check a JSON light; directions are normalized to unit length."""
-    fields = _parsed(path)
-    try:
-        if fields.get("format") != FORMAT:
-            raise ValueError(f"the format is not {FORMAT}")
-        if "directions" not in fields and "sh" not in fields:
-            raise ValueError("both directions and sh are missing")
-        directions, weights = torch.zeros(0, 3), torch.zeros(0, 3)
-        if "directions" in fields:
-            directions, weights = _rig(fields)
-        sh = _harmonics(fields["sh"]) if "sh" in fields else None
-    except ValueError as error:
-        raise InputError(f"{path}: not a light of facerf ({error}); {_ADVICE}") from None
-    provenance = fields.get("provenance")
-    kept = provenance.items() if isinstance(provenance, dict) else ()
-    attributes = {name: value for name, value in kept if _is_attribute(value)}
-    return LightRecord(directions, weights, str(fields.get("rig", "")), sh, attributes)
-
-
-def _parsed(path: Path) -> dict[str, Any]:
-    if path.suffix.lower() != ".json" or not path.is_file():
-        raise InputError(f"{path}: {'not a .json file' if path.is_file() else 'no such file'}; {_ADVICE}")
-    if path.stat().st_size > _LIMIT_BYTES:
-        raise InputError(f"{path}: larger than {_LIMIT_BYTES >> 20} MiB; {_ADVICE}")
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8"), parse_constant=float)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else error
-        raise InputError(f"{path}: cannot be read as JSON ({reason}); {_ADVICE}") from None
-    if not isinstance(fields, dict):
-        raise InputError(f"{path}: not a light of facerf (not a JSON object); {_ADVICE}")
-    return fields
+    if path.suffix.lower() != ".json":
+        raise InputError(f"{path}: not a .json file; {_ADVICE}")
+    light = read_document(path, _LightDocument, _ADVICE, _LIMIT_BYTES)
+    none = np.zeros((0, 3), np.float32)
+    return LightRecord(
+        torch.from_numpy(none if light.directions is None else light.directions),
+        torch.from_numpy(none if light.weights is None else light.weights),
+        light.rig,
+        Harmonics(torch.from_numpy(light.sh.coefficients), light.sh.convention) if light.sh else None,
+        {name: value for name, value in light.provenance.items() if _is_attribute(value)},
+    )
 
 
 def _is_attribute(value: Any) -> bool:
     """Return whether an image's header can store the value."""
-    if isinstance(value, str):
-        return True
-    return isinstance(value, int | float) and math.isfinite(value) and abs(value) < 1 << 31
-
-
-def _rig(fields: dict[str, Any]) -> tuple[Tensor, Tensor]:
-    directions = _rows(fields, "directions", _MOST_LIGHTS)
-    weights = _rows(fields, "weights", _MOST_LIGHTS)
-    if len(directions) != len(weights):
-        raise ValueError(f"{len(directions)} directions but {len(weights)} weights")
-    lengths = directions.norm(dim=1, keepdim=True)
-    if float((lengths - 1).abs().max()) > _LENGTH_TOLERANCE:
-        raise ValueError("directions are not unit vectors")
-    return directions / lengths, weights
-
-
-def _harmonics(fields: Any) -> Harmonics:
-    if not isinstance(fields, dict):
-        raise ValueError("sh is not a JSON object")
-    coefficients = _rows(fields, "coefficients", _MOST_COEFFICIENTS)
-    if math.isqrt(len(coefficients)) ** 2 != len(coefficients):
-        raise ValueError(f"{len(coefficients)} coefficients instead of 1, 4, 9, 16, ...")
-    return Harmonics(coefficients, str(fields.get("convention", "")))
-
-
-def _rows(fields: dict[str, Any], name: str, most: int) -> Tensor:
-    """Return an entry that is a matrix [N, 3] of finite numbers."""
-    rows = fields.get(name)
-    if not isinstance(rows, list) or not 1 <= len(rows) <= most:
-        raise ValueError(f"{name} is not a list of 1 to {most} rows")
-    if not all(isinstance(row, list) and len(row) == 3 for row in rows):
-        raise ValueError(f"{name} has a row that is not 3 numbers")
-    if not all(_is_finite_number(value) for row in rows for value in row):
-        raise ValueError(f"{name} has an entry that is not a finite number")
-    return torch.tensor(rows, dtype=torch.float32)
-
-
-def _is_finite_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _LARGEST
+    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
 
 
 def write_numbers(path: Path, numbers: Tensor) -> None:

@@ -12,23 +12,27 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
+from pydantic import PlainValidator
 from torch import Tensor
 
 from facerf_cli import memory
 from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
 from facerf_cli.files.images import HALF_MAX
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import one_line
 
-FORMAT = "facerf-olat-1"
+Format = Literal["facerf-olat-1"]
+FORMAT: Format = "facerf-olat-1"
 COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
 _LIGHT_BYTES = 6  # of a pixel: half floats
 _SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
@@ -250,24 +254,28 @@ def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
     if not text:
         raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
     try:
-        content = json.loads(text) if len(text) <= _MOST_HEADER_BYTES else {}
-        if content["format"] != FORMAT or content["kind"] not in ("photo", "texture", "image"):
-            raise ValueError(f"format {content['format']!r}, kind {content['kind']!r}")
-        rotation = np.array(content["rotation"], np.float64)
-        if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
-            raise ValueError(f"rotation has the shape {rotation.shape}")
-        return {
-            "kind": content["kind"],
-            "lights": int(content["lights"]),
-            "layout_version": int(content["layout_version"]),
-            "rotation": rotation,
-            "fit": {name: np.array(value) for name, value in content["fit"].items()},
-        }
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        if len(text) > _MOST_HEADER_BYTES:
+            raise ValueError(f"its header is larger than {_MOST_HEADER_BYTES >> 20} MiB")
+        return dict(checked(_StackDocument, parse_json(text), _HEADER))
+    except (ValueError, InputError) as error:
         raise InputError(
-            f"{path}: damaged OLAT stack, or written by another version of facerf "
-            f"({type(error).__name__}: {error})"
+            f"{path}: damaged OLAT stack, or written by another version of facerf ({error})"
         ) from None
+
+
+def _arrays(value: Any) -> dict[str, np.ndarray]:
+    if not isinstance(value, dict):
+        raise ValueError("an object of arrays is needed")
+    return {name: np.array(entry) for name, entry in value.items()}
+
+
+class _StackDocument(Document):
+    format: Format
+    kind: Literal["photo", "texture", "image"]
+    lights: int
+    layout_version: int
+    rotation: Matrix3
+    fit: Annotated[dict[str, np.ndarray], PlainValidator(_arrays)]
 
 
 def _direction(path: Path, spec: oiio.ImageSpec) -> np.ndarray:

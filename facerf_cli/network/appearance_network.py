@@ -12,17 +12,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.network.feature_networks import TrainedFeatures
+from facerf_cli.network.settings import Count, Grid, Side, VggWidth, settings_from
 
 
 @dataclass(frozen=True)
 class AppearanceSettings:
     """Number of people, side of the images, and sizes; `width` 1 is the trunk of VGG-16."""
 
-    people: int
-    side: int = 128
-    width: float = 0.25
-    grid: int = 8  # side to which conv3_3 is pooled before the head
-    hidden: int = 256
+    people: Count
+    side: Side = 128
+    width: VggWidth = 0.25
+    grid: Grid = 8  # side to which conv3_3 is pooled before the head
+    hidden: Count = 256
 
 
 class AppearanceNetwork(TrainedFeatures):
@@ -39,4 +40,4 @@ class AppearanceNetwork(TrainedFeatures):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(AppearanceSettings(**{name: value for name, value in metadata.items() if name != "form"}))
+        return cls(settings_from(AppearanceSettings, metadata))

@@ -18,6 +18,7 @@ from torch.overrides import TorchFunctionMode
 from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
@@ -29,7 +30,6 @@ from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 FORMAT = "facerf-checkpoint-1"
 _FILLS = (Tensor.uniform_, Tensor.normal_)
 _COPIES = 3  # of a file: its tensors, floats of its halves, and the networks that take them
-_LARGEST_SIDE = 4096  # working side, in a checkpoint that is read
 
 # Classes by the name of a network in a checkpoint, and its form.
 _CLASSES: dict[tuple[str, str], type[Any]] = {
@@ -85,7 +85,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        metadata = json.loads(header["facerf"])
+        metadata = parse_json(header["facerf"])
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is not a JSON object")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
@@ -102,7 +102,6 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
     """Make the network that metadata describe and load its tensors; raises ValueError if they do not fit."""
     network_class = _CLASSES[name, described["form"]]
-    _require_bounded(described)
     with torch.device("meta"), _Unfilled():  # takes no memory, whatever sizes the file demands
         shapes = network_class.from_metadata(described).state_dict().items()
         expected = {key: tensor.shape for key, tensor in shapes}
@@ -129,13 +128,6 @@ class _Unfilled(TorchFunctionMode):
         if function in _FILLS or getattr(function, "__module__", "") == nn.init.__name__:
             return args[0] if args else kwargs["tensor"]
         return function(*args, **kwargs)
-
-
-def _require_bounded(described: dict[str, Any]) -> None:
-    """Raise ValueError for bad values of the settings on which no tensor's shape depends."""
-    side, normals = described.get("side", 128), described.get("normals", True)
-    if type(side) is not int or not 8 <= side <= _LARGEST_SIDE or type(normals) is not bool:
-        raise ValueError(f"a working side of {side}, normals {normals}")
 
 
 def _tensors_of(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from facerf_cli.light.sh import irradiance, sh_basis
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, exposure_of, head_rotation, resize
 from facerf_cli.network.reflectance_default import Down
+from facerf_cli.network.settings import Count, Side, Widths, settings_from
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2
@@ -27,19 +28,18 @@ _GAIN = 0.5  # gain of the albedo's logit in an untrained network
 _MAP_SIDE = 64  # of the stored normals of the mean face
 _ROTATION_DIRECTIONS = 36  # at which a light is evaluated to rotate it: four per coefficient
 _CONSTANT = math.sqrt(4 * math.pi)  # the coefficient of a constant envmap of radiance 1
-_MOST_WIDTH = 1024  # of a layer, in a checkpoint that is read
 
 
 @dataclass(frozen=True)
 class DiffuseSettings:
     """Channels at each halving of the working side, and sizes of the branch that regresses the light."""
 
-    side: int = 128
-    encoder_widths: tuple[int, ...] = (16, 32, 64, 96, 128)
-    decoder_widths: tuple[int, ...] = (16, 24, 48, 64, 96)
-    light_channels: int = 24
-    light_grid: int = 8  # side to which the coarsest features are pooled for the light
-    light_hidden: int = 96
+    side: Side = 128
+    encoder_widths: Widths = (16, 32, 64, 96, 128)
+    decoder_widths: Widths = (16, 24, 48, 64, 96)
+    light_channels: Count = 24
+    light_grid: Count = 8  # side to which the coarsest features are pooled for the light
+    light_hidden: Count = 96
 
 
 class DiffuseEstimate(NamedTuple):
@@ -89,13 +89,7 @@ class DiffuseNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        given = {k: v for k, v in metadata.items() if k != "form"}
-        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-        wanted = DiffuseSettings(**settings)
-        widths = (*wanted.encoder_widths, *wanted.decoder_widths, wanted.light_channels, wanted.light_grid)
-        if not all(type(w) is int and 0 < w <= _MOST_WIDTH for w in (*widths, wanted.light_hidden)):
-            raise ValueError(f"no diffuse network has the settings {metadata}")
-        return cls(wanted)
+        return cls(settings_from(DiffuseSettings, metadata))
 
     def set_mean_face(self, normals: Tensor) -> None:
         """Store the normals [3, T, T] of the mean face, head frame, from which a head's pose is estimated."""

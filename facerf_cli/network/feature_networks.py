@@ -22,6 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.inputs import resize
+from facerf_cli.network.settings import Count, Grid, Side, VggWidth, settings_from
 
 # Index of each convolution in torchvision's `features`, and its channels.
 CONVOLUTIONS = (
@@ -155,10 +156,10 @@ class LightSettings:
     `side` is that of the textures it was trained on, the only one at which its features are right.
     """
 
-    width: float = 0.25
-    grid: int = 8  # side to which conv3_3 is pooled before the head: the places that are lit show the light
-    hidden: int = 128
-    side: int = 128
+    width: VggWidth = 0.25
+    grid: Grid = 8  # side to which conv3_3 is pooled before the head: the places that are lit show the light
+    hidden: Count = 128
+    side: Side = 128
 
 
 class TrainedFeatures(nn.Module):
@@ -206,7 +207,7 @@ class LightNetwork(TrainedFeatures):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(LightSettings(**{name: value for name, value in metadata.items() if name != "form"}))
+        return cls(settings_from(LightSettings, metadata))
 
 
 class Lpips(nn.Module):

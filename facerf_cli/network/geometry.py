@@ -10,15 +10,18 @@ representations in neural networks*, 2019).
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
+from pydantic import Field
 from torch import Tensor, nn
+
+from facerf_cli.network.settings import settings_from
 
 GeometryForm = Literal["default", "paper"]
 _SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of the crop that each form reads
-_MAX_COEFFICIENTS = 500  # of identity or expression, in a checkpoint that is read
+Coefficients = Annotated[int, Field(ge=0, le=500)]
 _SHIFT, _DEPTH = 0.05, 0.2  # what one unit of an output shifts the head: a share of the depth, of log depth
 _ALPHA, _BETA = 0.3, 0.7  # and the coefficients, in standard deviations; as wide as the priors of the fit
 _BRIGHTEST = 4.0  # standard deviations from a crop's mean at which its square root is clamped
@@ -29,9 +32,9 @@ class GeometryNetworkSettings:
     """Form, numbers of coefficients, and the translation (m, camera space) at outputs of zero."""
 
     form: GeometryForm = "default"
-    identity: int = 40
-    expression: int = 29
-    mean_translation_m: tuple[float, float, float] = (0.0, 0.0, -1.1)
+    identity: Coefficients = 40
+    expression: Coefficients = 29
+    mean_translation_m: tuple[float, float, Annotated[float, Field(gt=-100, lt=0)]] = (0.0, 0.0, -1.1)
 
 
 class GeometryEstimate(NamedTuple):
@@ -91,15 +94,7 @@ class GeometryNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        form, counts = metadata["form"], (int(metadata["identity"]), int(metadata["expression"]))
-        x, y, z = (float(value) for value in metadata["mean_translation_m"])
-        if (
-            form not in _SIDES
-            or not all(0 <= count <= _MAX_COEFFICIENTS for count in counts)
-            or not -100 < z < 0
-        ):
-            raise ValueError(f"no Geometry Network has the settings {metadata}")
-        return cls(GeometryNetworkSettings(form, *counts, (x, y, z)))
+        return cls(settings_from(GeometryNetworkSettings, metadata))
 
 
 def _rotation(columns: Tensor) -> Tensor:

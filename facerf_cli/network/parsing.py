@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-_MAX_WIDTH, _MAX_OUTPUTS = 512, 256  # in a checkpoint that is read
+from facerf_cli.network.settings import Blocks, Classes, Landmarks, Side, WidthsOfFour, settings_from
+
 _ALPHA_STEPS = 2  # pixels of the classes along each side of a pixel of the features
 
 
@@ -21,11 +22,11 @@ _ALPHA_STEPS = 2  # pixels of the classes along each side of a pixel of the feat
 class ParsingSettings:
     """Channels at 1/2, 1/4, ... of the crop's side; side in pixels; numbers of classes and landmarks."""
 
-    widths: tuple[int, ...] = (20, 40, 88, 152, 184)
-    blocks: tuple[int, ...] = (0, 1, 2, 3, 2)
-    side: int = 256
-    classes: int = 14
-    landmarks: int = 92
+    widths: WidthsOfFour = (20, 40, 88, 152, 184)
+    blocks: Blocks = (0, 1, 2, 3, 2)
+    side: Side = 256
+    classes: Classes = 14
+    landmarks: Landmarks = 92
 
 
 class Parsing(NamedTuple):
@@ -86,17 +87,10 @@ class ParsingNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        widths, blocks = (tuple(int(x) for x in metadata[name]) for name in ("widths", "blocks"))
-        side, classes, landmarks = (int(metadata[name]) for name in ("side", "classes", "landmarks"))
-        if (
-            not 3 <= len(widths) == len(blocks) <= 6
-            or not all(4 <= width <= _MAX_WIDTH and width % 4 == 0 for width in widths)
-            or not all(0 <= count <= 8 for count in blocks)
-            or not (2 <= classes <= _MAX_OUTPUTS and 68 <= landmarks <= _MAX_OUTPUTS)
-            or side % 2 ** len(widths)
-        ):
+        settings = settings_from(ParsingSettings, metadata)
+        if len(settings.widths) != len(settings.blocks) or settings.side % 2 ** len(settings.widths):
             raise ValueError(f"no Parsing Network has the settings {metadata}")
-        return cls(ParsingSettings(widths, blocks, side, classes, landmarks))
+        return cls(settings)
 
 
 def _normalised(crops: Tensor) -> Tensor:

@@ -21,13 +21,13 @@ from torch import Tensor, nn
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.parsing import Halving, Residual
+from facerf_cli.network.settings import Blocks, Classes, Side, WidthsOfFour, settings_from
 
 SKIN = 1  # index of the class whose mean exposes the image
 _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
 LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
 _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
-_MAX_WIDTH = 512  # in a checkpoint that is read
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
@@ -43,10 +43,10 @@ _OUTPUTS = 4 * sum(_FINE.values()) + sum(_COARSE.values())
 class PortraitSettings:
     """Channels at 1/2, 1/4, ... of the square's side, and residual blocks there; classes of the input."""
 
-    widths: tuple[int, ...] = (40, 72, 120, 176, 208)
-    blocks: tuple[int, ...] = (1, 1, 2, 2, 2)
-    classes: int = 14
-    side: int = 192
+    widths: WidthsOfFour = (40, 72, 120, 176, 208)
+    blocks: Blocks = (1, 1, 2, 2, 2)
+    classes: Classes = 14
+    side: Side = 192
 
 
 @dataclass(frozen=True)
@@ -198,17 +198,10 @@ class PortraitNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        widths, blocks = (tuple(int(x) for x in metadata[name]) for name in ("widths", "blocks"))
-        classes, side = int(metadata["classes"]), int(metadata["side"])
-        if (
-            not 3 <= len(widths) == len(blocks) <= 6
-            or not all(4 <= width <= _MAX_WIDTH and width % 4 == 0 for width in widths)
-            or not all(0 <= count <= 8 for count in blocks)
-            or not 2 <= classes <= 64
-            or side % 2 ** len(widths)
-        ):
+        settings = settings_from(PortraitSettings, metadata)
+        if len(settings.widths) != len(settings.blocks) or settings.side % 2 ** len(settings.widths):
             raise ValueError(f"no Portrait Network has the settings {metadata}")
-        return cls(PortraitSettings(widths, blocks, classes, side))
+        return cls(settings)
 
 
 def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:

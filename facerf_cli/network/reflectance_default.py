@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.inputs import exposure_of, from_root, head_rotation, resize
+from facerf_cli.network.settings import Count, Side, Widths, settings_from
 
 _MAP_SIDE = 64  # of the stored normals and shadows of the mean face
 _DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
@@ -34,11 +35,11 @@ class DefaultReflectanceSettings:
     normal maps by zeros (paper, 'Ablative Study').
     """
 
-    side: int = 128
-    encoder_widths: tuple[int, ...] = (32, 64, 128, 192, 224, 256)
-    decoder_widths: tuple[int, ...] = (20, 36, 64, 96, 128, 160)
-    template_channels: int = 8
-    rig_lights: int = 150
+    side: Side = 128
+    encoder_widths: Widths = (32, 64, 128, 192, 224, 256)
+    decoder_widths: Widths = (20, 36, 64, 96, 128, 160)
+    template_channels: Count = 8
+    rig_lights: Count = 150
     normals: bool = True
 
 
@@ -95,9 +96,7 @@ class DefaultReflectanceNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        given = {k: v for k, v in metadata.items() if k != "form"}
-        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-        return cls(DefaultReflectanceSettings(**settings))
+        return cls(settings_from(DefaultReflectanceSettings, metadata))
 
     @property
     def rig_lights(self) -> int:

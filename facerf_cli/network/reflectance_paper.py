@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.inputs import exposure_of, resize, to_root
+from facerf_cli.network.settings import Count, Side, Widths, settings_from
 
 _SLOPE = 0.2  # of the leaky rectifiers
 _GROUPS = 4  # of the group normalisations
@@ -39,9 +40,9 @@ class PaperReflectanceSettings:
     `normals` False leaves N_s and N_t out (paper, 'Ablative Study').
     """
 
-    side: int = 512
-    widths: tuple[int, ...] = (64, 128, 256, 512, 512, 512, 512, 512)
-    features: int = 32
+    side: Side = 512
+    widths: Widths = (64, 128, 256, 512, 512, 512, 512, 512)
+    features: Count = 32
     normals: bool = True
 
 
@@ -99,9 +100,7 @@ class PaperReflectanceNetwork(nn.Module):
     @classmethod
     def from_metadata(cls, metadata: dict[str, Any]) -> Self:
         """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        given = {k: v for k, v in metadata.items() if k != "form"}
-        settings: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in given.items()}
-        return cls(PaperReflectanceSettings(**settings))
+        return cls(settings_from(PaperReflectanceSettings, metadata))
 
     def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
         """Do nothing: this form needs no mean face."""

@@ -1,6 +1,5 @@
 """A synthetic light stage: random subjects, photographed by every camera under every light into a capture."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,11 +13,12 @@ from torch import Tensor
 
 from facerf_cli import __version__
 from facerf_cli.capture.stage_json import STAGE_FILE, STAGE_FORMAT
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import GRID
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import write_exr
+from facerf_cli.files.json_reader import read_json
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
 from facerf_cli.light.transport import BakeSettings
@@ -101,8 +101,8 @@ def open_capture(folder: Path, settings: StageSettings) -> None:
     path, described = folder / STAGE_FILE, describe_stage(settings)
     if path.exists():
         try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
+            found = read_json(path, "")
+        except InputError:
             found = {}
         if not isinstance(found, dict) or {**found, "subjects": None} != {**described, "subjects": None}:
             raise UsageError(f"{path}: the capture has other settings; give another -o or remove it")
@@ -113,9 +113,7 @@ def open_capture(folder: Path, settings: StageSettings) -> None:
 def close_capture(folder: Path, settings: StageSettings) -> None:
     """Write the traits of all finished subjects to stage.json."""
     records = {path.parent.name: path for path in sorted(folder.glob("*/subject.json"))}
-    subjects = {
-        name: json.loads(path.read_text(encoding="utf-8"))["traits"] for name, path in records.items()
-    }
+    subjects = {name: read_json(path, "")["traits"] for name, path in records.items()}
     write_document(folder / STAGE_FILE, describe_stage(settings) | {"subjects": subjects})
 
 

@@ -3,7 +3,6 @@
 Ctrl-C and SIGTERM end a run between two steps, so that nothing is lost; a second one ends it at once.
 """
 
-import json
 import logging
 import math
 import signal
@@ -21,6 +20,7 @@ from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import LOGGER_NAME, json_line
 from facerf_cli.stopping import unhurried
 
@@ -75,7 +75,7 @@ class RunLog:
 def _step_of(line: str) -> float:
     """Step of a row; infinite for an incomplete line."""
     try:
-        return float(json.loads(line)["step"])
+        return float(parse_json(line)["step"])
     except (ValueError, KeyError, TypeError):
         return math.inf
 

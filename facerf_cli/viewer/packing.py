@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import ConvexHull
 
+from facerf_cli import strips
 from facerf_cli.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     FACE_PERCENTILE,
@@ -63,7 +64,7 @@ def packed(
         "size": [matte.shape[1], matte.shape[0]],
         "head": _head(matte, crop),
         "photo": _lossless(_encoded(photo)),
-        "fringe": _lossless(_fringe(np.asarray(composition.own), matte)),
+        "fringe": _lossless(_fringe(strips.whole(composition.own), matte)),
         "matte": _png(np.round(matte * 255).astype(np.uint8)),
         "window": _add_window(pack, composition),
         "person": person,

@@ -48,7 +48,9 @@ def test_config_shows_what_is_in_force_and_from_where(
     assert f"--seed = 3  ({config})" in lines and f"evaluate yale-b --overwrite = always  ({config})" in lines
     assert main(["config", "relight"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert f"--exposure = face  ({config})" in lines and "--lights = 150  (default)" in lines
+    assert f"--exposure = face  ({config})" in lines and "# --lights = 150" in lines
+    assert lines.index(f"--exposure = face  ({config})") < lines.index("# not set, and so by default:")
+    assert all(line[0] == "#" for line in lines[lines.index("# not set, and so by default:") :])
     assert main(["config", "relight", "--seed", "5"]) == 0
     monkeypatch.delenv("FACERF_CONFIG")
     assert main(["config"]) == 0

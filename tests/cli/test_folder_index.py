@@ -1,7 +1,7 @@
 """Finished outputs: skipped where input, recipe and networks are those they were made with."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import pytest
@@ -10,6 +10,8 @@ from facerf_cli.cli import folder_index
 from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, Shard
+from facerf_cli.cli.output_options import OutputOptions
+from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
 from facerf_cli.errors import InputError
 from facerf_cli.files.downloads import file_sha256
@@ -57,8 +59,10 @@ def test_other_options_make_all_again_and_say_which(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     run([photos], tmp_path / "out", recipe={"lights": 150})
+    run([photos], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
+    assert "2 made again: --lights is 200, was 150" in capsys.readouterr().err
     run([photos], tmp_path / "out", recipe={"lights": 300})
-    assert "2 made again: lights is 300, was 150" in capsys.readouterr().err
+    assert "2 made again: --lights is 300, was 150" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
@@ -197,6 +201,27 @@ def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path:
     assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 
+def test_relight_reads_its_index_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.png").write_bytes(b"a")
+    read = []
+    init = folder_index._Rows.__init__
+
+    def counted(self: folder_index._Rows, folder: Path) -> None:
+        read.append(folder)
+        init(self, folder)
+
+    monkeypatch.setattr(folder_index._Rows, "__init__", counted)
+    monkeypatch.setattr("facerf_cli.cli.relight_work.Relight.readable", lambda self, dry_run: self)
+    line = ["relight", str(tmp_path / "a.png"), "--light", "9,9", "--dry-run"]
+    assert main([*line, "-o", str(tmp_path / "out")]) == 0
+    assert read == [tmp_path / "out"]
+
+
+def test_the_colours_of_input_and_output_are_both_in_a_recipe() -> None:
+    both = {field.name for part in (PhotoOptions, OutputOptions) for field in fields(part)}
+    assert len(both) == len(fields(PhotoOptions)) + len(fields(OutputOptions))  # one would hide the other
+
+
 @dataclass(frozen=True)
 class Inner:
     matte: Path
@@ -217,7 +242,7 @@ def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path:
     assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
-    assert differences(one, other) == "lights is another, was 150; matte changed"
+    assert differences(one, other) == "--lights is another, was 150; --matte changed"
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
 
 

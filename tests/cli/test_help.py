@@ -55,7 +55,7 @@ def test_the_options_of_a_long_help_stand_in_panels(name: str) -> None:
 
 def test_paragraphs_fill_the_width() -> None:
     help_text = COMMANDS["estimate-light"].help
-    assert "\n" not in help_text.replace("\n\n", "") and help_text.count("\n\n") == 2
+    assert "\n" not in help_text.replace("\n\n", "") and help_text.count("\n\n") == 3
 
 
 def test_man_pages_have_the_panels_as_subsections() -> None:
@@ -64,3 +64,11 @@ def test_man_pages_have_the_panels_as_subsections() -> None:
     assert panels == ["Light", "Method", "Face", "Image", "Batch"]
     top = manpages.pages()["facerf.1"]
     assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
+
+
+def test_the_longest_help_is_under_160_lines(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    assert main(["relight", "--help"]) == 0
+    assert 60 < len(capsys.readouterr().out.splitlines()) < 160

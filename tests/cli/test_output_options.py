@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +82,10 @@ def test_one_image_on_standard_output(
     given: Path, tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
 ) -> None:
     assert relight(given, Path("-"), *LIGHT) == 0
-    with Image.open(io.BytesIO(capsysbinary.readouterr().out)) as image:
+    said = capsysbinary.readouterr()
+    (line,) = said.err.decode().splitlines()
+    assert re.fullmatch(rf"{PHOTO} under light_\S+: exposure \S+ EV", line)  # no path that is gone
+    with Image.open(io.BytesIO(said.out)) as image:
         assert image.format == "PNG" and image.size == (512, 512)
     assert relight(given, Path("-"), *LIGHT, "--format", "exr", "--composite", "face") == 0
     (tmp_path / "piped.exr").write_bytes(capsysbinary.readouterr().out)

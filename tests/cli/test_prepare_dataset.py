@@ -143,7 +143,7 @@ def test_the_page_shows_everybody(prepared: Dataset) -> None:
     for subject in prepared.subjects:
         assert f'src="sheets/{subject}.jpg"' in page and prepared.split_of(subject) in page
         sheet = read_image(prepared.folder / f"sheets/{subject}.jpg").pixels
-        assert sheet.shape == (3 * 98 - 2, 6 * 98 - 2, 3) and sheet.max() > 0.5
+        assert sheet.shape == (3 * 194 - 2, 6 * 194 - 2, 3) and sheet.max() > 0.5
     assert all((prepared.folder / link).is_file() for link in re.findall(r'(?:href|src)="([^"]+)"', page))
     assert "http" not in page and "<script" not in page
 
@@ -387,6 +387,20 @@ def test_records_of_another_run_stay_out_of_the_dataset(
         (tmp_path / "hidden.exr").rename(torn)
     dataset = read_dataset(output)
     assert dataset.subjects == ("0000",) and dataset.crop_px == 64
+
+
+def test_a_small_capture_is_not_enlarged(given: Given, tmp_path: Path) -> None:
+    """Without --crop no stack has more pixels than its face has in the frames, at most 256 a side."""
+    assert main(["prepare-dataset", str(given[0]), "-o", str(tmp_path / "own"), "--checks", "off"]) == 0
+    dataset = read_dataset(tmp_path / "own")
+    sides = []
+    for subject in dataset.subjects:
+        for camera in dataset.cameras[subject]:
+            crop = load_fit(dataset.fit_path(subject, camera)).crop
+            assert crop.size_px <= crop.side_px and crop.size_px % 8 == 0
+            assert read_olat_stack(dataset.stack_path(subject, camera)).olats.shape[-1] == crop.size_px
+            sides.append(crop.size_px)
+    assert dataset.crop_px == max(sides) < 256
 
 
 def test_a_dry_run_writes_nothing(given: Given, tmp_path: Path, capsys: Said) -> None:

@@ -11,7 +11,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
@@ -413,3 +413,23 @@ def test_a_group_shares_the_exposure_of_its_first_photo(given: Path, tmp_path: P
     first, second = "shot.0000", "shot.0001"
     assert exposures["photo"][second] > exposures["photo"][first] + 1
     assert exposures["sequence"][first] == exposures["sequence"][second] == exposures["photo"][first]
+
+
+def test_a_group_of_stacks_shares_the_exposure_of_the_first(given: Path, tmp_path: Path) -> None:
+    """The same stack twice, the second at 0.4 of its light."""
+    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "--landmarks", str(given / "astronaut.json")]
+    olat = ["predict-olat", str(PHOTO), "--lights", "4", "--frame", "face", "-o", str(tmp_path / "olat")]
+    assert main([*fixed[:2], *olat, *fixed[2:]]) == 0
+    stack = read_olat_stack(tmp_path / "olat/astronaut_olat.exr")
+    stacks = tmp_path / "stacks"
+    stacks.mkdir()
+    for number, share in enumerate((1.0, 0.4)):
+        write_olat_stack(stacks / f"a.{number:04d}.exr", stack.header, [stack.olats.float() * share])
+    exposures = {}
+    for group in ("photo", "sequence"):
+        line = ["--light", "20,10", "--format", "png", "--exposure", "face", "--exposure-group", group]
+        assert main([*fixed[:2], "relight", str(stacks), *line, "-o", str(tmp_path / group)]) == 0
+        rows = map(json.loads, (tmp_path / group / "report.jsonl").read_text().splitlines())
+        exposures[group] = [next(iter(row["exposure_ev"].values())) for row in rows]
+    assert exposures["photo"][1] > exposures["photo"][0] + 1
+    assert exposures["sequence"] == [exposures["photo"][0]] * 2

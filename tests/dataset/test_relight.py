@@ -288,7 +288,6 @@ def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: 
         {"target_light": 20},
         {"index": -1},
         {"index": 1},
-        {"rotate_deg": 90},
     ],
 )
 def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, object]) -> None:

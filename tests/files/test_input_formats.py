@@ -15,6 +15,7 @@ from PIL import Image
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES
 from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError
+from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_display
 from tests import icc_profiles
 
@@ -213,3 +214,17 @@ def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pyte
     read_image(tmp_path / "bare.exr", "ACEScg")
     read_image(save_by_oiio(tmp_path / "a.png", LEVELS))
     assert not caplog.records
+
+
+def test_the_header_of_a_heic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`read_header` agrees with the pixels, under any name; None without pi-heif, or of a damaged file."""
+    other = tmp_path / "IMG_1.jpg"
+    other.write_bytes(HEIC.read_bytes())
+    for path in (HEIC, other):
+        header = read_header(path)
+        assert header is not None and (header.height_px, header.width_px) == read_image(HEIC).pixels.shape[:2]
+        assert (header.is_floating, header.bits) == (False, 8)
+    (tmp_path / "cut.heic").write_bytes(HEIC.read_bytes()[:200])
+    assert read_header(tmp_path / "cut.heic") is None
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    assert read_header(HEIC) is None

@@ -55,16 +55,17 @@ def test_a_light_may_have_coefficients_alone(tmp_path: Path) -> None:
 
 
 BAD: dict[str, dict[str, Any]] = {
-    "format is not": {"format": "other"},
-    "both directions and sh": {"directions": None},
+    "format is .*facerf-light-1": {"format": "other"},
+    "0 directions but 2 weights": {"directions": None},
+    "both directions and sh": {"directions": None, "weights": None},
     "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
-    "not unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
-    "weights has a row that is not 3": {"weights": [[1, 1, 1], [1, 1]]},
-    "weights has an entry": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
-    "weights has an entry that": {"weights": [[1, 1, 1], [1, 1, "2"]]},
-    "directions is not a list of 1 to 4096": {"directions": []},
-    "8 coefficients": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
-    "sh is not": {"sh": 5},
+    "directions is .*unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
+    "weights is .* rows of 3": {"weights": [[1, 1, 1], [1, 1]]},
+    "NaN is not a finite": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
+    "3 finite numbers": {"weights": [[1, 1, 1], [1, 1, "2"]]},
+    "directions is .*1 to 4096 rows": {"directions": []},
+    "sh: coefficients is .*not 8": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
+    "sh is 5; an object": {"sh": 5},
 }
 
 
@@ -78,13 +79,19 @@ def test_an_error_is_one_line_that_names_the_fault(complaint: str, tmp_path: Pat
     assert "a.json" in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"\xff\xfe", b"[" * 100_000, b" " * (5 << 20)])
+@pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b" " * (5 << 20)])
 def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(text)
     with pytest.raises(InputError, match=r"a\.json: .*give a \.json"):
         read_light(tmp_path / "a.json")
     with pytest.raises(InputError, match="no such file"):
         read_light(tmp_path / "b.json")
+
+
+def test_a_list_is_no_light(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(InputError, match=r"a\.json is \[1\]; an object"):
+        read_light(tmp_path / "a.json")
 
 
 def test_numbers_are_written_one_in_each_line(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.models import load_models
 from facerf_cli.pipeline import composition_of, find_for, head_of, relit_by
 from facerf_cli.portrait_field import PortraitField
-from facerf_cli.viewer.frame import shrunk_photo
+from facerf_cli.resize import shrunk_photo
 from facerf_cli.viewer.packing import packed
 from facerf_cli.viewer.page import page
 from tests.viewer.browser import chromium, drawn

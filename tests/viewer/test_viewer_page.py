@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from facerf_cli.resize import fitted, resized
 from facerf_cli.viewer.arrays import ArrayPack
-from facerf_cli.viewer.frame import fitted, resized
 from facerf_cli.viewer.packing import strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 from facerf_cli.viewer.stage import atlas, factored

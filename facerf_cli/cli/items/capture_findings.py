@@ -4,7 +4,6 @@ A dataset's findings.jsonl has a row for every finding; findings/SUBJECT.jsonl h
 before the subject is prepared.
 """
 
-import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, workers_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import LOGGER_NAME, STDERR, counted, json_line, one_line
 from facerf_cli.synth.threads import one_thread
 from facerf_cli.workers import process_died, spread
@@ -123,7 +123,7 @@ def _read_rows(path: Path) -> list[dict[str, Any]]:
         return []
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     try:
-        rows = [json.loads(line) for line in lines]
+        rows = [parse_json(line) for line in lines]
     except ValueError:
         raise InputError(f"{path}: damaged; remove it, and give --overwrite always to check again") from None
     return [row for row in rows if isinstance(row, dict)]

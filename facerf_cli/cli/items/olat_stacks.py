@@ -36,8 +36,8 @@ from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.resize import shrunk_photo
 from facerf_cli.strips import whole
-from facerf_cli.viewer.frame import shrunk_photo
 
 _TILE_PX = 128  # of the contact sheet
 _FRONT, _FEWEST_FRONT = (

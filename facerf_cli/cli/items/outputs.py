@@ -78,17 +78,17 @@ def _held(image: OutputImage) -> OutputImage:
 
 def _space_of(options: OutputOptions) -> ColourSpace:
     """The colour space of EXR and TIFF files."""
-    if options.colourspace is None:
+    if options.output_colourspace is None:
         return LINEAR
-    space = named_space(options.colourspace, options.config)
+    space = named_space(options.output_colourspace, options.config)
     if space.decode is not None:
         raise UsageError(
-            f"--output-colourspace {options.colourspace}: EXR and TIFF are linear, without the curve of "
-            f"{space.name}; give a linear space, such as ACEScg (PNG and JPEG are sRGB)"
+            f"--output-colourspace {options.output_colourspace}: EXR and TIFF are linear, without the curve "
+            f"of {space.name}; give a linear space, such as ACEScg (PNG and JPEG are sRGB)"
         )
     return space
 
 
 def _view_of(options: OutputOptions) -> View:
     """The display view of PNG and JPEG files."""
-    return named_view(options.view, options.config)
+    return named_view(options.view, options.config, options.display)

@@ -89,11 +89,12 @@ def read_photo(item: Item, options: PhotoOptions, kept_px: int = _KEPT_PX) -> Li
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
     found = list(_find(item, image, options))
-    for face in found:
-        _say_confidence(item, face)
+    names = _names(item, found)
+    for face, name in zip(found, names, strict=True):
+        _say_confidence(name, face)
     return [
-        FittedFace(tag, face, _fit_one(item, image, face, options))
-        for face, tag in zip(found, _tags(len(found), options), strict=True)
+        FittedFace(tag, face, _fit_one(name, image, face, options))
+        for face, tag, name in zip(found, _tags(len(found), options), names, strict=True)
     ]
 
 
@@ -103,8 +104,8 @@ def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[t
         faces = [_given(item, options.landmarks)]
     else:
         faces = find_faces(image.pixels, str(item.input_path), options.face, options.landmarks_from)
-    for face in faces:
-        _say_confidence(item, face)
+    for face, name in zip(faces, _names(item, faces), strict=True):
+        _say_confidence(name, face)
     return list(zip(_tags(len(faces), options), faces, strict=True))
 
 
@@ -123,11 +124,22 @@ def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
     return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
 
-def _say_confidence(item: Item, face: FaceBox) -> None:
+def _names(item: Item, faces: Sequence[FaceBox]) -> list[str]:
+    """Name the faces of a photo for messages: the photo, and of several their index and place."""
+    if len(faces) == 1:
+        return [str(item.input_path)]
+    named = []
+    for number, (left, top, right, bottom) in enumerate(face.box_px for face in faces):
+        x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
+        named.append(f"{item.input_path}: face {number} from the left, at x {x_px}, y {y_px} px")
+    return named
+
+
+def _say_confidence(name: str, face: FaceBox) -> None:
     if isinstance(face, FoundFace | FoundBox):
         confidence = confidence_in(face)
         why = "" if confidence.word == "sure" else f" ({confidence.reason})"
-        log.info("%s: %s%s", item.input_path, confidence.word, why)
+        log.info("%s: %s%s", name, confidence.word, why)
 
 
 def _tags(count: int, options: PhotoOptions) -> list[str]:
@@ -171,17 +183,17 @@ def _given(item: Item, landmarks: Path) -> Face:
     return face_at(read_landmarks(companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")))
 
 
-def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
+def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
     try:
         models = load_models_once(options)
         head = head_of(models, image.pixels, face, models.sides(options.texture_side))
     except InputError as error:
-        raise InputError(f"{item.input_path}: {error}") from None
+        raise InputError(f"{name}: {error}") from None
     if head.fit.quality == "poor":
         log.warning(
             "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "
             "`facerf fit-geometry`, or give --landmarks",
-            item.input_path,
+            name,
             100 * head.fit.error_iod,
         )
     yaw_deg = rotation_to_pose(head.fit.rotation)[0]
@@ -189,7 +201,7 @@ def _fit_one(item: Item, image: LinearImage, face: FaceBox, options: PhotoOption
         log.warning(
             "%s: the head is turned by %.0f degrees, and %.0f are supported; look at it with "
             "`facerf fit-geometry`",
-            item.input_path,
+            name,
             abs(yaw_deg),
             SUPPORTED_YAW_DEG,
         )

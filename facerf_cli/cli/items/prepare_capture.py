@@ -41,6 +41,7 @@ from facerf_cli.dataset.dataset import (
 from facerf_cli.dataset.pages import index_page
 from facerf_cli.dataset.prepare import prepare_subject, prepared_subjects, subject_outputs
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.joint_fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
@@ -48,7 +49,6 @@ from facerf_cli.files.downloads import file_sha256
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.synth.threads import one_thread
 
-_CROP_STEP_PX = 8
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -78,10 +78,8 @@ def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: b
 def prepare_capture(options: PrepareOptions, output: Path, settings: Settings) -> int:
     """Prepare all subjects of a capture, or only check them; return the exit code."""
     split = Split.parse(options.split)
-    if options.crop_px % _CROP_STEP_PX or not 0 < options.crop_px <= LARGEST_CROP_PX:
-        raise UsageError(
-            f"--crop {options.crop_px}: give a multiple of {_CROP_STEP_PX} up to {LARGEST_CROP_PX}"
-        )
+    if (px := options.crop_px) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
+        raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
     source = _with_charts(
         CaptureSource(options.capture, options.layout, options.subtract_ambient, options.align),
         options.colour_chart,
@@ -210,7 +208,7 @@ class Prepare:
     checks: Checks
     strict: bool
     face_model: str
-    crop_px: int
+    crop_px: int | None
     folder: Path
     key: str
 
@@ -256,7 +254,7 @@ def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, mod
         return
     _write_chart_overlays(capture, work.folder)
     model = _face_model(work.face_model)
-    dataset = describe_dataset(capture, records, split, seed, model, model_sha256, work.crop_px)
+    dataset = describe_dataset(capture, records, split, seed, model, model_sha256)
     with atomic_path(work.folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes

@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -36,7 +35,7 @@ from facerf_cli.cli.items.photos import (
 from facerf_cli.cli.items.shot_frames import seen_frame, view_of
 from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
-from facerf_cli.cli.relight import Relight
+from facerf_cli.cli.relight_work import Relight
 from facerf_cli.cli.shots import shot_of
 from facerf_cli.colour import ExposureRule
 from facerf_cli.composite import Composition, Relit, RelitRows, Target
@@ -56,6 +55,7 @@ from facerf_cli.strips import Rows
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _LIGHTS_AT_ONCE = 16  # of a stack, made floats
 log = logging.getLogger(LOGGER_NAME)
+_of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
 Written = dict[Path, float]  # the EXR of each image, and the exposure of the PNG in its place
 
@@ -90,15 +90,17 @@ class _Shown:
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     """Relight a photo or a stack under every setup; the images written, and facts for the report."""
-    stack = item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
-    return _relight_stack(item, work) if stack else _relight_photo(item, work)
+    return _relight_stack(item, work) if _is_stack(item) else _relight_photo(item, work)
+
+
+def _is_stack(item: Item) -> bool:
+    return item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     image, faces = _seen(item, work)
     metadata = _metadata(item, work)
-    leader = _leader_of(item, work)
-    chosen_ev = None if leader is None or leader == item else _exposures_of(leader, work)
+    chosen_ev = _shared_exposures(item, work)
     written: Written = {}
     if work.composite == "photo":
         shown = _together(item, image, faces, work)
@@ -126,15 +128,25 @@ def _leader_of(item: Item, work: Relight) -> Item | None:
     return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
 
 
-@cache
+def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
+    """The exposures of an item's group; None where it has none, or is the one that it has them of."""
+    leader = _leader_of(item, work)
+    if leader is None or leader == item:
+        return None
+    if (leader, work) not in _of_leaders:  # another process has written it, or an earlier run
+        _of_leaders[leader, work] = _exposures_of(leader, work)
+    return _of_leaders[leader, work]
+
+
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of a photo that others share; found once a process."""
+    """Exposures of a photo or stack that others share."""
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
-    image, faces = _seen(leader, work)
-    shown = _together(leader, image, faces, work)
-    parts = _parts(shown, work)
-    return _exposures_ev(parts, shown.relit, shown.composer, work)
+    if _is_stack(leader):
+        shown = _show_stack(leader, work)[0]
+    else:
+        shown = _together(leader, *_seen(leader, work), work)
+    return _exposures_ev(_parts(shown, work), shown.relit, shown.composer, work)
 
 
 def _together(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _Shown:
@@ -224,6 +236,12 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
 
 
 def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    shown, metadata, facts = _show_stack(item, work)
+    return dict(_write_setups(item, "", shown, work, metadata, _shared_exposures(item, work))), facts
+
+
+def _show_stack(item: Item, work: Relight) -> tuple[_Shown, dict[str, Any], dict[str, Any]]:
+    """A stack relit by setups, the metadata of its images, and facts for the report."""
     if work.pose is not None or work.asked_for_photo:
         raise InputError(
             f"{item.input_path}: a stack holds one pose of a face without its photo; give the photo"
@@ -258,8 +276,7 @@ def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
         weights = weights_over_stack(_each_light(setup), directions, work.sampling)
         return list(map(Relit, weighted_sum(batches, weights)))
 
-    shown = _Shown(composer, relit, apart, bytes_each, backdrops=backdrops)
-    return dict(_write_setups(item, "", shown, work, metadata)), facts
+    return _Shown(composer, relit, apart, bytes_each, backdrops=backdrops), dict(metadata), facts
 
 
 def _person_composer(
@@ -324,6 +341,8 @@ def _write_setups(
         return shown.relit(part) if whole is None else whole
 
     exposures_ev = chosen_ev or _exposures_ev(parts, relit_by_part, shown.composer, work)
+    if _leader_of(item, work) == item:
+        _of_leaders[item, work] = dict(exposures_ev)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
@@ -335,7 +354,7 @@ def _write_setups(
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
             if work.output.shown_suffix and not chosen_ev:
-                log.info("%s: exposure %+.2f EV", path.with_suffix(work.output.shown_suffix), ev)
+                log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
 
 

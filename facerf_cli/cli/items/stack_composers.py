@@ -9,8 +9,8 @@ from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_
 from facerf_cli.composite import Relit, RelitRows
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
+from facerf_cli.resize import resized
 from facerf_cli.strips import Rows, whole
-from facerf_cli.viewer.frame import resized
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 

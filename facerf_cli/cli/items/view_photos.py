@@ -19,8 +19,8 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 from facerf_cli.portrait_field import PortraitField
+from facerf_cli.resize import fitted, resized, shrunk_photo
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
-from facerf_cli.viewer.frame import fitted, resized, shrunk_photo
 from facerf_cli.viewer.packing import PageMap, packed, strip_jpeg
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
 

@@ -16,7 +16,6 @@ list of `id` and `coordinates`.
 """
 
 import importlib.util
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face.importers.basel_arrays import CELLS, LANDMARKS, MAX_SHAPES
 from facerf_cli.face.importers.source import SourceModel, require_mesh
 from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import one_line
 
@@ -166,7 +166,7 @@ def _known_2017(arrays: Mapping[str, np.ndarray], mean: np.ndarray) -> dict[int,
     if LANDMARKS not in arrays:
         return {}
     known = {}
-    for entry in json.loads(arrays[LANDMARKS].tobytes()):
+    for entry in parse_json(arrays[LANDMARKS].tobytes()):
         number = _LANDMARKS_2017.get(str(entry["id"]))
         point = np.array(entry["coordinates"], dtype=np.float64) / 1000
         if number is None or point.shape != (3,) or not np.isfinite(point).all():

@@ -1,4 +1,4 @@
-"""The photo of a page at its size, and images at others."""
+"""Images, photos and their heads at another size."""
 
 from dataclasses import replace
 

@@ -1,0 +1,114 @@
+"""The one reader of JSON: what passes every limit is read as the standard library reads it."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from facerf_cli.errors import InputError
+from facerf_cli.files import json_reader
+from facerf_cli.files.documents import Document, Name, checked, distinct
+from facerf_cli.files.json_reader import parse_json, read_json
+
+
+def test_a_document_within_the_limits_is_read_as_it_stands() -> None:
+    content = {"a": [1, 2.5, -3e8, "é", None, True], "b": {"c": [[[]]]}, "": 2**62}
+    assert parse_json(json.dumps(content)) == content and parse_json(json.dumps(content).encode()) == content
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1" + "0" * 400, "too large"),
+        ("[9223372036854775808]", "too large"),
+        ('{"a": [1e400]}', "too large"),
+        ("1" * 5000, "digits"),
+        ("[NaN]", "NaN is not"),
+        ("-Infinity", "not a finite"),
+        ("[" * 65 + "]" * 65, "64 deep"),
+        ("[" * 100_000, "deep"),
+        ('{"a": 1, "b": 2, "a": 3}', "'a' occurs twice"),
+        ('{"a": {"b": 1, "b": 1}}', "'b' occurs twice"),
+        ("{}x", "Extra data"),
+        (b"\xff", "utf-8"),
+    ],
+)
+def test_what_is_beyond_them_is_refused(text: str | bytes, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        parse_json(text)
+
+
+def test_depth_and_numbers_at_the_limits_pass() -> None:
+    assert parse_json("[" * 63 + "]" * 63)
+    assert parse_json(f"[{2**63 - 1}, 1e308]") == [2**63 - 1, 1e308]
+
+
+def test_the_number_of_values_is_bounded_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(json_reader, "_MOST_VALUES", 100)
+    assert len(parse_json(json.dumps([0] * 99))) == 99
+    monkeypatch.setattr(json_reader.json, "loads", lambda *a, **k: pytest.fail("it was parsed"))
+    for text in (json.dumps([0] * 101), "[" * 101, json.dumps({str(i): 0 for i in range(101)})):
+        with pytest.raises(ValueError, match="more than 100 values"):
+            parse_json(text)
+
+
+def test_a_repeated_key_among_many_takes_a_look_at_each_alone() -> None:
+    """Count the Python calls: a second key of 60,000 was once sought by comparing each with all others."""
+    pairs = [(str(key), 0) for key in range(60_000)]
+    calls = 0
+
+    def count(*_: Any) -> None:
+        nonlocal calls
+        calls += 1
+
+    sys.setprofile(count)
+    try:
+        with pytest.raises(ValueError, match="'59999' occurs twice"):
+            json_reader._unique_keys([*pairs, ("59999", 0)])
+    finally:
+        sys.setprofile(None)
+    assert calls < 60_000 * 4
+
+
+def test_files_are_bounded_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(b" " * 2_000_000)
+    with pytest.raises(InputError, match=r"a\.json: larger than 1 MiB; mend it"):
+        read_json(path, "mend it", 1 << 20)
+    with pytest.raises(InputError, match=r"b\.json: no such file; mend it"):
+        read_json(tmp_path / "b.json", "mend it")
+
+
+class Entry(Document):
+    id: Name
+    count: int
+
+
+class Root(Document):
+    entries: list[Entry]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ({}, "x.json has no 'entries'"),
+        ({"entries": 3}, r"x.json: entries is 3; a list \[ \] is needed"),
+        ({"entries": [3]}, r"x.json: entries\[0\] is 3; an object { } is needed"),
+        ({"entries": [{"id": "a"}]}, r"x.json: entries\[0\] has no 'count'"),
+        ({"entries": [{"id": "../a", "count": 1}]}, r'entries\[0\]: id is "../a"; a name of letters'),
+        ({"entries": [{"id": "a", "count": True}]}, r"count is true; input should be a valid int"),
+        ({"entries": [{"id": None, "count": "1"}]}, r"id is null; fill it in \(and 1 more\)"),
+    ],
+)
+def test_an_error_is_a_line_with_the_path_in_the_document(content: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said) as raised:
+        checked(Root, content, "x.json")
+    assert "\n" not in str(raised.value) and "pydantic" not in str(raised.value)
+
+
+def test_what_occurs_twice_is_named() -> None:
+    assert distinct(["a", "b"], "light") == ["a", "b"]
+    with pytest.raises(ValueError, match="light 'b' occurs twice"):
+        distinct(["a", "b", "b"], "light")
