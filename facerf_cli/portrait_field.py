@@ -38,10 +38,7 @@ SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
 _SHARE = 0.25  # of the portrait field in the face, where the other one is finer
-_PROXY_NORMALS = 1.0  # weight of the proxy's normals on face and neck; that of the network's is 1
-_HAIRLINE_PX = 4  # of the square, in which the network's normals are kept
 _SKIN = class_index("skin")
-_FACE = [class_index(name) for name in ("skin", "brows", "eyes", "lips", "mouth", "beard", "neck")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,18 +197,7 @@ class PortraitField:
 def maps_of(person: SeenPerson) -> PortraitMaps:
     """The light transport of a person, as the Portrait Network sees it."""
     rig = rig_directions(_SUMMARY_LIGHTS)
-    return _steadied(portrait_network()(person.inputs(rig, person.visibility(rig))), person)
-
-
-def _steadied(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:
-    """Normals that lie between the network's and, on face and neck, those of the proxy.
-
-    Where the network is unsure of a shape it predicts the mean of several, which is flatter than each.
-    """
-    face = person.maps.covered * person.classes[_FACE].sum(0)
-    inside = -F.max_pool2d(-face[None], 2 * _HAIRLINE_PX + 1, stride=1, padding=_HAIRLINE_PX)[0]
-    normals = F.normalize(maps.normals + _PROXY_NORMALS * inside * person.maps.normals, dim=1)
-    return maps._replace(normals=normals)
+    return portrait_network()(person.inputs(rig, person.visibility(rig)))
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

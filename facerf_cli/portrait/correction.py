@@ -19,7 +19,7 @@ from torch import Tensor
 
 _FLOOR = 0.05  # f, as a share of the mean of the photo's person
 _RANGE = (0.2, 5.0)  # of Q
-_SHARPNESS = 8.0  # exponent of the likeness
+SHARPNESS = 20.0  # exponent of the likeness
 _LARGEST = 1.5  # of p_l / p
 _SMALL_PX = 48  # side at which likeness is measured
 
@@ -73,7 +73,7 @@ class Correction:
         small = _small(olats, self.person)
         lengths = small.flatten(-2).norm(dim=-1) * self.explained.norm()
         cosine = (small * self.explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
-        return cosine.clamp(0, 1) ** _SHARPNESS
+        return cosine.clamp(0, 1) ** SHARPNESS
 
 
 def _small(images: Tensor, person: Tensor) -> Tensor:

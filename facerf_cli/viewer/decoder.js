@@ -4,6 +4,7 @@ const SHADOW_KERNEL = 70;
 const ROOT_OFFSET = 0.02;
 const DARKEST = 1e-8;
 const GLOSS_POWER = 8;
+const LIKENESS_POWER = 8; // light/quotient.py
 
 class Decoder {
   constructor(data, arrays) {

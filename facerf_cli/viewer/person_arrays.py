@@ -14,6 +14,7 @@ from torch import Tensor
 from facerf_cli.composite import PhotoDetail
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.correction import SHARPNESS
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.viewer.arrays import ArrayPack, Kind
 from facerf_cli.whole_person import WholePerson
@@ -52,6 +53,7 @@ def add_person(pack: ArrayPack, field: PortraitField, whole: WholePerson) -> dic
         "exposure": field.exposure,
         "personExposure": field.person.exposure,
         "floor": correction.floor,
+        "likenessPower": SHARPNESS,
         "mean": correction.mean,
         "gainRange": list(whole.gain_range),
         "square": _square(field),

@@ -4,7 +4,6 @@
 const LIT_TERMS = 16; // spherical harmonics up to order 3
 const SHADOW_TERMS = 25; // and up to 4
 const SMALL_PX = 48; // side at which likeness is measured
-const LIKENESS_POWER = 8;
 const MOST_LIKELY = 1.5;
 const LOBES = [8, 45];
 const STRANDS = 30;
@@ -82,7 +81,7 @@ class Portrait {
     let along = 0;
     for (let i = 0; i < small.length; i++) along += small[i] * explained[i];
     const cosine = along / Math.max(Math.hypot(...small) * this.explainedLength, 1e-12);
-    const likeness = Math.min(1, Math.max(0, cosine)) ** LIKENESS_POWER;
+    const likeness = Math.min(1, Math.max(0, cosine)) ** this.likenessPower;
     return { shade, glow, likeness, brightness: total / Math.max(this.people, 1) / Math.max(this.mean, 1e-9) };
   }
 
