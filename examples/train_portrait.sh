@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # The shipped Portrait Network: synthetic people from head to chest, nothing else. Two processor cores, about four hours:
 # one to bake the people, one for a first leg of training, two for a second one that starts from it.
-# Run it again after an interruption: it goes on.
+# Run it again after an interruption: it goes on. The shipped one's first two legs saw layers of a faulty bank, and a third
+# of 67 minutes mended ones (docs/measurements.md); with a mended bank two legs are meant to do.
 # Usage: [PEOPLE=340] examples/train_portrait.sh ICT-FaceKit.tar.xz RUN [TIME OF THE FIRST LEG] [OF THE SECOND]
 set -euo pipefail
 archive=$1 run=$2 first=${3:-60m} second=${4:-125m}
