@@ -3,6 +3,7 @@
 import os
 import signal
 import tarfile
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,16 @@ from facerf_cli.face.morphable import MorphableModel
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "shared"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Escape what is no UTF-8 in what a test printed: xdist's workers cannot send it."""
+    report = yield
+    report.sections = [
+        (title, text.encode("utf-8", "backslashreplace").decode()) for title, text in report.sections
+    ]
+    return report
 
 
 @pytest.fixture(scope="session")

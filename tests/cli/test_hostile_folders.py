@@ -1,7 +1,6 @@
 """Names, pipes, links and other processes in the folders of a verb."""
 
 import json
-import logging
 import os
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.olat_stack import is_olat_stack, read_olat_stack
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.files.toml_files import read_toml
-from facerf_cli.logs import LOGGER_NAME, json_line, shown
+from facerf_cli.logs import json_line, shown
 from tests.cli.toy_batch import run
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -49,18 +48,13 @@ def rows(out: Path) -> list[dict[str, object]]:
     return [json.loads(line) for line in (out / report_name(Shard())).read_text().split("\n") if line]
 
 
-def test_names_of_all_characters_have_a_row_and_an_output_each(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # xdist cannot send names that are no UTF-8 to its main process, in logs or on stdout
-    monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", False)
+def test_names_of_all_characters_have_a_row_and_an_output_each(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", *HOSTILE)
     assert run(photos, tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.jsonl").read_text()
     assert all(line.isprintable() for line in text.split("\n")) and len(text.splitlines()) == len(HOSTILE)
     assert {row["item"] for row in rows(tmp_path / "out")} == set(HOSTILE)
     assert run(photos, tmp_path / "out") == 0 and len(rows(tmp_path / "out")) == len(HOSTILE)
-    capfd.readouterr()
 
 
 def test_a_name_of_two_lines_fills_a_pattern(tmp_path: Path) -> None:
