@@ -154,7 +154,7 @@ def test_bad_lights_are_a_line_each_and_the_others_go_on(tmp_path: Path, capsys:
         "twice as wide",
         "8 numbers; a light has 9 or 27",
         "another convention",
-        "cannot be read as JSON",
+        "broken.json: not JSON",
     ):
         assert sum(words in line for line in lines) == 1
     assert not any("Traceback" in line for line in lines)
