@@ -9,22 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from skimage.data import astronaut
 
 from facerf_cli.cli.items import relight_photos
-from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
-from facerf_cli.network.checkpoint import save_networks
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
-from facerf_cli.raster.texture import normal_map
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
-WIDTHS = (4, 8, 8)
 FRAMES = 3
 CHEAP = ("--reflectance", "field", "--lights", "12")
 
@@ -55,14 +48,7 @@ def write_source(path: Path, frames: Iterator[np.ndarray] | list[np.ndarray]) ->
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a checkpoint and a film."""
     folder = tmp_path_factory.mktemp("given")
-    torch.manual_seed(0)
-    settings = DefaultReflectanceSettings(64, WIDTHS, WIDTHS, rig_lights=8)
-    network = DefaultReflectanceNetwork(settings)
-    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
-    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
-    save_networks(
-        folder / "lambert.safetensors", {"reflectance": network}, {"layout_version": LAYOUT_VERSION}
-    )
+    save_toy_checkpoint(folder / "lambert.safetensors")
     write_source(folder / "me.mp4", [frame_of(number) for number in range(FRAMES)])
     return folder
 

@@ -10,17 +10,16 @@ import torch
 from facerf_cli.colour import luminance
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.raster.texture import normal_map
 from facerf_cli.viewer.page import strip_of
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.files.test_relight_web import Decoder
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -32,15 +31,9 @@ Capture = pytest.CaptureFixture[str]
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a checkpoint and the photo's landmarks."""
     folder = tmp_path_factory.mktemp("given")
-    torch.manual_seed(0)
-    settings = DefaultReflectanceSettings(64, (4, 8, 8), (4, 8, 8), rig_lights=8)
-    network = DefaultReflectanceNetwork(settings)
-    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
-    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
-    metadata = {"layout_version": LAYOUT_VERSION}
-    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
+    network = save_toy_checkpoint(folder / "lambert.safetensors")
     save_networks(folder / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
-    torn = metadata | {"networks": {"reflectance": network.as_metadata()}}
+    torn = {"layout_version": LAYOUT_VERSION, "networks": {"reflectance": network.as_metadata()}}
     save_checkpoint(folder / "torn.safetensors", {}, torn)
     face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))

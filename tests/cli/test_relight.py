@@ -5,37 +5,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
-from facerf_cli.network.checkpoint import save_networks
-from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.raster.texture import normal_map
 from facerf_cli.synth.sky.skies import kind_of
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
-WIDTHS = (4, 8, 8)
 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a checkpoint, the photo's landmarks and two maps."""
     folder = tmp_path_factory.mktemp("given")
-    torch.manual_seed(0)
-    settings = DefaultReflectanceSettings(64, WIDTHS, WIDTHS, rig_lights=8)
-    network = DefaultReflectanceNetwork(settings)
-    normals = normal_map(load_face_model("builtin").mean, grid_triangles(), 64)
-    network.set_mean_face(normals, torch.ones(8, 64, 64), rig_directions(8))
-    metadata = {"layout_version": LAYOUT_VERSION}
-    save_networks(folder / "lambert.safetensors", {"reflectance": network}, metadata)
+    save_toy_checkpoint(folder / "lambert.safetensors")
     face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     (folder / "maps").mkdir()
