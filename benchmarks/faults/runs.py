@@ -4,10 +4,12 @@ import json
 import os
 import shutil
 import signal
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 from benchmarks._common import ASTRONAUT
@@ -49,20 +51,33 @@ def _fill_with_photos(folder: Path, count: int) -> None:
         Image.fromarray(pixels).save(folder / f"photo_{number:05d}.png", compress_level=1)
 
 
-VERBS = {
-    "convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights),
-    "segment": Verb("segment", (), _fill_with_photos),
+_ON_PHOTOS = {
+    "segment": (),
+    "fit-geometry": (),
+    "estimate-light": ("--lights", "20", "--width", "32"),
+    "predict-olat": ("--lights", "4", "--frame", "uv"),
+    "relight": ("--light", "75,20", "--exposure", "0"),
+}
+VERBS = {"convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights)} | {
+    name: Verb(name, given, _fill_with_photos) for name, given in _ON_PHOTOS.items()
 }
 
 
-def import_all(verb: Verb) -> None:
-    """Import what the verb needs, so that forks need not."""
+def warm_up(verb: Verb) -> None:
+    """Run the verb once here, so that forks have its imports and networks."""
     import importlib
 
-    for name in ("main", "cli.items.convert_lights", "cli.items.segment_photos"):
-        importlib.import_module(f"facerf_cli.{name}")
+    import OpenImageIO as oiio
+
+    from facerf_cli.main import main
+
     importlib.import_module("zoneinfo")  # late imports fail for a user who cannot read this Python
-    assert verb.name
+    oiio.attribute("threads", 1)  # a fork has one thread, and would wait for the others
+    oiio.attribute("exr_threads", -1)
+    with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
+        verb.fill(fresh(Path(name) / "in"), 1)
+        code = main([*verb.line(Path(name) / "in", Path(name) / "out"), "-q"])
+    assert code == 0, f"{verb.name} ends with {code}"
 
 
 @dataclass(frozen=True)
