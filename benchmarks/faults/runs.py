@@ -26,25 +26,25 @@ class Verb:
 
     name: str
     arguments: tuple[str, ...]
-    fill: Callable[[Path, int], None]  # writes so many inputs into a folder
+    fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
         return [self.name, str(inputs), *self.arguments, "-o", str(output)]
 
 
-def _fill_with_lights(folder: Path, count: int) -> None:
+def _fill_with_lights(folder: Path, count: int, _: int = 0) -> None:
     light = json.loads(samples.lights()["both.json"])
     for number in range(count):
         light["weights"][0] = [number, 0.5, 0.25]
         (folder / f"light_{number:03d}.json").write_text(json.dumps(light))
 
 
-def _fill_with_photos(folder: Path, count: int) -> None:
+def _fill_with_photos(folder: Path, count: int, side_px: int = 128) -> None:
     import numpy as np
     from PIL import Image
 
-    photo = Image.open(ASTRONAUT).convert("RGB").resize((128, 128))
+    photo = Image.open(ASTRONAUT).convert("RGB").resize((side_px, side_px))
     for number in range(count):
         pixels = np.asarray(photo).copy()
         pixels[0, 0] = number % 256, number // 256, 0
