@@ -5,7 +5,8 @@
 
 import math
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from facerf_cli.errors import InputError
@@ -14,6 +15,7 @@ SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by 
 _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
 _set: list[int] = []  # the limit, once it was set
+_held: list[int] = []  # what is held beside that which is asked for
 
 
 def set_limit(limit_bytes: int) -> None:
@@ -34,8 +36,24 @@ def default_limit(jobs: int = 1) -> int:
     return int(SHARE * most) // max(1, jobs)
 
 
+@contextmanager
+def beside(held_bytes: int) -> Iterator[None]:
+    """Count what is held meanwhile with whatever is asked for."""
+    _held.append(held_bytes)
+    try:
+        yield
+    finally:
+        _held.pop()
+
+
+def left_bytes() -> int:
+    """The budget without what is held."""
+    return max(0, limit_bytes() - sum(_held))
+
+
 def require(what: str, needed_bytes: int, instead: str) -> None:
     """Raise InputError where something needs more than the budget; `instead` says what else would do."""
+    needed_bytes += sum(_held)
     if needed_bytes > limit_bytes():
         least = math.ceil(100 * needed_bytes / _GB) / 100
         raise InputError(
