@@ -3,11 +3,14 @@
 `--memory` sets it for each job. What a process holds at rest, its libraries and networks, is not in it.
 """
 
+import ctypes
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 from facerf_cli.errors import InputError
 
@@ -49,6 +52,24 @@ def beside(held_bytes: int) -> Iterator[None]:
 def left_bytes() -> int:
     """The budget without what is held."""
     return max(0, limit_bytes() - sum(_held))
+
+
+def give_back() -> None:
+    """Return freed memory to the system.
+
+    glibc keeps what lies between blocks in use, so a batch of thousands of items would grow by these gaps.
+    """
+    if trim := _trim():
+        trim(0)
+
+
+@cache
+def _trim() -> Callable[[int], int] | None:
+    """glibc's malloc_trim; None with another library of C."""
+    try:
+        return cast("Callable[[int], int]", ctypes.CDLL(None).malloc_trim)
+    except (OSError, AttributeError, TypeError):
+        return None
 
 
 def require(what: str, needed_bytes: int, instead: str) -> None:
