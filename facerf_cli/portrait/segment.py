@@ -14,10 +14,10 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.matte import enlarged, refine_matte, shrunk
+from facerf_cli.portrait.matte import refine_matte, shrunk
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Computed, Rows, enlarged
 
 # Sides of the squares around the head and around the body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of squares of several sizes are averaged.
