@@ -7,8 +7,8 @@ of the brightest light's). For them, and for all lights, printed are the share o
 and the roughness: the mean difference of a weight from the mean of its six neighbours, over the mean of the
 weights' sizes. 0 is a light that changes linearly from light to light.
 
-Twins, on the same evidence in the same run: the same least squares with every light solved for, and the paper's
-signed least squares.
+Twins, on the same evidence in the same run: the same least squares with every light solved for, and the
+paper's signed least squares.
 """
 
 from pathlib import Path
