@@ -35,7 +35,7 @@ from facerf_cli.cli.photo_options import (
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.shots import (
-    CutsOption,
+    NoCutsOption,
     PhotosArgument,
     SequenceOption,
     Shot,
@@ -162,7 +162,7 @@ def estimate_light(
     face_model: FaceModelOption = "builtin",
     name: NameOption = None,
     sequence: SequenceOption = False,
-    cuts: CutsOption = True,
+    no_cuts: NoCutsOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -195,7 +195,7 @@ def estimate_light(
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()
-    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name), cuts)
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name), not no_cuts)
     check_shots(shots, photo)
     if shots and (refine != "none" or reflectance != "field" or matte is not None):
         raise UsageError(

@@ -37,13 +37,9 @@ SequenceOption = Annotated[
 ]
 
 
-CutsOption = Annotated[
+NoCutsOption = Annotated[
     bool,
-    typer.Option(
-        "--cuts/--no-cuts",
-        help="Take the parts of a film between its cuts as shots for themselves, or all of it as one shot.",
-        rich_help_panel=BATCH,
-    ),
+    typer.Option("--no-cuts", help="Take a film that cuts as one shot.", rich_help_panel=BATCH),
 ]
 
 
