@@ -21,6 +21,7 @@ from facerf_cli.strips import STRIP_PX, strips
 
 SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
 LANDMARKS = 68 + len(MORE_LANDMARKS)
+_POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
@@ -118,15 +119,14 @@ def parsing_network(path: Path = SHIPPED) -> ParsingNetwork:
 def sharpness_of(crops: Tensor) -> Tensor:
     """Contrast of finest over that of coarser detail [B] in the middle of crops [B, 3, S, S].
 
-    In a square around a face of 256 pixels, 0.4 and more where it is in focus, 0.2 and 0.14 where its image is
-    blurred by a hundredth and a fiftieth of its extent (standard deviation), whatever it shows.
+    In a square around a face of 256 pixels, 0.4 and more where it is in focus; 0.2 and 0.14 where its image
+    is blurred by a hundredth and a fiftieth of its extent (standard deviation), whatever it shows.
     """
-    grey = crops.mean(1, keepdim=True)
+    edge = crops.shape[-1] // 4 - _POOLED
+    grey = crops[..., edge:-edge, edge:-edge].mean(1, keepdim=True)
     fine = _smooth(_smooth(grey, 1), 1)
-    coarse = _smooth(_smooth(fine, 4), 4)
-    inner = slice(grey.shape[-1] // 4, -(grey.shape[-1] // 4))
-    bands = [fine - coarse, grey - fine]
-    low, high = (band[..., inner, inner].abs().mean((1, 2, 3)) for band in bands)
+    bands = grey - fine, fine - _smooth(_smooth(fine, 4), 4)
+    high, low = (band[..., _POOLED:-_POOLED, _POOLED:-_POOLED].abs().mean((1, 2, 3)) for band in bands)
     return high / low.clamp_min(1e-4)
 
 
