@@ -192,7 +192,8 @@ class Composition:
         def of(rows: slice) -> np.ndarray:
             pixels, matte = person[rows], self.matte[rows][..., None]
             if behind is not None:
-                return behind[rows] + matte * (pixels - behind[rows])
+                below = behind[rows]
+                return below + matte * (pixels - below)
             return (photo[rows] - matte * self.own[rows]) * gain + matte * pixels
 
         return RelitRows(Computed(photo.shape, of))

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from benchmarks._common import arguments
-from benchmarks.faults.runs import VERBS, Ended, Verb, faults_of, fresh, import_all, outputs, run, start, wait
+from benchmarks.faults.runs import VERBS, Ended, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
 
 _ITEMS = 6
 _NOBODY = 65534
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--verb", choices=sorted(VERBS), default="convert-light")
     given = parser.parse_args()
     verb = VERBS[given.verb]
-    import_all(verb)
+    warm_up(verb)
     bad = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -287,6 +287,8 @@ class _Work:
             return result(stops_the_run=error)
         except Exception as error:  # a bug must not cost the other items
             return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+        finally:
+            memory.give_back()
 
 
 def _broken(item: Item, error: Exception) -> _Result:
