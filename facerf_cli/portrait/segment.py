@@ -16,14 +16,14 @@ from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.ears import with_ears
-from facerf_cli.portrait.matte import enlarged, refine_matte, shrunk
+from facerf_cli.portrait.matte import refine_matte, shrunk
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Computed, Rows, enlarged
 
-# Sides of the squares around the head, head and chest, and the body, in extents of the landmarks, and how far
-# their centres lie above the middle of the landmarks. Views of the head are averaged, weighed by the inverse
-# squares of their sides, for smaller ones show more.
+# Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
+# centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
+# more, weigh more, by the inverse square of their sides.
 _NEAR_SIDES, _NEAR_ABOVE = (1.6, 2.2, 3.2), 0.1
 _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
@@ -31,9 +31,9 @@ _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
-# In extents: the line from the middle of the face down to the chest, and how far from it all of the person
-# counts as joined; half the width of a bridge that joins nobody; how far around the middle of the face, and
-# around the body, what is seen of the person is kept.
+# Lengths in extents of the landmarks: the line from the middle of the face down to the chest, and how far
+# from it all of the person counts as joined; half the width of a bridge that joins nobody; how far around the
+# middle of the face, and around the body, what is seen of the person is kept.
 _CHEST_BELOW, _WITHIN, _BRIDGE, _OF_HEAD, _OF_BODY = 1.5, 0.4, 0.06, 1.2, 0.2
 
 
