@@ -98,7 +98,7 @@ def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
             head = (x - 160).square() + (y - 70).square() < 40**2
             body = ((x - 160).abs() < 50) & (y > 105)
             flag = (x < 70) & (y > 150)
-            bridge = (x < 160) & ((y - 200).abs() < 2)
+            bridge = (x < 160) & ((y - 180).abs() < 2.6)
             strand = ((x - 210).square() + (y - 70).square()) < 4**2
             found.append(seen_of(square, {"garment": body | flag | bridge, "skin": head, "hair": strand}))
         return found
