@@ -44,7 +44,7 @@ def main() -> None:
         said = process.communicate(timeout=_PATIENCE_S)[1]
         cluster.shutdown()
         found = faults_of(folder / "out", outputs(folder / "whole"), finished=True)
-    found += [f"said {said[-500:]}"] if "Traceback" in said or "unexpected" in said else []
+    found += [f"said {said[:500]}"] if "Traceback" in said or "unexpected" in said else []
     print(f"{verb.name}, a node of two lost: exit {process.returncode}; {'; '.join(found) or 'well'}")
     print("".join(f"  {line}\n" for line in said.splitlines() if "lost" in line)[:600], end="")
     sys.exit(int(bool(found or process.returncode)))
