@@ -28,5 +28,6 @@ paper=(--preset paper --dataset "$run/dataset" --texture-size 128 --workers 0)
 facerf train -o "$run/light" --stage light-features "${paper[@]}" --resume --batch 2 --max-time 5m &
 facerf train -o "$run/appearance" --stage appearance-features "${paper[@]}" --resume --batch 4 --max-time 6m &
 wait
-facerf train -o "$run/paper" "${paper[@]}" --resume --photos "$run/photos" --max-time "$time" \
+# It is saved with each validation: an interruption costs no more than 250 steps.
+facerf train -o "$run/paper" "${paper[@]}" --resume --photos "$run/photos" --max-time "$time" --validate-every 250 \
     --appearance-features "$run/appearance/best.safetensors" --light-features "$run/light/best.safetensors"

@@ -128,7 +128,7 @@ def _leader_of(item: Item, work: Relight) -> Item | None:
     place = shot_of(work.shots, item)
     if place is None:
         return work.leader_of(item)
-    return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
+    return place[0].frames[view_of(*place, work.photo).middle_first[0]]
 
 
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
