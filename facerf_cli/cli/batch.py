@@ -167,7 +167,7 @@ def _run_alone(
         _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
-    if index:
+    if index and (todo or index.has_news):
         index.open()
     _say_what_is_skipped(reasons, options)
     if index and index.edited:
