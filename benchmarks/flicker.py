@@ -1,25 +1,43 @@
 """Flicker of a relit shot: a synthetic head that talks and turns under a fixed light, whose truth is known.
 
-    python benchmarks/flicker.py [--frames 16] [--size 256] [--person 5] [--sheet sheet.png]
+    python benchmarks/flicker.py [--frames 16] [--size 256] [--person 5] [--clip clip.npz] [--sheet sheet.png]
+    python benchmarks/flicker.py --film FILM|PHOTO [--frames 12]
 
 Temporal error: mean |(result - truth)_t - (result - truth)_{t-1}| over the person, over the same of the
 truth, in display values (sRGB); results have one gain a channel for the whole clip. Over patches, all are
 blurred first by a Gaussian of 1/64 of the side: flicker is seen in patches, the grain of a film in pixels.
-Twins: the frames relit one by one, as photos; and the source itself, whose error is its own noise.
+It counts errors that stay where they are on the head, too, since they move past the pixels with it. How many,
+tells a steady twin: the truth times the mean over time of result / truth, carried with the head by its known
+motion.
+
+Flicker: log of result / truth, carried to where the head is in the middle frame; what of it a parabola over
+five frames does not follow, over patches, in percent; white noise counts as in the change from one frame to
+the next. So neither an error that moves with the head counts, nor one that grows as the head turns.
+
+Twins: the frames relit one by one, as photos; and the source itself, whose error is its own noise. The
+flicker of the source against the truth in the other light is the least that can be measured: it holds the
+noise, and what is rough in the motion of the true light.
 
 The still head is one frame of the clip, with new noise in each frame: its truth does not move, so its
 temporal errors are over those of the source, which are its noise.
+
+--film measures any film, without truth: the mean difference of a frame from the one before, warped by optical
+flow of the source, over the person, in steps of 255. A photo is panned and zoomed by less than a pixel a
+frame, with noise; it is no real film.
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from _common import arguments, print_header, print_row
+from _film_of_photo import frames_of
+from _talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 from PIL import Image
 from scipy.ndimage import gaussian_filter
+from skimage.registration import optical_flow_ilk
+from skimage.transform import warp
 
 from facerf_cli import pipeline
 from facerf_cli.colour import linear_to_srgb, srgb_to_linear
@@ -27,94 +45,14 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.film.follow import Follower
 from facerf_cli.film.shot_view import ShotView
-from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.light.transport import BakeSettings
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models, load_models
 from facerf_cli.portrait_field import SteadyFrame
-from facerf_cli.synth.animation import Actor, seen_from, turned
-from facerf_cli.synth.portraits import bake_portrait, photograph
-from facerf_cli.synth.stage_cameras import stage_cameras
-from facerf_cli.synth.subjects import draw_subject, subject_model
 
-SEED, RATE, LIGHTS = 101, 24, 48
-BAKE = BakeSettings(light_samples=1, bounce_samples=4)
-NOISE = 0.006  # standard deviation of the source's noise, display values: 1.5 of 255
-MEAN = 0.18  # radiance of the source's person
 PATCH = 1 / 64  # of the side
-
-
-@dataclass(frozen=True)
-class Clip:
-    """Frames [N, H, W, 3] of the source, display values without noise, and of the truth; alpha [N, H, W]."""
-
-    source: np.ndarray
-    truth: np.ndarray
-    alpha: np.ndarray
-
-
-def lamps(*lit: tuple[float, float, float, tuple[float, float, float]], fill: float) -> torch.Tensor:
-    """Weights [L, 3] of soft lamps (azimuth, elevation, sharpness, rgb) over an even light."""
-    weights = torch.full((LIGHTS, 3), fill / LIGHTS)
-    for azimuth_deg, elevation_deg, sharpness, rgb in lit:
-        toward = azel_to_direction(azimuth_deg, elevation_deg)
-        share = (sharpness * (rig_directions(LIGHTS) @ toward)).softmax(0)
-        weights = weights + share[:, None] * torch.tensor(rgb)
-    return weights
-
-
-SOURCE = lamps((-50, 25, 8, (1.0, 0.95, 0.88)), fill=0.8)
-TARGET = lamps((70, 20, 12, (1.0, 0.8, 0.6)), (-110, 30, 12, (0.2, 0.35, 0.6)), fill=0.25)
-
-
-def expression(time_s: float) -> dict[str, float]:
-    """A talking face: jaw, lips, smile and brows."""
-
-    def wave(hertz: float, phase: float = 0.0) -> float:
-        return math.sin(2 * math.pi * hertz * time_s + phase)
-
-    smile, brows = wave(0.5) ** 2, 1.2 * wave(0.7) ** 2
-    return {
-        "jaw_open": 0.8 * max(0.0, wave(2.0)),
-        "pucker": max(0.0, wave(1.3, 1.0)),
-        **dict.fromkeys(("smile_left", "smile_right"), smile),
-        **dict.fromkeys(("brow_up_left", "brow_up_right"), brows),
-    }
-
-
-def draw_clip(person: int, frames: int, size_px: int) -> Clip:
-    """Photograph a person who talks and turns; lights are fixed to the camera."""
-    model = subject_model("builtin")
-    actor = Actor(draw_subject(model, person, SEED, size_px), model)
-    images, alphas = [], []
-    for frame in range(frames):
-        turn = 2 * math.pi * frame / RATE
-        camera = turned(
-            stage_cameras(size_px, "bust")[0], 8 * math.sin(0.35 * turn), 3 * math.sin(0.45 * turn)
-        )
-        posed = actor.with_expression(expression(frame / RATE))
-        baked = bake_portrait(posed, camera, seen_from(rig_directions(LIGHTS), camera), BAKE, 0)
-        photos = [photograph(baked, posed.appearance, weights) for weights in (SOURCE, TARGET)]
-        images.append([photo.image.permute(1, 2, 0).numpy() for photo in photos])
-        alphas.append(photos[0].alpha.numpy())
-    alpha = np.stack(alphas)
-    linear = np.array(images)
-    linear *= MEAN / ((linear[:, 0].mean(-1) * alpha).sum() / alpha.sum())
-    wall = np.linspace(0.05, 0.15, size_px)[:, None, None] * np.ones(3)
-    behind = (1 - alpha[..., None]) * wall
-    source = np.asarray(linear_to_srgb((linear[:, 0] + behind).clip(0, 1)))
-    return Clip(source, np.asarray(linear_to_srgb(linear[:, 1].clip(0, 1))), alpha)
-
-
-def still(clip: Clip, frames: int) -> Clip:
-    """One frame of a clip, for as long."""
-    return Clip(*(np.repeat(x[:1], frames, 0) for x in (clip.source, clip.truth, clip.alpha)))
-
-
-def filmed(clip: Clip) -> list[np.ndarray]:
-    """Scene-linear frames [H, W, 3] with noise, in 8 bits, as a camera writes them."""
-    random = np.random.default_rng(SEED)
-    noisy = clip.source + random.normal(0, NOISE, clip.source.shape)
-    return [np.asarray(srgb_to_linear(x), np.float32) for x in np.round(noisy.clip(0, 1) * 255) / 255]
+FLOOR = 0.02  # radiance added to results and truth before their ratio
+ROUGH = np.array([3.0, -12, 18, -12, 3])  # what a parabola over five frames leaves at the middle one
+ALIKE = 0.03  # difference of the source from its warped neighbour, in 0..1, up to which the flow is trusted
 
 
 def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
@@ -128,10 +66,15 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight the frames as `facerf relight FILM` does."""
+    view = shot_view(models, frames)
+    return [relit(models, frames[n], view.head(n), view.steady(n)) for n in range(len(frames))]
+
+
+def shot_view(models: Models, frames: list[np.ndarray]) -> ShotView:
+    """The view of a shot, its face followed."""
     follower = Follower("largest")
     sightings = [follower.see(to_display(frame)) for frame in frames]
-    view = ShotView(models, models.sides(), frames.__getitem__, sightings)
-    return [relit(models, frames[n], view.head(n), view.steady(n)) for n in range(len(frames))]
+    return ShotView(models, models.sides(), frames.__getitem__, sightings)
 
 
 def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:
@@ -146,7 +89,12 @@ def exposed(results: list[np.ndarray], clip: Clip) -> np.ndarray:
     """Results in display values [N, H, W, 3], with the truth's mean colour over the clip."""
     linear, own = np.stack(results), clip.alpha > 0.5
     gain = srgb_to_linear(clip.truth)[own].mean(0) / linear[own].mean(0)
-    return np.asarray(linear_to_srgb((linear * gain).clip(0, 1)))
+    return shown(linear * gain)
+
+
+def shown(linear: np.ndarray) -> np.ndarray:
+    """Scene-linear values in display values."""
+    return np.asarray(linear_to_srgb(linear.clip(0, 1)))
 
 
 def changes(images: np.ndarray, clip: Clip, patches: bool) -> float:
@@ -159,6 +107,40 @@ def changes(images: np.ndarray, clip: Clip, patches: bool) -> float:
     return float(np.abs(np.diff(images, axis=0))[own[1:] & own[:-1]].mean())
 
 
+def ratio(images: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Radiance of images over that of their truth; both in display values."""
+    return np.asarray((srgb_to_linear(images) + FLOOR) / (srgb_to_linear(truth) + FLOOR))
+
+
+def steady_twin(images: np.ndarray, clip: Clip) -> np.ndarray:
+    """The truth [N, H, W, 3] with the mean error of images, which moves with the head."""
+    own = ratio(images, clip.truth)
+    mean = masked_mean(clip.in_middle(own))
+    carried = clip.from_the_middle(mean)
+    kept = np.where(np.isnan(carried), own, carried)
+    return shown((srgb_to_linear(clip.truth) + FLOOR) * kept - FLOOR)
+
+
+def masked_mean(values: np.ndarray) -> np.ndarray:
+    """Mean [...] over the first axis of what is not NaN; NaN where nothing is."""
+    known = np.isfinite(values)
+    return np.asarray(np.where(known, values, 0).sum(0) / np.where(known.any(0), known.sum(0), np.nan))
+
+
+def flicker(images: np.ndarray, truth: np.ndarray, clip: Clip) -> float:
+    """Mean roughness in time, in percent, of images [N, H, W, 3] in the head's own frame; see above."""
+    error = clip.in_middle(np.log(ratio(images, truth)))
+    error[:, clip.alpha[clip.middle] <= 0.5] = np.nan
+    steps = range(len(error) - len(ROUGH) + 1)
+    rough = np.stack([np.tensordot(ROUGH, error[n : n + len(ROUGH)], 1) for n in steps])
+    rough *= np.sqrt(2 / (ROUGH**2).sum())
+    known, sigma = np.isfinite(rough), (0, PATCH * images.shape[1], PATCH * images.shape[1], 0)
+    blurred = gaussian_filter(np.where(known, rough, 0), sigma) / gaussian_filter(known * 1.0, sigma).clip(
+        0.05
+    )
+    return 100 * float(np.abs(blurred)[known].mean())
+
+
 Way = Callable[[Models, list[np.ndarray]], list[np.ndarray]]
 WAYS: dict[str, Way] = {"frame by frame": one_by_one, "as a shot": as_shot}
 
@@ -166,25 +148,78 @@ WAYS: dict[str, Way] = {"frame by frame": one_by_one, "as a shot": as_shot}
 def measure(name: str, clip: Clip, models: Models) -> dict[str, np.ndarray]:
     """Print the rows of a clip; return the results in display values."""
     frames = filmed(clip)
-    source = np.stack([np.asarray(linear_to_srgb(frame)) for frame in frames])
-    shown = {way: exposed(relight(models, frames), clip) for way, relight in WAYS.items()}
-    rows = {"the source's own noise": (source, clip.source), **{k: (x, clip.truth) for k, x in shown.items()}}
+    source = np.stack([shown(frame) for frame in frames])
+    found = {way: exposed(relight(models, frames), clip) for way, relight in WAYS.items()}
+    steady = steady_twin(found["as a shot"], clip)
+    rows = {
+        "the source's own noise": (source, clip.source),
+        "the source, against the truth": (source, clip.truth),
+        **{way: (images, clip.truth) for way, images in found.items()},
+        "steady, with the errors of the shot": (steady, clip.truth),
+    }
     moves = name != "still"
     for way, (images, truth) in rows.items():
         cells = []
         for patches in (False, True):
             over = changes(clip.truth, clip, patches) if moves else changes(source, clip, patches)
             cells.append(f"{changes(images - truth, clip, patches) / over:.3f}")
-        print_row(name, way, *cells)
-    return shown
+        print_row(name, way, *cells, f"{flicker(images, truth, clip):.2f}")
+    return found
 
 
-def sheet(shown: dict[str, np.ndarray], clip: Clip) -> Image.Image:
+def sheet(found: dict[str, np.ndarray], clip: Clip) -> Image.Image:
     """Four frames: source, frame by frame, as a shot, truth."""
     at = np.linspace(0, len(clip.truth) - 1, 4).round().astype(int)
-    rows = [clip.source, *shown.values(), clip.truth]
+    rows = [clip.source, *found.values(), clip.truth]
     joined = np.concatenate([np.concatenate(row[at], 1) for row in rows])
     return Image.fromarray((joined.clip(0, 1) * 255).round().astype(np.uint8))
+
+
+def flow_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Optical flow [2, H, W], rows and columns, by which a frame `after` lies in the one `before`."""
+    greys = (image.mean(-1) for image in (after, before))
+    return np.asarray(optical_flow_ilk(*greys, radius=7, gaussian=True))
+
+
+def warped(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """An image [H, W, 3] at the places to which a flow [2, H, W] leads."""
+    at = np.mgrid[: flow.shape[1], : flow.shape[2]] + flow
+    return np.stack([warp(image[..., c], at, mode="edge", order=3) for c in range(3)], -1)
+
+
+def warped_errors(
+    films: dict[str, list[np.ndarray]], source: list[np.ndarray], mattes: list[np.ndarray]
+) -> dict[str, tuple[float, float]]:
+    """Mean and 99 % of the difference of each frame from the one before, warped, in steps of 255.
+
+    All are in display values; mattes [H, W] show the person. Left out is where the source itself differs.
+    """
+    found: dict[str, list[np.ndarray]] = {name: [] for name in films}
+    for n in range(1, len(source)):
+        flow = flow_between(source[n - 1], source[n])
+        smooth = gaussian_filter(warped(source[n - 1], flow) - source[n], (1, 1, 0))
+        trusted = (np.abs(smooth).max(-1) < ALIKE) & (mattes[n] > 0.5)
+        for name, film in films.items():
+            found[name].append(np.abs(warped(film[n - 1], flow) - film[n])[trusted])
+    every = {name: 255 * np.concatenate(parts) for name, parts in found.items()}
+    return {name: (float(x.mean()), float(np.percentile(x, 99))) for name, x in every.items()}
+
+
+def measure_film(path: Path, count: int, models: Models) -> None:
+    """Print the warped errors of a film."""
+    frames = frames_of(path, count)
+    view = shot_view(models, frames)
+    mattes = [view.segmentation(n).matte for n in range(len(frames))]
+    source = [shown(frame) for frame in frames]
+    films = {"the source itself": source}
+    for way, relight in WAYS.items():
+        linear = np.stack(relight(models, frames))
+        own = np.stack(mattes) > 0.5
+        gain = np.stack(frames)[own].mean() / linear[own].mean()
+        films[way] = list(shown(linear * gain))
+    print_header(path.name, "warped error, mean", "99 %")
+    for name, (mean, most) in warped_errors(films, source, mattes).items():
+        print_row(name, f"{mean:.2f}", f"{most:.1f}")
 
 
 def main() -> None:
@@ -192,15 +227,20 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--person", type=int, default=5)
+    parser.add_argument("--clip", type=Path, help="keep the synthetic clip here; read it from here")
+    parser.add_argument("--film", type=Path)
     parser.add_argument("--sheet")
     given = parser.parse_args()
-    clip = draw_clip(given.person, given.frames, given.size)
     models = load_models(None, "builtin", torch.device("cpu"))
-    print_header("head", "relit", "temporal error of pixels", "of patches")
-    shown = measure("talks and turns", clip, models)
-    measure("still", still(clip, given.frames), models)
+    if given.film:
+        measure_film(given.film, given.frames, models)
+        return
+    clip = kept_clip(given.clip, given.person, given.frames, given.size)
+    print_header("head", "relit", "temporal error of pixels", "of patches", "flicker, %")
+    found = measure("talks and turns", clip, models)
+    measure("still", still(clip, len(clip.alpha)), models)
     if given.sheet:
-        sheet(shown, clip).save(given.sheet)
+        sheet(found, clip).save(given.sheet)
 
 
 if __name__ == "__main__":

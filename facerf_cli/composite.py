@@ -4,14 +4,15 @@ A texture is coarser than the photo, so the photo's detail is added to it. Where
 the relit one R, a photo pixel P becomes
 
     R (P + e) / (S + e) + k e (P - S) / (S + e)    where P >= S,    k = mean R / mean S,
-    R P / S                                        where P < S.
+    R D / S + R (P - D) / (S + e)                  where P < S,
 
-For bright sources both are the quotient P R / S. Where the source is nearly black the quotient would be
-noise, and e, a small share of the source's mean, keeps the pixel near R. Under the photo's own light (R = S)
-the photo comes back. What lies around the face follows by `Surround`, or is relit as a whole person. All
-steps are linear in light: two lights composed apart add up to both composed at once, but for a slight
-undershoot of the surround, which is clipped, and for the photo's background, which no light changes. A light
-with negative weights, such as the paper's plain least squares gives, can make pixels negative.
+D is P, but in dark pixels has the colour of S, for theirs is noise. For bright sources both are the
+quotient P R / S. Where the source is nearly black the quotient would be noise, and e, a small share of the
+source's mean, keeps the pixel near R. Under the photo's own light (R = S) the photo comes back, its dark
+pixels nearly. What lies around the face follows by `Surround`, or is relit as a whole person. All steps are
+linear in light: two lights composed apart add up to both composed at once, but for a slight undershoot of
+the surround, which is clipped, and for the photo's background, which no light changes. A light with
+negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from facerf_cli.colour import ExposureRule, chosen_exposure_ev
+from facerf_cli.colour import ExposureRule, chosen_exposure_ev, luminance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
@@ -39,6 +40,7 @@ from facerf_cli.raster.texture import inpaint
 from facerf_cli.strips import Computed, Rows, whole
 
 _DARK = 0.08  # e above, a share of the source's mean
+_NOISY = 2.0  # times e: the luminance below which colours of pixels are noise
 _OWN_REGIONS = ("eyes", "mouth", "brows")  # keep the photo's own detail, scaled as the skin around them
 _OWN_SIDE = 128  # texels of their mask; finer ones take seconds to draw
 _TINY = 1e-8
@@ -127,6 +129,7 @@ class PersonAround(AroundFace, Protocol):
     """A photo's person under sums of lights: `WholePerson`."""
 
     matte: np.ndarray  # the person's share of the photo [H, W]
+    bare_face: Rows  # share [H, W] of the pixels that show the face itself, without hair or a hand before it
 
     def layer(self, name: str, lit: Tensor) -> dict[str, Rows]:
         """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
@@ -192,7 +195,8 @@ class Composition:
         def of(rows: slice) -> np.ndarray:
             pixels, matte = person[rows], self.matte[rows][..., None]
             if behind is not None:
-                return behind[rows] + matte * (pixels - behind[rows])
+                below = behind[rows]
+                return below + matte * (pixels - below)
             return (photo[rows] - matte * self.own[rows]) * gain + matte * pixels
 
         return RelitRows(Computed(photo.shape, of))
@@ -215,10 +219,17 @@ class Composition:
             inside = view.rows_inside(rows)
             if inside.start < inside.stop:
                 part = person[view.rows_of(inside, rows), view.window[1]]
-                part += view.mask[inside].numpy()[..., None] * (detail(inside) - part)
+                part += self.face_share(inside)[..., None] * (detail(inside) - part)
             return person
 
         return Computed(around.shape, of)
+
+    def face_share(self, inside: slice) -> np.ndarray:
+        """Share [h, w] of the face in rows of the view's window, without what is seen before it."""
+        mask = self.view.mask[inside].numpy()
+        if self._person is None:
+            return mask
+        return np.asarray(mask * self._person.bare_face[self.view.in_photo(inside)][:, self.view.window[1]])
 
     def person(self, relit: Relit) -> tuple[Rows, Rows]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
@@ -300,12 +311,21 @@ class PhotoDetail:
             rendered = self._view.render(textures, rows).numpy()
             skin, change, source, own = np.split(rendered, [3, 6, 9], -1)
             finer = pixels >= source
-            gain = np.where(finer, (pixels + floor) / (source + floor), pixels / source.clip(min=_TINY))
+            steady = _steady_colours(pixels, source, _NOISY * floor)
+            darker = steady / source.clip(min=_TINY) + (pixels - steady) / (source + floor)
+            gain = np.where(finer, (pixels + floor) / (source + floor), darker)
             bias = np.where(finer, floor * (pixels - source) / (source + floor), 0)
             skin = skin * gain + mean_change * bias
             return np.asarray(skin + own * (change * pixels - skin))
 
         return of
+
+
+def _steady_colours(pixels: np.ndarray, around: np.ndarray, dark: float) -> np.ndarray:
+    """Pixels [h, w, 3], which where they are darker than `dark` take on the colour of what is around them."""
+    light, mean = (luminance(image)[..., None] for image in (pixels, around))
+    share = (1 - light / dark).clip(min=0)
+    return pixels + share * (around * light / mean.clip(min=_TINY) - pixels)
 
 
 def _mean(texture: Tensor, weight: Tensor) -> Tensor:

@@ -3,10 +3,14 @@
 `--memory` sets it for each job. What a process holds at rest, its libraries and networks, is not in it.
 """
 
+import ctypes
 import math
 import os
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import cast
 
 from facerf_cli.errors import InputError
 
@@ -14,6 +18,7 @@ SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by 
 _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
 _set: list[int] = []  # the limit, once it was set
+_held: list[int] = []  # what is held beside that which is asked for
 
 
 def set_limit(limit_bytes: int) -> None:
@@ -34,8 +39,42 @@ def default_limit(jobs: int = 1) -> int:
     return int(SHARE * most) // max(1, jobs)
 
 
+@contextmanager
+def beside(held_bytes: int) -> Iterator[None]:
+    """Count what is held meanwhile with whatever is asked for."""
+    _held.append(held_bytes)
+    try:
+        yield
+    finally:
+        _held.pop()
+
+
+def left_bytes() -> int:
+    """The budget without what is held."""
+    return max(0, limit_bytes() - sum(_held))
+
+
+def give_back() -> None:
+    """Return freed memory to the system.
+
+    glibc keeps what lies between blocks in use, so a batch of thousands of items would grow by these gaps.
+    """
+    if trim := _trim():
+        trim(0)
+
+
+@cache
+def _trim() -> Callable[[int], int] | None:
+    """glibc's malloc_trim; None with another library of C."""
+    try:
+        return cast("Callable[[int], int]", ctypes.CDLL(None).malloc_trim)
+    except (OSError, AttributeError, TypeError):
+        return None
+
+
 def require(what: str, needed_bytes: int, instead: str) -> None:
     """Raise InputError where something needs more than the budget; `instead` says what else would do."""
+    needed_bytes += sum(_held)
     if needed_bytes > limit_bytes():
         least = math.ceil(100 * needed_bytes / _GB) / 100
         raise InputError(

@@ -77,6 +77,11 @@ def in_ray(
                 else:
                     error = ChildProcessError(f"{attempt} times; the last: {answer}")
                     yield number, broken(items[number], error)
+    except ray.exceptions.RayError as error:
+        raise FacerfError(
+            f"--ray {address}: the cluster was lost ({_first_sentence(error)}); start it again, then run the "
+            "same command, which continues"
+        ) from error
     finally:
         _cancel(ray, list(running))
 

@@ -7,6 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.face.head import Head
+from facerf_cli.strips import Computed, Rows, enlarged
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -16,6 +17,17 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     sized = F.interpolate(planes[None], (height, width), mode="bilinear", align_corners=False, antialias=True)
     plain = sized[0].permute(1, 2, 0).numpy()
     return np.ascontiguousarray(plain[..., 0] if image.ndim == 2 else plain)
+
+
+def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Rows:
+    """`resized`; the rows of a larger image are computed as they are read."""
+    if size[0] < image.shape[0] or size[1] < image.shape[1]:
+        return resized(image, *size)
+    maps = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+    shape = (*size, *image.shape[2:])
+    return Computed(
+        shape, lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *shape[1:])
+    )
 
 
 def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:

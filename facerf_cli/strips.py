@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 STRIP_PX = 1 << 18  # pixels of a strip, about
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
@@ -53,3 +56,19 @@ def whole(rows: Rows) -> np.ndarray:
     for some in strips(rows.shape):
         found[some] = rows[some]
     return found
+
+
+def enlarged(maps: np.ndarray, size: tuple[int, ...], rows: slice = slice(None)) -> np.ndarray:
+    """Maps [C, h, w] at another size [C, H, W], or some rows of that."""
+    above, below, share = between(np.arange(size[0])[rows], maps.shape[1], size[0])
+    tall = maps[:, above] + share[:, None] * (maps[:, below] - maps[:, above])
+    tensor: Tensor = torch.from_numpy(np.ascontiguousarray(tall, np.float32))[None]
+    wide = F.interpolate(tensor, size=(len(share), size[1]), mode="bilinear", align_corners=False)
+    return np.asarray(wide[0].numpy())
+
+
+def between(at: np.ndarray, small: int, large: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Neighbours of large pixels among small ones, and the weight of the second one."""
+    place = ((at + 0.5) * (small / large) - 0.5).clip(0, small - 1)
+    first = place.astype(np.int64)
+    return first, (first + 1).clip(max=small - 1), (place - first).astype(np.float32)

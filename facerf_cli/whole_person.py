@@ -17,6 +17,7 @@ from facerf_cli.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
+from facerf_cli.portrait.occluders import uncovered_rows
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import inpaint
@@ -36,6 +37,8 @@ class WholePerson:
 
     def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
         self.matte = field.person.segmentation.matte
+        size_px = (photo.shape[0], photo.shape[1])
+        self.bare_face = uncovered_rows(field.person.segmentation.classes, size_px)
         self._field, self._photo = field, photo
         self._display_ev = display_ev(photo)
         self.own = (1 - field.person.classes[0] > _SURE).float()

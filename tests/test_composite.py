@@ -2,15 +2,19 @@
 
 from dataclasses import dataclass
 from functools import cache
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from facerf_cli.colour import luminance
 from facerf_cli.composite import (
     Background,
     Composition,
+    PersonAround,
     PhotoDetail,
     Relit,
     RelitImage,
@@ -266,11 +270,33 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
         max=1
     )
     skin = torch.nn.functional.interpolate(own_region[None, None], (48, 48), mode="bilinear")[0, 0] < 1e-3
-    np.testing.assert_allclose(
-        detail.relit(photo, face.texture)(rows)[skin], photo[skin], rtol=1e-4, atol=1e-6
-    )
+    bright = skin.numpy() & (luminance(photo) > 2 * detail.floor)  # below, colours are noise
+    returned = detail.relit(photo, face.texture)(rows)
+    np.testing.assert_allclose(returned[bright], photo[bright], rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(returned[skin], photo[skin], atol=detail.floor)
     one_sided = face.texture * (torch.arange(48) > 24)
     assert detail.relit(photo, one_sided)(rows).min() >= 0
+
+
+def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
+    source = torch.full((3, 32, 32), 0.4)
+    source[:, 16:19, 22:25] = torch.tensor([0.02, 0.016, 0.012])[:, None, None]  # hair on a cheek
+    face, screen, shown = flat_face(source)
+    photo = shown.copy()
+    photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
+    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 32, 32), 0.4))(slice(0, 32))[17, 23]
+    assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
+
+
+def test_what_is_before_the_face_is_not_of_it() -> None:
+    photo, source, seen = unwrapped()
+    composition = composed(photo, source, seen, FOLLOWING)
+    rows = slice(0, len(composition.view.mask))
+    whole = composition.face_share(rows)
+    covered = SimpleNamespace(bare_face=np.tile(np.arange(WIDTH_PX) < WIDTH_PX // 2, (HEIGHT_PX, 1)))
+    composition._person = cast(PersonAround, covered)
+    left, columns = composition.view.window[1].start, np.arange(whole.shape[1])
+    np.testing.assert_array_equal(composition.face_share(rows), whole * (left + columns < WIDTH_PX // 2))
 
 
 def test_eyes_keep_their_detail() -> None:

@@ -1,5 +1,7 @@
 """The budget of memory: what readers ask for before they decode, and who is refused."""
 
+import os
+import platform
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -50,6 +52,31 @@ def test_a_refusal_names_what_is_needed_and_what_is_allowed() -> None:
     assert str(refused.value) == (
         "a.exr: needs 1.01 GB of memory, and 1.00 GB are allowed; give --memory 1.01 or crop it"
     )
+
+
+def test_what_is_held_counts_with_what_is_asked_for() -> None:
+    memory.set_limit(1 << 30)
+    with memory.beside(1 << 29):
+        assert memory.left_bytes() == 1 << 29
+        memory.require("a.exr", 1 << 29, "crop it")
+        with pytest.raises(InputError, match=r"needs 1\.25 GB of memory, and 1\.00 GB are allowed"):
+            memory.require("a.exr", 3 << 28, "crop it")
+    memory.require("a.exr", 1 << 30, "crop it")
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries have no malloc_trim")
+def test_freed_memory_is_given_back() -> None:
+    """64 MB in small blocks, of which one in a thousand stays in use: the others' pages go."""
+
+    def resident_mb() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    blocks = [bytes(4000) for _ in range(16_000)]
+    kept = blocks[::1000]
+    full_mb = resident_mb()
+    del blocks
+    memory.give_back()
+    assert resident_mb() < full_mb - 40 and len(kept) == 16
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,14 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from facerf_cli.cli.options import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import configure_logging
-from facerf_cli.ray_workers import connect
+from facerf_cli.ray_workers import connect, in_ray
 from tests.cli.toy_batch import run
 from tests.processes import wait_until
 
@@ -190,3 +191,26 @@ def test_without_ray(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UsageError, match=r"^--ray: Ray is not installed; pip install 'facerf\[ray\]'$"):
         run(photos, tmp_path / "out", ray="local")
+
+
+def test_a_lost_cluster_is_one_line_that_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    class RayError(Exception):
+        pass
+
+    def wait(*_: object, **__: object) -> None:
+        raise RayError("The node died. It had much more to say")
+
+    task = SimpleNamespace(remote=lambda *_: "reference")
+    ray = SimpleNamespace(
+        remote=lambda **_: lambda _: task,
+        put=lambda work: work,
+        cluster_resources=lambda: {"CPU": 1},
+        wait=wait,
+        exceptions=SimpleNamespace(RayError=RayError),
+        is_initialized=lambda: False,
+    )
+    monkeypatch.setattr("facerf_cli.ray_workers.connect", lambda *_: ray)
+    with pytest.raises(
+        FacerfError, match=r"^--ray a:1: the cluster was lost \(The node died\); start it again"
+    ):
+        list(in_ray(str, ["item"], "a:1", 1, 0, lambda item, error: item))

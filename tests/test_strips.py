@@ -10,8 +10,8 @@ import torch.nn.functional as F
 
 from facerf_cli import strips as module
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
-from facerf_cli.portrait.matte import PersonColours, enlarged, refine_matte, shrunk
-from facerf_cli.strips import Computed, strips, whole
+from facerf_cli.portrait.matte import PersonColours, refine_matte, shrunk
+from facerf_cli.strips import Computed, enlarged, strips, whole
 from tests.oracles.person_colours import slow_person_colours
 
 HEIGHT, WIDTH = 150, 70

@@ -1,6 +1,6 @@
 """A verb killed at random and at aimed moments, then run again: are all outputs there, byte for byte?
 
-    python -m benchmarks.faults.kills [--verb convert-light] [--kills 100] [--seed 0]
+    python -m benchmarks.faults.kills [--verb convert-light] [--kills 100] [--items 6] [--seed 0]
 
 Aimed kills fall before or after a call that changes the disk (mkdir, fsync, replace, a row of the report);
 random ones anywhere between the start and the end of an undisturbed run, and some send SIGTERM, SIGHUP or
@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._common import arguments
-from benchmarks.faults.runs import VERBS, Verb, faults_of, fresh, import_all, outputs, run, start, wait
+from benchmarks.faults.runs import VERBS, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
 
-_ITEMS = 6
 _CALLS = ("mkdir", "fsync", "replace", "row")
 _SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
@@ -33,19 +32,20 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--verb", choices=sorted(VERBS), default="convert-light")
     parser.add_argument("--kills", type=int, default=100, help="of each kind: aimed and random")
+    parser.add_argument("--items", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     verb = VERBS[given.verb]
-    import_all(verb)
+    warm_up(verb)
     wrong: Counter[str] = Counter()
     begin = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        verb.fill(fresh(folder / "in"), _ITEMS)
+        verb.fill(fresh(folder / "in"), given.items)
         whole, seconds = _undisturbed(verb, folder)
         draw = random.Random(given.seed)
         for number in range(given.kills):
-            wrong.update(_aimed(verb, folder, whole, draw))
+            wrong.update(_aimed(verb, folder, whole, draw, 3 * given.items))
             wrong.update(_random(verb, folder, whole, draw, seconds))
             if set(wrong) - {"interrupted"} and number % 10 == 0:
                 print(dict(wrong), file=sys.stderr)
@@ -65,12 +65,12 @@ def _undisturbed(verb: Verb, folder: Path) -> tuple[dict[str, bytes], float]:
     return outputs(folder / "whole"), time.monotonic() - begin
 
 
-def _aimed(verb: Verb, folder: Path, whole: dict[str, bytes], draw: random.Random) -> list[str]:
-    """Kill at a call that changes the disk, up to three times, then finish."""
+def _aimed(verb: Verb, folder: Path, whole: dict[str, bytes], draw: random.Random, most: int) -> list[str]:
+    """Kill at one of the first `most` calls that change the disk, up to three times, then finish."""
     out, found = folder / "out", []
     fresh(out).rmdir()
     for _ in range(draw.choice((1, 1, 2, 3))):
-        call, count, after = draw.choice(_CALLS), draw.randrange(1, 3 * _ITEMS), draw.random() < 0.5
+        call, count, after = draw.choice(_CALLS), draw.randrange(1, most), draw.random() < 0.5
         ended = run(verb.line(folder / "in", out), partial(_kill_at, call, count, after))
         found += ["interrupted"] if ended.code == -signal.SIGKILL else []
         found += faults_of(out, whole, finished=False)

@@ -21,9 +21,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from benchmarks._common import arguments
-from benchmarks.faults.runs import VERBS, Ended, Verb, faults_of, fresh, import_all, outputs, run, start, wait
+from benchmarks.faults.runs import VERBS, Ended, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
 
-_ITEMS = 6
+_ITEMS = 8
 _NOBODY = 65534
 
 
@@ -32,7 +32,7 @@ def main() -> None:
     parser.add_argument("--verb", choices=sorted(VERBS), default="convert-light")
     given = parser.parse_args()
     verb = VERBS[given.verb]
-    import_all(verb)
+    warm_up(verb)
     bad = 0
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -173,17 +173,17 @@ def _two_at_once(verb: Verb, folder: Path, whole: dict[str, bytes]) -> list[str]
 
 
 def _killed_worker(verb: Verb, folder: Path, whole: dict[str, bytes]) -> list[str]:
-    """A worker of two that is killed, at four times."""
+    """A worker of two that is killed, at four times, and four of eight."""
     found = []
-    for delay_s in (1.0, 2.0, 3.0, 5.0):
+    for delay_s, jobs in ((1.0, 2), (2.0, 2), (3.0, 2), (5.0, 2), (8.0, 8)):
         fresh(folder / "out").rmdir()
-        line = [*verb.line(folder / "in", folder / "out"), "--jobs", "2"]
+        line = [*verb.line(folder / "in", folder / "out"), "--jobs", str(jobs)]
         process = start(line, lambda: None, folder / "said")
         time.sleep(delay_s)
         children = Path(f"/proc/{process}/task/{process}/children")
         ids = [int(word) for word in children.read_text().split()] if children.exists() else []
         workers = [number for number in ids if b"spawn_main" in _command_of(number)]
-        for worker in workers[:1]:
+        for worker in workers[: jobs // 2]:
             os.kill(worker, signal.SIGKILL)
         ended = wait(process, folder / "said")
         found += _said_badly(ended, (0, 1)) + faults_of(folder / "out", whole, finished=False)

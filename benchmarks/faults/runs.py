@@ -4,10 +4,12 @@ import json
 import os
 import shutil
 import signal
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 
 from benchmarks._common import ASTRONAUT
@@ -24,45 +26,58 @@ class Verb:
 
     name: str
     arguments: tuple[str, ...]
-    fill: Callable[[Path, int], None]  # writes so many inputs into a folder
+    fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
         return [self.name, str(inputs), *self.arguments, "-o", str(output)]
 
 
-def _fill_with_lights(folder: Path, count: int) -> None:
+def _fill_with_lights(folder: Path, count: int, _: int = 0) -> None:
     light = json.loads(samples.lights()["both.json"])
     for number in range(count):
         light["weights"][0] = [number, 0.5, 0.25]
         (folder / f"light_{number:03d}.json").write_text(json.dumps(light))
 
 
-def _fill_with_photos(folder: Path, count: int) -> None:
+def _fill_with_photos(folder: Path, count: int, side_px: int = 128) -> None:
     import numpy as np
     from PIL import Image
 
-    photo = Image.open(ASTRONAUT).convert("RGB").resize((128, 128))
+    photo = Image.open(ASTRONAUT).convert("RGB").resize((side_px, side_px))
     for number in range(count):
         pixels = np.asarray(photo).copy()
         pixels[0, 0] = number % 256, number // 256, 0
         Image.fromarray(pixels).save(folder / f"photo_{number:05d}.png", compress_level=1)
 
 
-VERBS = {
-    "convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights),
-    "segment": Verb("segment", (), _fill_with_photos),
+_ON_PHOTOS = {
+    "segment": (),
+    "fit-geometry": (),
+    "estimate-light": ("--lights", "20", "--width", "32"),
+    "predict-olat": ("--lights", "4", "--frame", "uv"),
+    "relight": ("--light", "75,20", "--exposure", "0"),
+}
+VERBS = {"convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights)} | {
+    name: Verb(name, given, _fill_with_photos) for name, given in _ON_PHOTOS.items()
 }
 
 
-def import_all(verb: Verb) -> None:
-    """Import what the verb needs, so that forks need not."""
+def warm_up(verb: Verb) -> None:
+    """Run the verb once here, so that forks have its imports and networks."""
     import importlib
 
-    for name in ("main", "cli.items.convert_lights", "cli.items.segment_photos"):
-        importlib.import_module(f"facerf_cli.{name}")
+    import OpenImageIO as oiio
+
+    from facerf_cli.main import main
+
     importlib.import_module("zoneinfo")  # late imports fail for a user who cannot read this Python
-    assert verb.name
+    oiio.attribute("threads", 1)  # a fork has one thread, and would wait for the others
+    oiio.attribute("exr_threads", -1)
+    with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
+        verb.fill(fresh(Path(name) / "in"), 1)
+        code = main([*verb.line(Path(name) / "in", Path(name) / "out"), "-q"])
+    assert code == 0, f"{verb.name} ends with {code}"
 
 
 @dataclass(frozen=True)

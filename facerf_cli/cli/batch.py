@@ -167,7 +167,7 @@ def _run_alone(
         _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
     report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
-    if index:
+    if index and (todo or index.has_news):
         index.open()
     _say_what_is_skipped(reasons, options)
     if index and index.edited:
@@ -287,6 +287,8 @@ class _Work:
             return result(stops_the_run=error)
         except Exception as error:  # a bug must not cost the other items
             return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+        finally:
+            memory.give_back()
 
 
 def _broken(item: Item, error: Exception) -> _Result:

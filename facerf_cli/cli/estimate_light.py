@@ -35,6 +35,7 @@ from facerf_cli.cli.photo_options import (
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.shots import (
+    NoCutsOption,
     PhotosArgument,
     SequenceOption,
     Shot,
@@ -80,9 +81,10 @@ class EstimateLight:
 
         for shot in self.shots:
             if item.output_base == shot.base:
-                seen = write_shot_light(shot, item, self.options, self.width_px, self.sh_order)
-                return Outcome(self.outputs_of(item), seen)
-        tags, facts = write_lights(item, self.options, self.width_px, self.sh_order)
+                tags, facts = write_shot_light(shot, item, self.options, self.width_px, self.sh_order)
+                break
+        else:
+            tags, facts = write_lights(item, self.options, self.width_px, self.sh_order)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)
 
 
@@ -160,6 +162,7 @@ def estimate_light(
     face_model: FaceModelOption = "builtin",
     name: NameOption = None,
     sequence: SequenceOption = False,
+    no_cuts: NoCutsOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -171,7 +174,8 @@ def estimate_light(
     is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the residual
     inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
 
-    A film, or images with --sequence, has one light, which is estimated from several frames together.
+    A film, or images with --sequence, has one light between cuts, estimated from several frames together
+    (_take2_light.exr after the first cut).
 
     A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
     the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
@@ -191,7 +195,7 @@ def estimate_light(
     photo.check()
     how = LightOptions(photo, reflectance, lights, non_negative, refine, vgg_weights, keep_eyes, matte)
     how.check()
-    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name))
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name), not no_cuts)
     check_shots(shots, photo)
     if shots and (refine != "none" or reflectance != "field" or matte is not None):
         raise UsageError(

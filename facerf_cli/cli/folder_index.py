@@ -97,6 +97,7 @@ class FolderIndex:
 
     def __init__(self, folder: Path, verb: str, shard: Shard, recipes_of: RecipesOf) -> None:
         self._folder, self._verb = folder, verb
+        self._prefix = os.path.join(folder, "")
         self._rows = _Rows(folder)
         self._new: list[Row] = []  # files read since the rows were last written
         self.edited: list[Path] = []  # finished outputs that are not as they were written
@@ -154,6 +155,11 @@ class FolderIndex:
     def _is_edited(self, path: Path) -> bool:
         return self._digest_or_none(path) != self._rows.outputs[self._name(path)].get("sha256")
 
+    @property
+    def has_news(self) -> bool:
+        """True if files were read that the rows do not know."""
+        return bool(self._new)
+
     def open(self) -> None:
         """Write the rows, those that are known and those of this run's recipes."""
         self._rows.recipes.update(self._wanted)
@@ -194,6 +200,9 @@ class FolderIndex:
         self._new.append(row)
 
     def _name(self, path: Path) -> str:
+        text = os.fspath(path)
+        if text.startswith(self._prefix) and ".." not in text:  # as all of a verb's; ten times faster
+            return text[len(self._prefix) :].replace(os.sep, "/")
         return Path(os.path.relpath(path, self._folder)).as_posix()
 
 

@@ -7,6 +7,7 @@ from facerf_cli.cli.values import azel, is_sweep, numbers, sweep
 from facerf_cli.errors import UsageError
 from facerf_cli.light.studio import StudioLight
 
+_AROUND = "around"  # as a direction: from all of them
 KEYS = ("at", "from", "az", "el", "rgb", "kelvin", "stops", "size", "size_deg", "spot")
 # Limits of values.
 _KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
@@ -42,6 +43,8 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Giv
     is_far = bool(given.keys() & {"from", "az", "el"})
     if is_far == ("at" in given) or ("from" in given and given.keys() & {"az", "el"}):
         raise UsageError(f"{where} {_shown(given)}: give one of at=X,Y,Z, from=AZ,EL, or az and el")
+    if "size_deg" in given and given.get("from") == _AROUND:
+        raise UsageError(f"{where} {_shown(given)}: a light from all around has no size; leave size_deg out")
     if wrong := sorted(given.keys() & ({"size", "spot"} if is_far else {"size_deg"})):
         right = "is of near lights (at=); a far one has size_deg" if is_far else "is of far lights; give size"
         raise UsageError(f"{where} {_shown(given)}: {wrong[0]} {right}")
@@ -86,10 +89,12 @@ def _place(text: str, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float]]:
-    """Azimuth and elevation, of each frame where they sweep."""
+def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float] | None]:
+    """Azimuth and elevation, of each frame where they sweep; None is from all around."""
+    if given.get("from") == _AROUND:
+        return [None]
     if "from" in given:
-        azimuth, elevation = azel(given["from"], ("AZ,EL",), f"{where} from")
+        azimuth, elevation = azel(given["from"], (f"AZ,EL or {_AROUND}",), f"{where} from")
         return [(azimuth, elevation)]
     azimuths, elevations = (_angles(given.get(key, "0"), f"{where} {key}") for key in ("az", "el"))
     count = max(len(azimuths), len(elevations))
@@ -98,7 +103,7 @@ def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float
     pairs = [(azimuths[k % len(azimuths)], elevations[k % len(elevations)]) for k in range(count)]
     for pair in pairs:
         azel(f"{pair[0]},{pair[1]}", ("AZ,EL",), where)
-    return pairs
+    return [*pairs]
 
 
 def _angles(text: str, option: str) -> list[float]:

@@ -57,6 +57,7 @@ from facerf_cli.cli.photo_options import (
 from facerf_cli.cli.relight_work import Composite, ExposureGroup, Relight
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
+    NoCutsOption,
     PhotosArgument,
     SequenceOption,
     check_shots,
@@ -253,6 +254,7 @@ def relight(
         ),
     ] = None,
     sequence: SequenceOption = False,
+    no_cuts: NoCutsOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -260,9 +262,9 @@ def relight(
     """Relight photos, or OLAT stacks, under environment maps and single lights.
 
     Each image is written as a scene-linear EXR with the matte as layer person.A, and as a PNG at --exposure.
-    A film, or images with --sequence, is one shot: one identity, and one light by which the field is
-    corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or FILE.mov joins
-    frames to a film, with the sound of the film that they come from.
+    A film, or images with --sequence, is one shot between cuts: one identity, and one light by which the
+    field is corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or
+    FILE.mov joins frames to a film, with the sound of the film that they come from.
 
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
     --light takes the nearest of them.
@@ -327,7 +329,7 @@ def relight(
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
         _write_to_stdout(inputs, work)
         return
-    items, shots = collect_frames(inputs, output, settings, sequence, pattern)
+    items, shots = collect_frames(inputs, output, settings, sequence, pattern, not no_cuts)
     check_shots(shots, photo)
     in_a_row = FRAMES_IN_A_ROW if shots else 1
     options = BatchOptions(output, overwrite, dry_run, jobs, in_a_row, print_outputs=film is None)

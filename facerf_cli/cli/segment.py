@@ -22,6 +22,7 @@ from facerf_cli.cli.photo_options import FaceOption, LandmarksFromOption, Landma
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
+    NoCutsOption,
     PhotosArgument,
     SequenceOption,
     Shot,
@@ -67,6 +68,7 @@ def segment(
     input_colourspace: InputColourspaceOption = None,
     name: NameOption = None,
     sequence: SequenceOption = False,
+    no_cuts: NoCutsOption = False,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
@@ -88,7 +90,7 @@ def segment(
         landmarks_from=landmarks_from,
     )
     photo.check()
-    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name))
+    items, shots = collect_frames(inputs, output, photo.settings, sequence, file_pattern(name), not no_cuts)
     check_shots(shots, photo)
     work = Segment(photo, shots)
     options = BatchOptions(output, overwrite, dry_run, jobs, FRAMES_IN_A_ROW if shots else 1)

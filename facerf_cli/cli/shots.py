@@ -37,6 +37,12 @@ SequenceOption = Annotated[
 ]
 
 
+NoCutsOption = Annotated[
+    bool,
+    typer.Option("--no-cuts", help="Take a film that cuts as one shot.", rich_help_panel=BATCH),
+]
+
+
 @dataclass(frozen=True, eq=False)  # as a key of caches by identity: it has thousands of frames
 class Shot:
     """Frames of one person, in order: of a film, or images."""
@@ -44,6 +50,7 @@ class Shot:
     base: Path  # output folder / name
     frames: tuple[Item, ...]
     film: Path | None = None
+    cuts: bool = True  # each part between cuts is a shot for itself
 
     @property
     def track(self) -> Path:
@@ -62,6 +69,7 @@ def collect_frames(
     settings: Settings,
     sequence: bool = False,
     pattern: NamePattern | None = None,
+    cuts: bool = True,
 ) -> tuple[list[Item], tuple[Shot, ...]]:
     """List photos and the frames of films, in order, and the shots that they make; see `collect_items`.
 
@@ -75,6 +83,7 @@ def collect_frames(
     if sequence:
         shots += _of_images(photos)
         photos = []
+    shots = [replace(shot, cuts=cuts) for shot in shots]
     if shots and settings.shard.of > 1:
         raise UsageError("--shard: the frames of a shot belong together; use --jobs, or a shard of photos")
     return [*photos, *missing, *(item for shot in shots for item in shot.frames)], tuple(shots)
@@ -119,19 +128,20 @@ def shot_of(shots: Sequence[Shot], item: Item) -> tuple[Shot, int] | None:
 
 
 def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
-    """An entry of a recipe by the images of sequences, since a frame depends on its neighbours."""
+    """Entries of a recipe: the images of sequences, since a frame depends on its neighbours; --no-cuts."""
     import hashlib
 
     from facerf_cli.errors import InputError
 
+    found: Recipe = {} if all(shot.cuts for shot in shots) else {"cuts": False}
     images = [item.input_path for shot in shots if shot.film is None for item in shot.frames]
     if not images:
-        return {}
+        return found
     try:
         digests = "".join(map(digest_of, images))
     except InputError:  # its item says so
         digests = ""
-    return {"sequence": "sha256:" + hashlib.sha256(digests.encode()).hexdigest()}
+    return {**found, "sequence": "sha256:" + hashlib.sha256(digests.encode()).hexdigest()}
 
 
 def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:

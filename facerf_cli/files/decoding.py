@@ -10,7 +10,7 @@ import OpenImageIO as oiio
 
 from facerf_cli import memory
 from facerf_cli.errors import InputError
-from facerf_cli.files.heif import decode_heif, is_heif
+from facerf_cli.files.heif import HEIF_BYTES, decode_heif, is_heif
 from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
 from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import LOGGER_NAME, one_line
@@ -21,7 +21,6 @@ log = logging.getLogger(LOGGER_NAME)
 _INTEGERS = (oiio.TypeDesc(oiio.UINT8), oiio.TypeDesc(oiio.UINT16))
 _LINEAR_BYTES = 12  # of a pixel that is read: three floats, and
 _ALPHA_BYTES = 4
-_HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +46,7 @@ def decode(path: Path, limit_px: int, kept_px: int = 0) -> Decoded:
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; give an image file")
     if is_heif(path):
-        most_px = memory.limit_bytes() // (_LINEAR_BYTES + max(_HEIF_BYTES, kept_px))
-        values, spec = decode_heif(path, min(limit_px, most_px))
+        values, spec = decode_heif(path, limit_px, _LINEAR_BYTES + max(HEIF_BYTES, kept_px))
         return Decoded(values, spec, *pick_channels(list(spec.channelnames), -1))
     require_whole_png(path)
     return _decode_by_oiio(path, limit_px, kept_px)

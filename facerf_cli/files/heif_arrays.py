@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-PIXELS, PROFILE, CODES = "pixels", "profile", "codes"
+PIXELS, PROFILE, CODES, SIZE = "pixels", "profile", "codes", "size"
 
 
-def heif_arrays(path: Path, limit_px: int) -> dict[str, np.ndarray]:
-    """The main image, upright, [H, W, C] uint8 or uint16, and its ICC profile or its colour's code points."""
+def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray]:
+    """The main image, upright, [H, W, C] uint8 or uint16, and its ICC profile or its colour's code points.
+
+    Of an image of more than `most_px` pixels only the size (W, H); over `limit_px` is a ValueError.
+    """
     import pi_heif
 
     image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
@@ -19,6 +22,8 @@ def heif_arrays(path: Path, limit_px: int) -> dict[str, np.ndarray]:
     if width * height > limit_px:
         most = f"at most {limit_px / 1e6:.0f} megapixels are read"
         raise ValueError(f"{width} x {height} pixels; {most}, so make it smaller")
+    if width * height > most_px:
+        return {SIZE: np.array([width, height])}
     pixels = np.asarray(image)
     arrays = {PIXELS: pixels.reshape(height, width, -1)}
     if profile := image.info.get("icc_profile"):

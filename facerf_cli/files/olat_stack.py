@@ -35,6 +35,9 @@ Format = Literal["facerf-olat-1"]
 FORMAT: Format = "facerf-olat-1"
 COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
 _LIGHT_BYTES = 6  # of a pixel: half floats
+_SUM_BYTES = 30  # of a pixel of a light that is summed: half floats, floats, and a copy of them
+_AT_ONCE = 16  # lights that are summed
+_OPEN = 256  # lights that are read before a stack is opened again
 _SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
 _MOST_PARTS = 4097  # 4096 lights and the source
 _MOST_HEADER_BYTES = 1 << 20  # of the JSON
@@ -178,6 +181,26 @@ def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None
         share = len(range(height)[rows]) / max(1, height)
         _ask_for(path, stream.spec(), len(range(content["lights"])[lights]), share)
         return _read_lights(path, stream, content, lights, rows)
+
+
+def stream_olats(path: Path) -> Iterator[Tensor]:
+    """Yield the OLATs of a stack of any length in batches [l, 3, H, W] float32, to be summed.
+
+    A batch has as many lights as fit half of the budget of memory, which is asked for one and the source.
+    """
+    with _opened(path) as stream:
+        spec, lights = stream.spec(), _header_of(path, stream.spec())["lights"]
+        size_px = spec.height * spec.width
+        what = f"{path}: lights of {spec.width} x {spec.height} pixels"
+        memory.require(what, size_px * (_SUM_BYTES + _SOURCE_BYTES), "a stack of fewer pixels")
+        fit = (memory.left_bytes() // 2 // size_px - _SOURCE_BYTES) // _SUM_BYTES
+        at_once = max(1, min(_AT_ONCE, fit))
+    for first in range(0, lights, _OPEN):  # OpenEXR holds some memory for each part that was read
+        with _opened(path) as stream:
+            content, last = _header_of(path, stream.spec()), min(first + _OPEN, lights)
+            for start in range(first, last, at_once):
+                some = slice(start, min(start + at_once, last))
+                yield _read_lights(path, stream, content, some).float()
 
 
 @contextmanager

@@ -1,38 +1,52 @@
 """Backgrounds of portraits: the part of an environment map that a camera sees."""
 
 import math
+from collections.abc import Callable
 
-import torch
+import numpy as np
 import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.light.envmap import look_up, mean_radiance
+from facerf_cli.strips import Computed, Rows, enlarged, whole
 
 _SHARP_PX = 3.0  # standard deviation of a blur up to which an image is drawn at its full size
 _TURN = 2 * math.pi
 
 
-def backdrop(envmap: Tensor, rays: Tensor, rotate_deg: float = 0.0, blur: float = 0.0) -> Tensor:
-    """The map [H, W, 3] seen along viewing rays [h, w, 3] of any length, camera space: radiance [h, w, 3].
+def backdrop(
+    envmap: Tensor,
+    size: tuple[int, int],
+    rays: Callable[[tuple[int, int], slice], Tensor],
+    rotate_deg: float = 0.0,
+    blur: float = 0.0,
+) -> Rows:
+    """The map [H, W, 3] in a frame of a size: radiance [h, w, 3], whose rows are computed as they are read.
 
+    `rays` gives viewing rays of any length, camera space, of some rows of the frame at another size.
     `rotate_deg` is added to every azimuth of the map; `blur` is the standard deviation of a lens's blur as a
     share of the longer side.
     """
-    size = (rays.shape[0], rays.shape[1])
     sigma_px = blur * max(size)
     scale = min(1.0, _SHARP_PX / sigma_px) if sigma_px else 1.0
-    small = (max(2, round(size[0] * scale)), max(2, round(size[1] * scale)))
-    towards = F.interpolate(rays.permute(2, 0, 1)[None], small, mode="area")[0].permute(1, 2, 0)
-    towards = F.normalize(towards, dim=-1)
-    step = float((towards[0, 0] - towards[-1, -1]).norm()) / math.hypot(*small)  # radians in a pixel
-    rows = max(16, round(_TURN / 2 / max(step, 1e-6)))
-    seen = look_up(mean_radiance(envmap, rows, rotate_deg), towards.reshape(-1, 3)).view(*small, 3)
-    if sigma_px:
-        sigma = sigma_px * small[1] / size[1]
-        seen = torch.from_numpy(gaussian_filter(seen.numpy(), (sigma, sigma, 0), mode="nearest"))
-    if small == size:
-        return seen
-    return F.interpolate(seen.permute(2, 0, 1)[None], size, mode="bilinear", align_corners=False)[0].permute(
-        1, 2, 0
-    )
+    small = max(2, round(size[0] * scale)), max(2, round(size[1] * scale))
+
+    def towards(rows: slice) -> Tensor:
+        return F.normalize(rays(small, rows), dim=-1)
+
+    first, last = (towards(slice(row, row + 1)) for row in (0, small[0] - 1))
+    step = float((first[0, 0] - last[0, -1]).norm()) / math.hypot(*small)  # radians in a pixel
+    mean = mean_radiance(envmap, max(16, round(_TURN / 2 / max(step, 1e-6))), rotate_deg)
+
+    def drawn(rows: slice) -> np.ndarray:
+        directions = towards(rows)
+        return look_up(mean, directions.reshape(-1, 3)).view(directions.shape).numpy()
+
+    sharp = Computed((*small, 3), drawn)
+    if not sigma_px:
+        return sharp
+    sigma = sigma_px * small[1] / size[1]
+    soft = gaussian_filter(whole(sharp), (sigma, sigma, 0), mode="nearest")
+    maps = soft.transpose(2, 0, 1)
+    return Computed((*size, 3), lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1))

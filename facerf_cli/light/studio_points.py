@@ -8,10 +8,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.light.blackbody import blackbody_rgb
-from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
+_AROUND = 48  # samples of a light from all around
 _NEAREST_M = 0.05  # distance below which a light does not grow any more
 _FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
 
@@ -24,7 +25,11 @@ def intensity_of(light: StudioLight) -> Tensor:
 
 def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     """Unit directions [n, 3] of a far light and its share [n] in each; a surface that faces it receives 1."""
-    assert light.azel_deg is not None
+    if light.azel_deg is None:
+        directions = rig_directions(_AROUND)
+        return directions, torch.full(
+            (_AROUND,), 4 / _AROUND
+        )  # the mean of a cosine over the sphere is 1 / 4
     middle = azel_to_direction(*light.azel_deg)
     if light.size_deg == 0:  # to the last bit
         return middle[None], torch.ones(1)

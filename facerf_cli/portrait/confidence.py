@@ -14,6 +14,7 @@ _SURE, _UNSURE = 0.6, 0.35  # least scores of the words
 _SMALL_PX, _LARGE_PX = 40.0, 160.0  # extents of a face that is too small, and large enough
 _NARROW, _FRONTAL = 0.15, 0.4  # distance of the eyes over the face's extent, in profile and from the front
 _OFF = 0.05  # expected error of the landmarks, in extents, at which they are worthless
+_BLURRED, _SHARP = 0.12, 0.24  # sharpness of a face without detail, and with enough of it
 SUPPORTED_YAW_DEG, _LOST_YAW_DEG = 45.0, 75.0  # turn of a head that the fit supports, and that it loses
 _COVERING = ("glasses", "hand", "headwear")
 
@@ -41,7 +42,7 @@ class Confidence:
 
 
 def confidence_in(face: FoundFace | FoundBox, yaw_deg: float = 0.0) -> Confidence:
-    """Rate a face: how sure its landmarks are, its size, its turn and what covers it.
+    """Rate a face: how sure its landmarks are, its size and sharpness, its turn and what covers it.
 
     `yaw_deg` is the turn of the head that was fitted to it.
     """
@@ -55,6 +56,7 @@ def confidence_in(face: FoundFace | FoundBox, yaw_deg: float = 0.0) -> Confidenc
         {
             "unclear": seen.presence * _ramp(seen.relative_error, _OFF, 0.3 * _OFF),
             "small": _ramp(extent_px, _SMALL_PX, _LARGE_PX),
+            "blurred": _ramp(seen.sharpness, _BLURRED, _SHARP),
             "profile": _ramp(eyes, _NARROW, _FRONTAL),
             "covered": _ramp(covered, 0.6, 0.1),
             "turned": _ramp(abs(yaw_deg), _LOST_YAW_DEG, SUPPORTED_YAW_DEG),

@@ -1,12 +1,13 @@
 """People in a photo: their faces, each with landmarks and how sure they are, and what is seen around them.
 
 dlib's HOG detector proposes squares, and so does the whole photo. The Parsing Network looks at each, and
-again at the face that it sees there, upright; what it is not sure of is dropped.
+again at the face that it sees there, upright, and at last from squares that differ a little; what it is not
+sure of is dropped.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,8 @@ LandmarksFrom = Literal["facerf", "dlib"]
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
+# Sides (in extents) and turns of further squares whose landmarks the last ones are averaged with.
+_MORE_SIDES, _MORE_TURNS_RAD = (1.5, 1.9), (0.12, -0.12)
 _BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
 _LEAST_PRESENCE = 0.5  # of a face
 _MOST_ERROR, _SURE_ERROR = 0.06, 0.018  # expected, of a face and of a sure one, in extents of the landmarks
@@ -127,7 +130,18 @@ def _refined(image: np.ndarray, seen: Seen) -> Seen | None:
         seen = look(image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
         if not _is_face(seen, image):
             return None
-    return seen if seen.relative_error <= _MOST_ERROR else None
+    if seen.relative_error > _MOST_ERROR:
+        return None
+    landmarks_px = seen.landmarks_px[:68]
+    others = (_around(landmarks_px, *pair) for pair in zip(_MORE_SIDES, _MORE_TURNS_RAD, strict=True))
+    return averaged([seen, *look(image, list(others))])
+
+
+def averaged(views: list[Seen]) -> Seen:
+    """The first view of a face, with the landmarks of all, weighed by the inverse squares of their errors."""
+    weights = np.stack([view.error_px**-2.0 for view in views])[..., None]
+    places = np.stack([view.landmarks_px for view in views])
+    return replace(views[0], landmarks_px=(weights * places).sum(0) / weights.sum(0))
 
 
 def _as_face(seen: Seen) -> FoundFace:
@@ -147,13 +161,13 @@ def _is_face(seen: Seen, image: np.ndarray) -> bool:
     return bool(seen.presence >= _LEAST_PRESENCE and inside)
 
 
-def _around(face: np.ndarray) -> Square:
-    """The square that shows a face with landmarks [68, 2] large and upright."""
+def _around(face: np.ndarray, sides: float = _FACE_SIDES, more_rad: float = 0.0) -> Square:
+    """The square that shows a face with landmarks [68, 2] large and upright, or turned a little more."""
     x_px, y_px = (face.min(0) + face.max(0)) / 2
     left, right = face[list(OUTER_EYE_CORNERS)]
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
     extent_px = float(np.ptp(face, axis=0).max())
-    return Square(float(x_px), float(y_px), _FACE_SIDES * max(extent_px, 1.0), turn_rad)
+    return Square(float(x_px), float(y_px), sides * max(extent_px, 1.0), turn_rad + more_rad)
 
 
 def _square(box_px: Box) -> Square:

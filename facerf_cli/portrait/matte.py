@@ -3,13 +3,10 @@
 import math
 
 import numpy as np
-import torch
-import torch.nn.functional as F
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
-from torch import Tensor
 
-from facerf_cli.strips import Rows, strips
+from facerf_cli.strips import Rows, between, enlarged, strips
 
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
@@ -104,19 +101,12 @@ class PersonColours:
 def _looked_up(maps: np.ndarray, y: np.ndarray, x: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """Values [N, C] of maps [h, w, C], enlarged to `size` as by `enlarged`, at rows y and columns x."""
     (top, bottom, down), (left, right, along) = (
-        _between(at, small, large) for at, small, large in zip((y, x), maps.shape, size, strict=False)
+        between(at, small, large) for at, small, large in zip((y, x), maps.shape, size, strict=False)
     )
     along = along[:, None]
     above = maps[top, left] + along * (maps[top, right] - maps[top, left])
     below = maps[bottom, left] + along * (maps[bottom, right] - maps[bottom, left])
     return np.asarray(above + down[:, None] * (below - above))
-
-
-def _between(at: np.ndarray, small: int, large: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Neighbours of large pixels among small ones, and the weight of the second one."""
-    place = ((at + 0.5) * (small / large) - 0.5).clip(0, small - 1)
-    first = place.astype(np.int64)
-    return first, (first + 1).clip(max=small - 1), (place - first).astype(np.float32)
 
 
 def shrunk(image: Rows, size: tuple[int, int]) -> np.ndarray:
@@ -152,12 +142,3 @@ def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.nda
     """Means [H, W, 3] over squares of `size` pixels, under weights [H, W]."""
     total = uniform_filter(colours * weight[..., None], (size, size, 1), mode="nearest")
     return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))
-
-
-def enlarged(maps: np.ndarray, size: tuple[int, ...], rows: slice = slice(None)) -> np.ndarray:
-    """Maps [C, h, w] at another size [C, H, W], or some rows of that."""
-    above, below, share = _between(np.arange(size[0])[rows], maps.shape[1], size[0])
-    tall = maps[:, above] + share[:, None] * (maps[:, below] - maps[:, above])
-    tensor: Tensor = torch.from_numpy(np.ascontiguousarray(tall, np.float32))[None]
-    wide = F.interpolate(tensor, size=(len(share), size[1]), mode="bilinear", align_corners=False)
-    return np.asarray(wide[0].numpy())

@@ -9,6 +9,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.strips import Computed, Rows, enlarged
 
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered
@@ -27,6 +28,12 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
     return _shown(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
+def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Rows:
+    """The same share [H, W] of the photo's own pixels, by the classes [C, h, w] of the whole photo."""
+    covered = _covering(classes)[None].numpy()
+    return Computed(size_px, lambda rows: _share_shown(enlarged(covered, size_px, rows)[0]))
+
+
 def _places(crop: Crop) -> np.ndarray:
     """Centres [S, S, 2] of a crop's pixels in the photo's."""
     centres = (np.arange(crop.size_px) + PIXEL_CENTRE) / crop.scale
@@ -35,9 +42,17 @@ def _places(crop: Crop) -> np.ndarray:
 
 def _shown(classes: Tensor, shares: np.ndarray) -> np.ndarray:
     """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
-    own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
-    covered = classes[~own].sum(0)
     grid = torch.from_numpy(2 * shares - 1).float()[None]
-    sampled = F.grid_sample(covered[None, None].float(), grid, align_corners=False)[0, 0]
+    sampled = F.grid_sample(_covering(classes)[None, None], grid, align_corners=False)[0, 0]
+    return _share_shown(sampled.numpy())
+
+
+def _covering(classes: Tensor) -> Tensor:
+    """Share [h, w] of what is not of the face, by classes [C, h, w]."""
+    own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
+    return classes[~own].sum(0).float()
+
+
+def _share_shown(covered: np.ndarray) -> np.ndarray:
     low, high = _SURE
-    return np.asarray((1 - (sampled - low) / (high - low)).clamp(0, 1).numpy())
+    return (1 - (covered - low) / (high - low)).clip(0, 1)

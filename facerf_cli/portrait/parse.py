@@ -21,6 +21,7 @@ from facerf_cli.strips import STRIP_PX, strips
 
 SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
 LANDMARKS = 68 + len(MORE_LANDMARKS)
+_POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
@@ -81,7 +82,8 @@ def _averaged(region: np.ndarray, step: int) -> np.ndarray:
 class Seen:
     """View of a square by the network: shares [C, S, S] of the classes; landmarks [N, 2] in the photo.
 
-    error_px [N] are the landmarks' expected errors; presence, in 0..1, says how surely a head is there.
+    error_px [N] are the landmarks' expected errors; presence, in 0..1, says how surely a head is there;
+    sharpness: see `sharpness_of`.
     """
 
     square: Square
@@ -89,6 +91,7 @@ class Seen:
     landmarks_px: np.ndarray
     error_px: np.ndarray
     presence: float
+    sharpness: float = 1.0
 
     @property
     def extent_px(self) -> float:
@@ -113,11 +116,30 @@ def parsing_network(path: Path = SHIPPED) -> ParsingNetwork:
     return network.eval()
 
 
+def sharpness_of(crops: Tensor) -> Tensor:
+    """Contrast of finest over that of coarser detail [B] in the middle of crops [B, 3, S, S].
+
+    In a square around a face of 256 pixels, 0.4 and more where it is in focus; 0.2 and 0.14 where its image
+    is blurred by a hundredth and a fiftieth of its extent (standard deviation), whatever it shows.
+    """
+    edge = crops.shape[-1] // 4 - _POOLED
+    grey = crops[..., edge:-edge, edge:-edge].mean(1, keepdim=True)
+    fine = _smooth(_smooth(grey, 1), 1)
+    bands = grey - fine, fine - _smooth(_smooth(fine, 4), 4)
+    high, low = (band[..., _POOLED:-_POOLED, _POOLED:-_POOLED].abs().mean((1, 2, 3)) for band in bands)
+    return high / low.clamp_min(1e-4)
+
+
+def _smooth(grey: Tensor, reach: int) -> Tensor:
+    return F.avg_pool2d(grey, 2 * reach + 1, 1, reach, count_include_pad=False)
+
+
 @torch.inference_mode()
 def look(image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False) -> list[Seen]:
     """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
     network = parsing_network()
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
+    sharpness = sharpness_of(crops)
     found: Parsing = network(crops)
     classes, places, log_error = found.classes, found.landmarks.double(), found.log_error.double()
     if mirrored:
@@ -132,6 +154,7 @@ def look(image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = Fal
             square.to_photo(places[index].numpy()),
             log_error[index].exp().numpy() * square.side_px,
             float(found.presence[index].sigmoid()),
+            float(sharpness[index]),
         )
         for index, square in enumerate(squares)
     ]

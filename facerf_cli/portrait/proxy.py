@@ -133,8 +133,9 @@ class Shadows:
         normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
         self.origins = (points + _OFF_M * normals).astype(np.float32)
         self._scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
-        count = len(self.origins)
-        self.numbers = np.random.default_rng(_SEED).random((_RAYS, 2, count, 1)).astype(np.float32)
+        # by pixel of the square, so that those of neighbouring frames of a shot are alike
+        numbers = np.random.default_rng(_SEED).random((_RAYS, 2, *self._inside.shape)).astype(np.float32)
+        self.numbers = numbers[:, :, self._inside][..., None]
         self._places = [places_on_disc(_RADIUS_DEG, *pair) for pair in self.numbers]
 
     def along(self, directions: Tensor) -> Tensor:

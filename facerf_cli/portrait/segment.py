@@ -1,6 +1,7 @@
 """Classes and matte of a person over the whole frame of a photo, as layers.
 
-The Parsing Network looks at the whole body and, for detail, at squares of several sizes around the head.
+The Parsing Network looks at the whole body and, for detail, at head and chest and at squares of several
+sizes around the head.
 """
 
 from collections.abc import Iterator, Mapping
@@ -10,23 +11,30 @@ from functools import cached_property
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import label
+from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.matte import enlarged, refine_matte, shrunk
+from facerf_cli.portrait.ears import with_ears
+from facerf_cli.portrait.matte import refine_matte, shrunk
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Computed, Rows, enlarged
 
-# Sides of the squares around the head and around the body, in extents of the landmarks, and how far their
-# centres lie above the middle of the landmarks. Views of squares of several sizes are averaged.
-_NEAR_SIDES, _NEAR_ABOVE = (1.8, 2.2, 3.2), 0.1
+# Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
+# centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
+# more, weigh more, by the inverse square of their sides.
+_NEAR_SIDES, _NEAR_ABOVE = (1.6, 2.2, 3.2), 0.1
+_CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
+# Lengths in extents of the landmarks: the line from the middle of the face down to the chest, and how far
+# from it all of the person counts as joined; half the width of a bridge that joins nobody; how far around the
+# middle of the face, and around the body, what is seen of the person is kept.
+_CHEST_BELOW, _WITHIN, _BRIDGE, _OF_HEAD, _OF_BODY = 1.5, 0.4, 0.06, 1.2, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,15 +88,20 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     """Shares [C, h, w] of the classes at a small size, which sum to 1; see `segment`."""
     height, width = image_srgb.shape[:2]
     body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
+    chest = _around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = _small_size(height, width)
-    wide, *close = look(image_srgb, [body, *near])
+    wide, middle, *close = (
+        (one, _over_photo(one, size, image_srgb.shape)) for one in look(image_srgb, [body, chest, *near])
+    )
     shares = torch.stack([_feather(square, size, image_srgb.shape) for square in near])
-    seen = torch.stack([_over_photo(one, size, image_srgb.shape) for one in close])
-    mean = (shares[:, None] * seen).sum(0) / shares.sum(0).clamp_min(1e-6)
-    largest = shares.amax(0)
-    classes = torch.lerp(_over_photo(wide, size, image_srgb.shape), mean, largest)
-    classes = _connected(classes, largest)
+    weights = shares * torch.tensor(_NEAR_SIDES)[:, None, None] ** -2.0
+    mean = (weights[:, None] * torch.stack([seen for _, seen in close])).sum(0)
+    classes = torch.lerp(wide[1], middle[1], _feather(chest, size, image_srgb.shape))
+    classes = torch.lerp(classes, mean / weights.sum(0).clamp_min(1e-6), shares.amax(0))
+    places_px = _places(size, image_srgb.shape)
+    classes = with_ears(classes, close[0][0], places_px)
+    classes = _of_one_person(classes, landmarks_px, places_px)
     return classes / classes.sum(0).clamp_min(1e-6)
 
 
@@ -149,13 +162,28 @@ def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> T
     return torch.from_numpy(inside.clip(0, 1)).float()
 
 
-def _connected(classes: Tensor, near: Tensor) -> Tensor:
-    """Classes without people who do not touch what is seen of this one in the near square."""
-    person = classes[0].numpy() < 0.5
-    parts, _ = label(person)
-    kept = np.unique(parts[person & (near.numpy() > 0.5)])
-    other = torch.from_numpy(person & ~np.isin(parts, kept))
-    return torch.where(other, _only_background(), classes)
+def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndarray) -> Tensor:
+    """Classes without what is not joined to face and chest, or by a thin bridge alone.
+
+    The pixels [h, w] of the classes lie at places [h, w, 2] in the photo.
+    """
+    face = _around(landmarks_px, 1, 0)
+    extent_px = max(face.side_px, 1e-6)
+    away = (places_px - (face.x_px, face.y_px)) / extent_px
+    apart = np.linalg.norm(away - [0, 1] * away.clip(0, _CHEST_BELOW), axis=-1)  # from the head's axis
+    pixel = float(np.ptp(places_px, axis=(0, 1)).max()) / max(1, max(apart.shape) - 1) / extent_px
+    person, middle = classes[0].numpy() < 0.5, apart < _WITHIN
+    inner = distance_transform_edt(np.pad(person, 1, "edge"))[1:-1, 1:-1] * pixel > _BRIDGE
+    parts, _ = label(inner | (person & middle))
+    joined = np.isin(parts, np.setdiff1d(np.unique(parts[middle]), [0]))
+    around = distance_transform_edt(~joined) * pixel if joined.any() else np.zeros_like(apart)
+    kept = np.maximum(_falling(np.linalg.norm(away, axis=-1), _OF_HEAD), _falling(around, _OF_BODY))
+    return torch.lerp(_only_background(), classes, torch.from_numpy(kept).float())
+
+
+def _falling(distance: np.ndarray, most: float) -> np.ndarray:
+    """1 up to a distance, 0 from one and a half times it on."""
+    return (3 - 2 * distance / most).clip(0, 1)
 
 
 def _only_background() -> Tensor:

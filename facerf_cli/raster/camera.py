@@ -55,6 +55,13 @@ def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tens
     return torch.stack([grid_x, grid_y], -1)
 
 
+def rays_of_rows(camera: Camera, size: tuple[int, int], rows: slice) -> Tensor:
+    """Viewing rays [n, w, 3] through pixels of some rows of the camera's image at another size (h, w)."""
+    y = (torch.arange(size[0])[rows] + PIXEL_CENTRE) * (camera.height_px / size[0])
+    x = (torch.arange(size[1]) + PIXEL_CENTRE) * (camera.width_px / size[1])
+    return pixel_rays(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1), camera)
+
+
 def pose_to_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Tensor:
     """Return head_to_camera = Rz(roll) Rx(pitch) Ry(yaw), [3, 3] float32.
 

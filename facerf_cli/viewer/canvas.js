@@ -84,13 +84,18 @@ class CanvasView {
     const { texture, around, mean, gain } = this.lit;
     const floor = this.data.person.detailFloor;
     const kept = texel(ownDetail, 0);
+    const sources = own.map((_, c) => texel(faceTexture, c));
+    const lightness = luminanceOf(own);
+    const noise = Math.max(1 - lightness / (NOISY * floor), 0);
+    const scale = lightness / Math.max(luminanceOf(sources), 1e-8);
     return own.map((value, c) => {
-      const source = texel(faceTexture, c);
+      const source = sources[c];
+      const steady = value + noise * (source * scale - value);
       const skin = texel(texture, c);
       const relit =
         value >= source
           ? (skin * (value + floor)) / (source + floor) + (mean[c] * floor * (value - source)) / (source + floor)
-          : (skin * value) / Math.max(source, 1e-8);
+          : skin * (steady / Math.max(source, 1e-8) + (value - steady) / (source + floor));
       const detailed = gain * (relit + kept * (texel(around, c) * value - relit));
       return person[c] + mask * (detailed - person[c]);
     });

@@ -1,6 +1,7 @@
 // The exposure of `facerf relight --exposure auto`: the face as bright as in the photo; and its view (colour.py).
 
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
+const NOISY = 2; // times the floor of the detail: the luminance below which colours are noise (composite.py)
 const BLACK = 1e-9;
 const SHOULDER = 0.8; // luminance from which on the soft view bends
 
@@ -19,11 +20,15 @@ class AutoExposure {
   }
 }
 
+function luminanceOf(rgb) {
+  return LUMINANCE[0] * rgb[0] + LUMINANCE[1] * rgb[1] + LUMINANCE[2] * rgb[2];
+}
+
 function luminances(planes, mask) {
   const values = [];
   const area = mask.length;
   for (let i = 0; i < area; i++) {
-    if (mask[i] > 0.5) values.push(LUMINANCE[0] * planes[i] + LUMINANCE[1] * planes[area + i] + LUMINANCE[2] * planes[2 * area + i]);
+    if (mask[i] > 0.5) values.push(luminanceOf([planes[i], planes[area + i], planes[2 * area + i]]));
   }
   return values;
 }

@@ -1,6 +1,7 @@
 // Textures of the face: of single lights by the decoder, of maps by factors; mixed with the portrait's.
 
 const PORTRAIT_SHARE = 0.25; // in the face, where the decoder's texture is finer
+const FACTOR_ERROR = 4; // of the factors' texels, in steps of their bytes; where it drowns the light, none of it is seen
 
 class Face {
   constructor(data, arrays, atlas, rig) {
@@ -40,7 +41,11 @@ class Face {
       if (known) this.addTexture(texture, known, rgb);
       else this.rig.coefficients(toward).forEach((value, k) => rgb.forEach((share, c) => (sums[3 * k + c] += share * value)));
     }
-    if (lights.some(({ known }) => !known)) this.addFactors(texture, sums);
+    this.noise = 0;
+    if (lights.some(({ known }) => !known)) {
+      this.addFactors(texture, sums);
+      this.noise = this.noiseOf(sums);
+    }
     return texture;
   }
 
@@ -75,6 +80,13 @@ class Face {
     }
   }
 
+  // The standard deviation of a texture's noise where the factors guess it.
+  noiseOf(sums) {
+    const { scales } = this.stage;
+    const power = sums.reduce((total, value, i) => total + (value * scales[Math.floor(i / 3)]) ** 2 / 3, 0);
+    return (FACTOR_ERROR * Math.sqrt(power)) / 127;
+  }
+
   // That texture mixed with the portrait's under shading and highlights [6, side, side].
   blended(texture, lit) {
     const { texels, side } = this;
@@ -87,7 +99,8 @@ class Face {
         const shading = sampledAt(lit, c * side * side, side, x, y);
         const shine = sampledAt(lit, (3 + c) * side * side, side, x, y);
         const own = (faceAlbedo[at] * shading + shine) * this.exposure;
-        texture[at] += PORTRAIT_SHARE * (own - texture[at]);
+        const drowned = Math.min(1, (this.noise / Math.max(own, texture[at], 1e-9)) ** 2); // by noise, as lights from behind are
+        texture[at] += (PORTRAIT_SHARE + (1 - PORTRAIT_SHARE) * drowned) * (own - texture[at]);
       }
     }
     return texture;

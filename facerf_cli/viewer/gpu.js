@@ -48,7 +48,10 @@ vec3 withFace(vec3 person, vec3 own, uvec4 seen) {
   vec3 skin = texture(face, vec3(uv, 0)).rgb;
   vec3 floored = vec3(detailFloor);
   vec3 brighter = skin * (own + floored) / (source.rgb + floored) + meanChange * floored * (own - source.rgb) / (source.rgb + floored);
-  vec3 darker = skin * own / max(source.rgb, 1e-8);
+  float lightness = dot(own, vec3(${LUMINANCE}));
+  vec3 around = source.rgb * lightness / max(dot(source.rgb, vec3(${LUMINANCE})), 1e-8);
+  vec3 steady = mix(own, around, max(1.0 - lightness / (${NOISY}.0 * detailFloor), 0.0));
+  vec3 darker = skin * (steady / max(source.rgb, 1e-8) + (own - steady) / (source.rgb + floored));
   vec3 relit = mix(darker, brighter, step(source.rgb, own));
   relit += source.a * (texture(face, vec3(uv, 1)).rgb * own - relit);
   return mix(person, relit, float(seen.z) / 65535.0);

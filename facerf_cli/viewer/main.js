@@ -1,5 +1,7 @@
 // The page: its data are decoded, then every change of the state is shown in the next frame.
 
+const NO_LIGHT = "No light is on: add a light, or choose an environment.";
+
 class Page {
   constructor(data, arrays, images) {
     this.photo = data.source;
@@ -58,6 +60,9 @@ class Page {
     this.view.light({ ...lit, gain: 2 ** this.ev });
     this.view.draw(state.background);
     document.body.dataset.settled = String(lit.exact);
+    const dark = !state.lights.length && !state.map;
+    if (dark) this.say(NO_LIGHT);
+    else if (byId("message").textContent === NO_LIGHT) this.say("");
     if (!lit.exact) field.refine(lights, state.map, state.rotate, () => this.show());
     this.ball.draw(state, this.ev);
     this.panel.update();
@@ -68,7 +73,7 @@ class Page {
 
   // Show the photo left of a division at so many percent; null: nowhere.
   compare(percent) {
-    for (const element of document.querySelectorAll("#before, #divider, #split, .tag")) element.hidden = percent === null;
+    for (const element of document.querySelectorAll("#before, #divider, #split, .left, .right")) element.hidden = percent === null;
     byId("before").style.clipPath = `inset(0 ${100 - percent}% 0 0)`;
     byId("divider").style.left = `${percent}%`;
     byId("split").value = percent;

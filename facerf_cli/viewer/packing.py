@@ -87,8 +87,9 @@ def packed(
 def _add_window(pack: ArrayPack, composition: Composition) -> list[int]:
     """Add where the face is in the photo: (u, v) and its soft mask; return left, top, width, height."""
     view = composition.view
-    planes = [view.uv[..., 0], view.uv[..., 1], view.mask * view.coverage]
-    steps = [np.round(plane.clamp(0, 1).numpy() * _STEPS_16).astype(np.uint16) for plane in planes]
+    mask = composition.face_share(slice(0, len(view.mask))) * view.coverage.numpy()
+    planes = [view.uv[..., 0].numpy(), view.uv[..., 1].numpy(), mask]
+    steps = [np.round(plane.clip(0, 1) * _STEPS_16).astype(np.uint16) for plane in planes]
     pack.add("window", np.stack(steps), "index")
     height, width = view.mask.shape
     return [view.left, view.top, width, height]

@@ -2,6 +2,8 @@
 
 const COARSE_DEG = 5;
 const QUARTER = 0.25;
+const PLACES = [[-60, 10], [40, 25], [145, 25], [-145, 25], [0, 80], [75, -10], [-90, 40], [0, -50], [180, 15]]; // of new lights
+const APART_DEG = 10;
 
 function byId(id) {
   return document.getElementById(id);
@@ -17,6 +19,9 @@ class Panel {
     this.connectFiles();
     this.connectDragging();
     document.addEventListener("keydown", (event) => this.key(event));
+    byId("hint").hidden = Boolean(location.hash);
+    const hide = () => (byId("hint").hidden = true);
+    for (const kind of ["pointerdown", "keydown"]) document.addEventListener(kind, hide, { once: true });
     document.addEventListener("keyup", (event) => event.key === " " && page.hold(false));
   }
 
@@ -102,8 +107,14 @@ class Panel {
     }
   }
 
-  add(azimuth = -60, elevation = 10) {
+  // Add a light, where no other one is.
+  add(azimuth, elevation) {
     if (this.state.lights.length >= MOST_LIGHTS) return;
+    if (azimuth === undefined) {
+      const near = (light, place) => Math.hypot(light.azimuth - place[0], light.elevation - place[1]) < APART_DEG;
+      const open = PLACES.filter((place) => !this.state.lights.some((light) => near(light, place)));
+      [azimuth, elevation] = open[0] ?? PLACES[0];
+    }
     this.state.lights.push(newLight(azimuth, elevation));
     this.change({ selected: this.state.lights.length - 1 });
   }

@@ -101,6 +101,7 @@ function lightText(light) {
 
 // The command lines that make the same image.
 function commandOf(state, photo, ev) {
+  if (!state.map && !state.lights.length) return "# add a light, or choose an environment";
   const lines = [];
   const both = Boolean(state.map) && state.lights.length > 0;
   let line = `facerf relight ${photo}`;

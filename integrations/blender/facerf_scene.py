@@ -3,8 +3,9 @@
     blender --python integrations/blender/facerf_scene.py -- me.exr sky.exr 30
 
 me.exr is an image of `facerf relight --background none --aov albedo,normal`; 30 is its --rotate. The portrait
-stands in the plane x, z and looks along -y. Its albedo and normals are layers of the file; Blender reads them
-by the Image node's Layer. World and plane agree with facerf: light from the image's right comes from +x.
+stands in the plane x, z and looks along -y. World and plane agree with facerf: light from the image's right
+comes from +x. Blender shows nothing of a file with several parts, so the image alone is written beside it, as
+me_rgba.exr; a layer is had by `oiiotool me.exr --subimage albedo -o albedo.exr`.
 """
 
 import math
@@ -33,16 +34,29 @@ def add_world(bpy: Any, envmap: Path, rotate_deg: float) -> None:
     output = nodes.new("ShaderNodeOutputWorld")
     mapping.vector_type = "POINT"
     mapping.inputs["Rotation"].default_value[2] = math.radians(world_turn_deg(rotate_deg))
-    picture.image = bpy.data.images.load(str(envmap))
+    picture.image = bpy.data.images.load(str(envmap.resolve()))
     links.new(coordinates.outputs["Generated"], mapping.inputs["Vector"])
     links.new(mapping.outputs["Vector"], picture.inputs["Vector"])
     links.new(picture.outputs["Color"], background.inputs["Color"])
     links.new(background.outputs["Background"], output.inputs["Surface"])
 
 
+def image_alone(path: Path) -> Path:
+    """The image of an EXR without its layers, in a file beside it; an image of one part is its own."""
+    import OpenImageIO as oiio  # comes with Blender
+
+    image = oiio.ImageBuf(str(path))
+    if image.nsubimages == 1:
+        return path
+    alone = path.with_name(f"{path.stem}_rgba.exr")
+    if not image.write(str(alone)):
+        raise SystemExit(f"{alone}: {image.geterror()}")
+    return alone
+
+
 def add_portrait(bpy: Any, image_path: Path, height_m: float = 0.5) -> Any:
     """Add the relit person, cut out, as an upright plane that gives off its own light."""
-    image = bpy.data.images.load(str(image_path))
+    image = bpy.data.images.load(str(image_alone(image_path).resolve()))
     width_m = height_m * image.size[0] / max(1, image.size[1])
     bpy.ops.mesh.primitive_plane_add(size=1.0, rotation=(math.pi / 2, 0.0, 0.0))
     plane = bpy.context.object
@@ -55,7 +69,7 @@ def add_portrait(bpy: Any, image_path: Path, height_m: float = 0.5) -> Any:
     texture, emission = nodes.new("ShaderNodeTexImage"), nodes.new("ShaderNodeEmission")
     clear, mix = nodes.new("ShaderNodeBsdfTransparent"), nodes.new("ShaderNodeMixShader")
     output = nodes.new("ShaderNodeOutputMaterial")
-    texture.image = image
+    texture.image, texture.extension = image, "CLIP"  # nothing of the other edge
     links.new(texture.outputs["Color"], emission.inputs["Color"])
     links.new(texture.outputs["Alpha"], mix.inputs[0])
     links.new(clear.outputs[0], mix.inputs[1])

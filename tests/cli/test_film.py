@@ -175,6 +175,48 @@ def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
     assert row["frames"] == [0, 1, 2] and row["residual"] < 0.3
 
 
+def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The second take is dark and mirrored; the film is stopped in it, and goes on."""
+    takes = [frame_of(0)] * 3 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 3
+    write_source(tmp_path / "cut.mp4", takes)
+    line = (tmp_path / "cut.mp4", "--light", "70,20", "--format", "png", *CHEAP)
+
+    def made(folder: str, *more: str) -> tuple[list[dict[str, Any]], list[float]]:
+        assert facerf(given, "relight", *line, "-o", tmp_path / folder, *more) == 0
+        track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:]
+        report = (tmp_path / folder / "report.jsonl").read_text().splitlines()
+        exposures = [next(iter(json.loads(row)["exposure_ev"].values())) for row in report]
+        return [json.loads(row) for row in track], exposures
+
+    rows, exposures = made("out")
+    assert [row.get("cut", False) for row in rows] == [False] * 3 + [True] + [False] * 2
+    assert "cut: cuts at frame 3:" in capsys.readouterr().err
+    places = np.array([np.mean(row["landmarks"], 0) for row in rows])
+    assert np.abs(np.diff(places[:3], axis=0)).max() < 1 > np.abs(np.diff(places[3:], axis=0)).max()
+    first, second = exposures[:3], exposures[3:]
+    assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
+    kept = (tmp_path / "out" / "cut_track.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "out" / "cut_track.jsonl").write_text("".join(kept[:5]))
+    again = made("out", "--overwrite", "always")[0]
+    assert [row.get("cut") for row in again] == [row.get("cut") for row in rows]
+    apart = [np.subtract(a["landmarks"], b["landmarks"]) for a, b in zip(again, rows, strict=True)]
+    assert np.abs(apart).max() < 0.5  # pixels: the track's are rounded
+    capsys.readouterr()
+    rows, exposures = made("one", "--no-cuts")
+    assert not any("cut" in row for row in rows) and len(set(exposures)) == 1
+    assert "cuts at" not in capsys.readouterr().err
+
+
+def test_each_take_has_its_light(given: Path, tmp_path: Path) -> None:
+    write_source(tmp_path / "cut.mp4", [frame_of(0)] * 2 + [np.ascontiguousarray(frame_of(0)[:, ::-1])] * 2)
+    out = tmp_path / "out"
+    assert facerf(given, "estimate-light", tmp_path / "cut.mp4", "--lights", "20", "-o", out) == 0
+    lights = {name for name in names(out) if name.endswith("_light.json")}
+    assert lights == {"cut_light.json", "cut_take2_light.json"}
+    (row,) = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    assert [take["frames"] for take in row["takes"]] == [[0, 1], [2, 3]]
+
+
 def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert main(["segment", str(given / "me.mp4"), "-o", str(out)]) == 0

@@ -156,6 +156,18 @@ def test_unchanged_files_are_not_read_again(
     assert read == []
 
 
+def test_a_finished_folder_is_read_without_writing_its_index(photos: Path, tmp_path: Path) -> None:
+    """So that a rerun of thousands of items is quick; a file whose time changed is noted."""
+    run([photos], tmp_path / "out")
+    index = tmp_path / "out/.facerf-index.jsonl"
+    inode = index.stat().st_ino
+    run([photos], tmp_path / "out")
+    assert index.stat().st_ino == inode
+    os.utime(next(photos.glob("*")), (1, 1))
+    run([photos], tmp_path / "out")
+    assert index.stat().st_ino != inode and "1000000000" in index.read_text()
+
+
 def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run([photos], tmp_path / "out")
     index = tmp_path / "out" / ".facerf-index.jsonl"

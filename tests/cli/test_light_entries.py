@@ -25,6 +25,7 @@ def test_a_light_by_its_keys() -> None:
     assert single("from=40,20; kelvin=5600 ;stops=-1;size_deg=30") == far
     assert single("az=40;el=20;kelvin=5600;stops=-1;size_deg=30") == far
     assert single("az=40") == single("40,0") and single("el=20") == single("0,20")
+    assert single("from=around;stops=-3") == StudioLight(stops=-3.0)
     assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
 
 
@@ -90,7 +91,9 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
         ("az=0:90:0", "az '0:90:0': give degrees"),
         ("az=0:90:2;el=0:9:3", "give one N"),
         ("el=0:200:4", "the elevation is out of range"),
-        ("from=0:90:3,10", "from '0:90:3,10': give AZ,EL"),
+        ("from=0:90:3,10", "from '0:90:3,10': give AZ,EL or around"),
+        ("from=around;size_deg=3", "a light from all around has no size; leave size_deg out"),
+        ("from=around;az=3", "give one of at=X,Y,Z"),
         ("name=;at=0,0,1", "'': give each light a name of its own"),
         ("name=a b;at=0,0,1", "'a b': give each light a name"),
         ("=40,20", "'': give each light a name"),

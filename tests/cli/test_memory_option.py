@@ -6,7 +6,7 @@ import pytest
 from skimage.data import astronaut
 
 from facerf_cli import memory
-from facerf_cli.cli.batch import _Work
+from facerf_cli.cli.batch import Outcome, _Work
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings
 from facerf_cli.files.images import write_display
@@ -50,6 +50,14 @@ def test_jobs_have_a_share_each_unless_one_is_given(monkeypatch: pytest.MonkeyPa
     work = _Work(lambda item: seen.append(memory.limit_bytes()), False, 12345)  # type: ignore[arg-type]
     work(Item(Path("a"), Path("a"), "a"))
     assert seen == [12345]
+
+
+def test_an_item_gives_its_memory_back_however_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[str] = []
+    monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
+    for process in (lambda item: Outcome([]), lambda item: 1 / 0):
+        _Work(process, False, 1 << 30)(Item(Path("a"), Path("a"), "a"))
+    assert given == ["back", "back"]
 
 
 def test_it_may_stand_before_or_after_the_verb() -> None:

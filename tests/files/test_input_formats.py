@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES
 from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError
@@ -113,6 +114,14 @@ def test_a_heic_under_another_name_and_a_broken_one(tmp_path: Path) -> None:
         read_image(tmp_path / "text.heic")
     with pytest.raises(InputError, match="48 x 64 pixels; at most"):
         read_image(HEIC, limit_px=1000)
+
+
+def test_a_heic_beyond_the_budget_is_refused_as_others_are() -> None:
+    memory.set_limit(48 * 64 * 24 - 1)
+    with pytest.raises(
+        InputError, match=r"phone\.heic: \d+ x \d+ pixels: needs \S+ GB of memory, .* --memory"
+    ):
+        read_image(HEIC)
 
 
 def test_without_pi_heif_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

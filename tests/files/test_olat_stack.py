@@ -1,6 +1,7 @@
 """OLAT stacks: what is written comes back, other programs open it, and what is no stack is refused."""
 
 import json
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -21,6 +22,7 @@ from facerf_cli.files.olat_stack import (
     read_olat_header,
     read_olat_stack,
     read_olats,
+    stream_olats,
     write_olat_stack,
 )
 
@@ -154,6 +156,18 @@ def test_the_budget_of_memory_bounds_lights_and_source(path: Path) -> None:
     for read in (read_olat_header, read_olats):
         with pytest.raises(InputError, match="of memory"):
             read(path)
+
+
+def test_a_stack_is_summed_in_batches_of_half_the_budget(path: Path) -> None:
+    """A light that is summed takes 30 bytes a pixel, the source 100; one light is the least."""
+    every, size_px = read_olats(path).float(), math.prod(read_olats(path).shape[2:])
+    for limit, first in ((1 << 40, LIGHTS), (size_px * 2 * (100 + 2 * 30), 2), (size_px * 130, 1)):
+        memory.set_limit(limit)
+        batches = list(stream_olats(path))
+        assert len(batches[0]) == first and torch.equal(torch.cat(batches), every)
+    memory.set_limit(size_px * 130 - 1)
+    with pytest.raises(InputError, match=r"lights of .* pixels: needs .* fewer pixels"):
+        next(stream_olats(path))
 
 
 def test_a_part_without_direction_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,10 +9,11 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.sphere import azel_to_direction, direction_to_uv, rig_directions
 
@@ -89,12 +90,27 @@ def test_blender_looks_where_facerf_looks(azimuth: float, elevation: float, rota
     assert abs(v - float(wanted[1])) < 1e-6
 
 
+def test_blender_is_given_the_image_without_its_layers(tmp_path: Path) -> None:
+    """Of an EXR with several parts Blender has an image of 0 x 0 pixels, which shows nothing."""
+    scene = module_of("integrations/blender/facerf_scene.py")
+    random = np.random.default_rng(1)
+    image, matte = random.random((8, 6, 3)).astype(np.float32), np.ones((8, 6), np.float32)
+    write_exr(tmp_path / "me.exr", image, matte, {"albedo": image, "person.A": matte})
+    alone = scene.image_alone(tmp_path / "me.exr")
+    assert alone.name == "me_rgba.exr" and oiio.ImageBuf(str(alone)).nsubimages == 1
+    np.testing.assert_allclose(read_image(alone).pixels, image, atol=1e-3)
+    assert scene.image_alone(alone) == alone
+
+
 def test_a_scene_is_built_where_blender_is_installed(tmp_path: Path) -> None:
     bpy = pytest.importorskip("bpy", reason="Blender's bpy is not installed")
     scene = module_of("integrations/blender/facerf_scene.py")
-    write_exr(tmp_path / "me.exr", np.ones((8, 6, 3), np.float32), np.ones((8, 6), np.float32))
+    image, matte = np.ones((8, 6, 3), np.float32), np.ones((8, 6), np.float32)
+    write_exr(tmp_path / "me.exr", image, matte, {"albedo": image})
     scene.add_world(bpy, ROOT / "examples/maps/studio.exr", 30.0)
-    assert scene.add_portrait(bpy, tmp_path / "me.exr").dimensions[0] > 0
+    portrait = scene.add_portrait(bpy, tmp_path / "me.exr", 0.5)
+    bpy.context.view_layer.update()
+    assert tuple(portrait.dimensions[:2]) == pytest.approx((0.375, 0.5))
 
 
 def test_the_dockerfile_copies_what_is_there() -> None:

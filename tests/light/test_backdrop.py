@@ -1,19 +1,19 @@
 """The background of a map, as a camera that looks down -z sees it."""
 
+from functools import partial
+
 import numpy as np
 import torch
 
 from facerf_cli.light.backdrop import backdrop
 from facerf_cli.light.sphere import direction_to_uv
-from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays
+from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays, rays_of_rows
+from facerf_cli.strips import whole
 
 
 def seen(envmap: torch.Tensor, rotate_deg: float = 0.0, blur: float = 0.0) -> np.ndarray:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
-    pixels: np.ndarray = backdrop(
-        envmap, pixel_rays(pixel_centres_px(camera), camera), rotate_deg, blur
-    ).numpy()
-    return pixels
+    return whole(backdrop(envmap, (40, 60), partial(rays_of_rows, camera), rotate_deg, blur))
 
 
 def dot(direction: tuple[float, float, float]) -> torch.Tensor:
@@ -50,3 +50,18 @@ def test_radiance_is_kept_and_blur_spreads_it() -> None:
     sharp, soft = seen(dot((0.0, 0.0, -1.0))), seen(dot((0.0, 0.0, -1.0)), blur=0.1)
     assert soft.shape == sharp.shape == (40, 60, 3) and soft.max() < 0.5 * sharp.max()
     np.testing.assert_allclose(soft.mean(), sharp.mean(), rtol=0.25)
+
+
+def test_rays_of_rows_are_those_of_the_whole_image() -> None:
+    camera = Camera(60.0, 60, 40, 30.0, 20.0)
+    every = pixel_rays(pixel_centres_px(camera), camera)
+    assert torch.equal(rays_of_rows(camera, (40, 60), slice(8, 21)), every[8:21])
+    halved = every.view(20, 2, 30, 2, 3).mean((1, 3))  # rays are linear in the pixels
+    torch.testing.assert_close(rays_of_rows(camera, (20, 30), slice(0, 20)), halved)
+
+
+def test_rows_of_a_background_are_those_of_the_whole() -> None:
+    camera = Camera(60.0, 60, 40, 30.0, 20.0)
+    for blur in (0.0, 0.02, 0.1):
+        rows = backdrop(dot((0.0, 0.0, -1.0)), (40, 60), partial(rays_of_rows, camera), blur=blur)
+        np.testing.assert_allclose(rows[8:21], whole(rows)[8:21], rtol=1e-6)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from facerf_cli.colour import REC709_CHROMATICITIES, luminance, rgb_to_xyz
 from facerf_cli.light.blackbody import blackbody_rgb
-from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import PointLights, far_samples, intensity_of
 
@@ -64,6 +64,13 @@ def test_a_soft_far_light_is_as_strong_as_a_hard_one(size_deg: float) -> None:
     torch.testing.assert_close(torch.nn.functional.normalize(shares @ directions, dim=0), middle)
     widest = math.degrees(math.acos(min(1.0, float((directions @ middle).min()))))
     assert size_deg / 3 <= widest <= 0.75 * size_deg + 0.1  # of a square: toward its corners
+
+
+def test_light_from_around_reaches_every_surface_alike() -> None:
+    directions, shares = far_samples(StudioLight())
+    facing = rig_directions(200)
+    received = ((facing @ directions.T).clamp_min(0) * shares).sum(1)
+    torch.testing.assert_close(received, torch.ones(200), rtol=0.02, atol=0)  # 48 samples of the sphere
 
 
 def test_stops_double_and_colours_multiply() -> None:

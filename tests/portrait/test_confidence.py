@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import skimage.data
 import torch
+from scipy.ndimage import gaussian_filter
 
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.portrait.confidence import Confidence, confidence_in
-from facerf_cli.portrait.find import FoundFace
+from facerf_cli.portrait.find import FoundFace, detect_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square
 from tests.portrait.seen import places, seen_of
 
@@ -43,6 +45,7 @@ def test_a_good_face_is_sure() -> None:
         ("unclear", face(presence=0.2)),
         ("profile", face(turned=0.2)),
         ("covered", face(covered=True)),
+        ("blurred", replace(face(), seen=replace(face().seen, sharpness=0.13))),
     ],
 )
 def test_what_makes_a_photo_hard_is_named(reason: str, hard: FoundFace) -> None:
@@ -60,3 +63,14 @@ def test_the_words_follow_the_score() -> None:
     words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
     assert words == ["sure", "unsure", "doubtful"]
     assert Confidence({"small": 0.5, "profile": 0.5}).score == pytest.approx(0.25)
+
+
+def test_a_blurred_photo_is_doubtful_and_says_why() -> None:
+    photo = skimage.data.astronaut()[:300, 60:360].astype(np.float32)
+    (sharp,) = detect_faces(photo.astype(np.uint8))
+    assert isinstance(sharp, FoundFace) and confidence_in(sharp).factors["blurred"] == 1
+    blurs = [0.01 * sharp.seen.extent_px, 0.02 * sharp.seen.extent_px]
+    found = [detect_faces(gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0] for blur in blurs]
+    little, much = (confidence_in(one) for one in found if isinstance(one, FoundFace))
+    assert little.factors["blurred"] > 0.5 > much.factors["blurred"]
+    assert much.word != "sure" and much.reason == "blurred"

@@ -1,6 +1,7 @@
 """Faces are found in small, dark, turned and large images and in tight crops; by facerf and by dlib."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.dlib_landmarks import predictor_path
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
-from facerf_cli.portrait.find import detect_faces, find_faces
+from facerf_cli.portrait.find import averaged, detect_faces, find_faces
+from facerf_cli.portrait.parse import LANDMARKS, Square
+from tests.portrait.seen import seen_of
 
 PHOTO = skimage.data.astronaut()[:400, 40:400]  # not square
 INNER = slice(len(CONTOUR), None)
@@ -138,3 +141,14 @@ def test_without_the_extra_only_its_option_fails(monkeypatch):
 
 def test_the_predictor_is_found_without_importing_its_package():
     assert predictor_path().is_file()
+
+
+def test_views_are_weighed_by_what_is_expected_of_them():
+    first = seen_of(Square(50, 50, 100), {})
+    sure = replace(
+        first, landmarks_px=first.landmarks_px + np.array([3, 0]), error_px=np.full(LANDMARKS, 1.0)
+    )
+    unsure = replace(first, error_px=np.full(LANDMARKS, 2.0))
+    found = averaged([unsure, sure])
+    assert np.allclose(found.landmarks_px - first.landmarks_px, [2.4, 0])  # weights 1/4 and 1
+    assert found.square == first.square and np.allclose(found.error_px, 2)

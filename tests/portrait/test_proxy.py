@@ -129,3 +129,17 @@ def test_all_lights_share_one_scene_and_one_view(monkeypatch: pytest.MonkeyPatch
     assert calls == ["view", "scene"]
     torch.testing.assert_close(at_once, torch.cat([shadows.along(light[None]) for light in lights]))
     assert len(calls) == 2
+
+
+def test_rays_of_a_pixel_are_those_of_the_frame_before() -> None:
+    """Hair that grows covers more pixels; the numbers of the others stay, or their shadows would flicker."""
+    camera = square_camera(fit(), SQUARE)
+    numbers = []
+    for hair_px in (20.0, 34.0):
+        shadows = Shadows(proxy(hair_px=hair_px), camera)
+        placed = np.full((*shadows.numbers.shape[:2], SIDE, SIDE), np.nan)
+        placed[:, :, shadows.covered.numpy() > 0] = shadows.numbers[..., 0]
+        numbers.append(placed)
+    both = np.isfinite(numbers[0]) & np.isfinite(numbers[1])
+    assert np.isfinite(numbers[1]).sum() > np.isfinite(numbers[0]).sum()
+    np.testing.assert_array_equal(numbers[0][both], numbers[1][both])

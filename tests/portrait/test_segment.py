@@ -86,3 +86,40 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
     found = Segmentation(classes, np.full((16, 16), 0.5, np.float32))
     total = sum(whole(found.layer(name)) for name in CLASSES[1:])
     assert np.allclose(total, 0.5, atol=1e-6) and whole(found.layer("hair")).min() > 0.4
+
+
+def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+        found = []
+        for square in wanted:
+            x, y = photo_share(square)
+            head = (x - 160).square() + (y - 70).square() < 40**2
+            body = ((x - 160).abs() < 50) & (y > 105)
+            flag = (x < 70) & (y > 150)
+            bridge = (x < 160) & ((y - 180).abs() < 2.6)
+            strand = ((x - 210).square() + (y - 70).square()) < 4**2
+            found.append(seen_of(square, {"garment": body | flag | bridge, "skin": head, "hair": strand}))
+        return found
+
+    monkeypatch.setattr(module, "look", look)
+    classes = module.seen_classes(photo(), FACE)
+    matte = 1 - classes[0]
+    assert matte[200, 30] < 0.05 and matte[70, 160] > 0.9 and matte[220, 160] > 0.9
+    assert matte[70, 209] > 0.5
+
+
+def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+        smallest = min(square.side_px for square in wanted)
+        everywhere = torch.ones_like(places()[0], dtype=torch.bool)
+        return [
+            seen_of(square, {"skin" if square.side_px == smallest else "neck": everywhere})
+            for square in wanted
+        ]
+
+    monkeypatch.setattr(module, "look", look)
+    at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
+    assert at_face[CLASSES.index("skin")] == pytest.approx(0.562, abs=0.01)  # 1.6^-2 over the sum
+    assert at_face[CLASSES.index("neck")] > 0.4

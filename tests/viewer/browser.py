@@ -10,6 +10,7 @@ import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,28 @@ async function drive() {
   document.body.append(out);
 }
 addEventListener("load", drive);
+"""
+_WAITERS = """
+const waiting = setInterval(() => {}, 20); // without a timer, virtual time runs out before the next frame
+const settled = () => new Promise((done) => {
+  const look = () => (document.body.dataset.settled === "true" ? done() : setTimeout(look, 20));
+  look();
+});
+const frames = async (count) => {
+  for (let i = 0; i < count; i++) await new Promise((done) => requestAnimationFrame(done));
+};
+addEventListener("load", async () => {
+  await settled();
+  const results = await (async () => {
+"""
+_END = """
+  })().catch((error) => ({ error: String(error) }));
+  const out = document.createElement("pre");
+  out.id = "results";
+  out.textContent = JSON.stringify(results);
+  document.body.append(out);
+  clearInterval(waiting);
+});
 """
 
 
@@ -88,6 +111,25 @@ def drawn(page: str, addresses: Sequence[str], folder: Path, *options: str) -> l
     for first in range(0, len(addresses), _AT_ONCE):
         found += _drawn_at_once(page, addresses[first : first + _AT_ONCE], folder, *options)
     return found
+
+
+def driven(page: str, script: str, folder: Path) -> Any:
+    """What a script, the body of an async function, returns in a page once it has settled.
+
+    It has `settled()` and `frames(n)` to wait with.
+    """
+    document = dumped(with_script(page, _WAITERS + script + _END), folder)
+    found = re.search(r'<pre id="results">(.*?)</pre>', document, re.S)
+    if found is None:
+        pytest.skip("chromium runs no page here")
+    results = json.loads(html.unescape(found[1]))
+    assert not (isinstance(results, dict) and "error" in results), results["error"]
+    return results
+
+
+def image_of(address: str) -> np.ndarray:
+    """The pixels [H, W, 4] in 0..255 of a PNG as an address (data:)."""
+    return _pixels(address)
 
 
 def _drawn_at_once(page: str, addresses: Sequence[str], folder: Path, *options: str) -> list[Drawn]:

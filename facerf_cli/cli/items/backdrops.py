@@ -1,16 +1,22 @@
 """Backgrounds of relit photos: images [H, W, 3] behind a person, for each light setup."""
 
+from functools import partial
+
 import numpy as np
 import torch
 import torch.nn.functional as F
 
+from facerf_cli import memory
 from facerf_cli.cli.backgrounds import BackgroundChoice
 from facerf_cli.cli.items.light_weights import read_map
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.files.images import read_image
 from facerf_cli.light.backdrop import backdrop
-from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays
+from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.strips import Computed, Rows
+
+_HELD_BYTES = 24  # of a pixel of the photo: it, its matte and the view of its face
+_COVER_BYTES = 12  # of a pixel of the frame, which an image covers
 
 
 class Backdrops:
@@ -18,7 +24,7 @@ class Backdrops:
 
     def __init__(self, choice: BackgroundChoice, blur: float, camera: Camera) -> None:
         self._choice, self._blur, self._camera = choice, blur, camera
-        self._fixed = _fixed(choice, camera.height_px, camera.width_px)
+        self._fixed = _fixed(choice, camera)
 
     def behind(self, setup: LightSetup, ev: float) -> Rows | None:
         """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
@@ -31,15 +37,25 @@ class Backdrops:
             return None if fixed is None else Computed(fixed.shape, lambda rows: fixed[rows] * gain)
         if setup.envmap is None:
             return np.broadcast_to(np.float32(0), (self._camera.height_px, self._camera.width_px, 3))
-        rays = pixel_rays(pixel_centres_px(self._camera), self._camera)
-        seen: np.ndarray = backdrop(read_map(setup.envmap), rays, setup.rotate_deg, self._blur).numpy()
-        return seen
+        with memory.beside(_held_bytes(self._camera)):
+            envmap = read_map(setup.envmap)
+        size = self._camera.height_px, self._camera.width_px
+        return backdrop(envmap, size, partial(rays_of_rows, self._camera), setup.rotate_deg, self._blur)
 
 
-def _fixed(choice: BackgroundChoice, height: int, width: int) -> np.ndarray | None:
+def _held_bytes(camera: Camera) -> int:
+    """Memory of the photo that is held while a background is read."""
+    return _HELD_BYTES * camera.height_px * camera.width_px
+
+
+def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
+    height, width = camera.height_px, camera.width_px
     if choice.colour is not None:
         return np.broadcast_to(np.array(choice.colour, np.float32), (height, width, 3))
-    return None if choice.path is None else _covering(read_image(choice.path, None).pixels, height, width)
+    if choice.path is None:
+        return None
+    with memory.beside(_held_bytes(camera) + _COVER_BYTES * height * width):
+        return _covering(read_image(choice.path, None).pixels, height, width)
 
 
 def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -113,7 +113,7 @@ def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Ten
     """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
     for row, setup in enumerate(setups):
         for light in setup.lights:
-            if light.azel_deg is not None:
+            if light.at_m is None:
                 towards, shares = far_samples(light)
                 yield row, towards, shares[:, None] * intensity_of(light)
 

@@ -19,7 +19,7 @@ from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.strips import Rows, whole
 
 Exposure = float | Literal["auto"]
-_HELD = 3  # of an image: beside the photo, its matte and what else is as large
+_HELD = 1  # of an image: the photo; a writer of each format may hold as much as an image
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -52,7 +52,7 @@ def write_output(
     """Write an image in every format, at the same time, under `path` with the suffix of each."""
     space, view = _space_of(options), _view_of(options)
     if len(options.formats) > 1:
-        image = _held(image)
+        image = _held(image, len(options.formats))
 
     def write(name: Format) -> None:
         target = path.with_suffix(SUFFIXES[name])
@@ -70,10 +70,10 @@ def write_output(
         list(pool.map(write, options.formats))
 
 
-def _held(image: OutputImage) -> OutputImage:
-    """The image with its pixels computed once for all formats, where that fits the budget of memory."""
-    bytes_each = 4 * math.prod(image.pixels.shape)
-    return replace(image, pixels=whole(image.pixels)) if memory.limit_bytes() > _HELD * bytes_each else image
+def _held(image: OutputImage, formats: int) -> OutputImage:
+    """The image with its pixels computed once for all formats, where they and the writers fit the budget."""
+    needed = (_HELD + formats) * 4 * math.prod(image.pixels.shape)
+    return replace(image, pixels=whole(image.pixels)) if memory.limit_bytes() > needed else image
 
 
 def _space_of(options: OutputOptions) -> ColourSpace:

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from facerf_cli.cli.items.photos import (
     read_matte,
     read_photo,
 )
-from facerf_cli.cli.items.shot_frames import seen_frame, view_of
+from facerf_cli.cli.items.shot_frames import seen_frame, takes_with_face, view_of
 from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import InputError
@@ -45,13 +46,25 @@ def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
         feature_network(options.vgg_weights)
 
 
-def write_shot_light(shot: Shot, item: Item, options: LightOptions, width_px: int, sh_order: int) -> Any:
-    """Estimate and write the one light of a shot, from key frames together; facts for the report."""
-    view = view_of(shot, options.photo)
-    number, *others = view.middle_first
-    image, face = seen_frame(shot, number, options.photo, portrait=False)
-    more = [view.head(frame) for frame in others]
-    return _write(item, image, face, options, width_px, sh_order, more) | {"frames": view.key_frames}
+def write_shot_light(
+    shot: Shot, item: Item, options: LightOptions, width_px: int, sh_order: int
+) -> tuple[list[str], Any]:
+    """Estimate and write the one light of each take of a shot; their tags, and facts for the report.
+
+    A light is estimated from key frames together. Takes that do not show the face have none.
+    """
+    tags: list[str] = []
+    facts: list[dict[str, Any]] = []
+    for take in takes_with_face(shot):
+        view = view_of(shot, take.start, options.photo)
+        number, *others = view.middle_first
+        image, face = seen_frame(shot, number, options.photo, portrait=False)
+        face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
+        more = [view.head(frame) for frame in others]
+        found = _write(item, image, face, options, width_px, sh_order, more)
+        tags.append(face.tag)
+        facts.append(found | {"frames": view.key_frames})
+    return tags, facts[0] if len(facts) == 1 else {"takes": facts}
 
 
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.companions import companion
 from facerf_cli.cli.options import torch_device
@@ -32,6 +33,7 @@ from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
 from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
+_PHOTO_BYTES = 12  # of a pixel of the photo that is held
 _KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
 LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
@@ -211,7 +213,8 @@ def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
     """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
     path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
-    image = read_image(path, "linear")
+    with memory.beside(_PHOTO_BYTES * math.prod(size_px)):
+        image = read_image(path, "linear")
     matte = image.pixels.mean(-1) if image.alpha is None else image.alpha
     if matte.shape != tuple(size_px):
         height, width = matte.shape

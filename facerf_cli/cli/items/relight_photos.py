@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol, cast
 
@@ -46,14 +47,15 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, read_image
-from facerf_cli.files.olat_stack import OlatStack, is_olat_stack, read_olat_stack
+from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
-from facerf_cli.strips import Rows
+from facerf_cli.strips import Computed, Rows
 
 _HELD = 4  # relit textures are held this many times while lights are added to them
-_LIGHTS_AT_ONCE = 16  # of a stack, made floats
+_STACK_BYTES = 130  # of a pixel of a stack, beside its photo
+_KEPT_PX = 12  # bytes of a pixel beside that photo: an image computed once for several formats
 log = logging.getLogger(LOGGER_NAME)
 _of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
@@ -98,6 +100,7 @@ def _is_stack(item: Item) -> bool:
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
+    weights_over_rig(work.setups, work.rig, work.sampling)  # maps are read before the photo, not beside it
     image, faces = _seen(item, work)
     metadata = _metadata(item, work)
     chosen_ev = _shared_exposures(item, work)
@@ -125,7 +128,7 @@ def _leader_of(item: Item, work: Relight) -> Item | None:
     place = shot_of(work.shots, item)
     if place is None:
         return work.leader_of(item)
-    return place[0].frames[view_of(place[0], work.photo).middle_first[0]]
+    return place[0].frames[view_of(*place, work.photo).middle_first[0]]
 
 
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
@@ -252,38 +255,37 @@ def _show_stack(item: Item, work: Relight) -> tuple[_Shown, dict[str, Any], dict
         raise InputError(f"{item.input_path}: a stack holds the field as predicted; give its photo")
     if near_lights_of(work.setups) is not None:
         raise InputError(f"{item.input_path}: a stack holds far lights; for near ones (at=) give its photo")
-    stack = read_olat_stack(item.input_path)
+    header = read_olat_header(item.input_path)
+    directions = torch.from_numpy(header.directions).float()
+    weights = weights_over_stack(work.setups, directions, work.sampling)
     composer: Composer
     backdrops: Backdrops | None = None
-    if stack.header.kind == "photo":
-        composer, backdrops, facts = _person_composer(item, stack, work)
+    if header.kind == "photo":
+        composer, backdrops, facts = _person_composer(item, header, work)
     elif work.photo_of_stack is not None:
         raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
     else:
-        composer, facts = _stack_composer(item, stack, work)
-    directions = torch.from_numpy(stack.header.directions).float()
-    weights = weights_over_stack(work.setups, directions, work.sampling)
+        composer, facts = _stack_composer(item, header, work)
+
+    def summed(weights: torch.Tensor) -> list[Relit]:
+        return list(map(Relit, weighted_sum(stream_olats(item.input_path), weights)))
 
     def relit(rows: slice) -> list[Relit]:
-        batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
-        return list(map(Relit, weighted_sum(batches, weights[rows])))
-
-    metadata = attributes_of_sum(stack.header.metadata, item.input_path.name)
-    bytes_each = 12 * stack.header.seen.size
+        return summed(weights[rows])
 
     def apart(setup: LightSetup) -> list[Relit]:
-        batches = (half.float() for half in torch.split(stack.olats, _LIGHTS_AT_ONCE))
-        weights = weights_over_stack(_each_light(setup), directions, work.sampling)
-        return list(map(Relit, weighted_sum(batches, weights)))
+        return summed(weights_over_stack(_each_light(setup), directions, work.sampling))
+
+    metadata = attributes_of_sum(header.metadata, item.input_path.name)
+    bytes_each = 12 * header.seen.size
 
     return _Shown(composer, relit, apart, bytes_each, backdrops=backdrops), dict(metadata), facts
 
 
 def _person_composer(
-    item: Item, stack: OlatStack, work: Relight
+    item: Item, header: StackHeader, work: Relight
 ) -> tuple[PersonStack, Backdrops | None, dict[str, Any]]:
     """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
-    header = stack.header
     try:
         fit = fit_from_arrays(header.fit)
     except (ValueError, TypeError, KeyError) as error:
@@ -295,7 +297,8 @@ def _person_composer(
     if work.photo_of_stack is None:
         return PersonStack(header, face), None, fit_facts(fit)
     path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
-    photo = read_image(path, work.photo.colourspace).pixels
+    with memory.beside(_STACK_BYTES * header.seen.size):
+        photo = read_image(path, work.photo.colourspace, kept_px=_KEPT_PX).pixels
     scale = photo.shape[0] / size_px[0]
     if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
         raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
@@ -304,9 +307,8 @@ def _person_composer(
     return PersonStack(header, face, photo, work.background.kind == "photo"), backdrops, fit_facts(fit)
 
 
-def _stack_composer(item: Item, stack: OlatStack, work: Relight) -> tuple[Composer, dict[str, Any]]:
+def _stack_composer(item: Item, header: StackHeader, work: Relight) -> tuple[Composer, dict[str, Any]]:
     """The composer of a stack's images in the frame of its crop, and facts of its fit."""
-    header = stack.header
     if header.kind == "image":
         return RenderedStack(header.seen, header.normals), {}
     try:
@@ -349,8 +351,7 @@ def _write_setups(
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
             image, layers = shown.composer.rows(relit, ev, behind), shown.composer.layers(work.aov, relit)
             if setup.names:
-                each = map(shown.composer.light_layer, shown.apart(setup))
-                layers = {**layers, **dict(zip(setup.names, each, strict=True))}
+                layers = {**layers, **_light_layers(shown, setup, image.pixels.shape)}
             written = _output(image, layers, shown.alpha, work)
             write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
             if work.output.shown_suffix and not chosen_ev:
@@ -360,8 +361,34 @@ def _write_setups(
 
 def _parts(shown: _Shown, work: Relight) -> list[slice]:
     """Setups, as many at a time as fit the memory."""
-    at_once = max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
+    at_once = _at_once(shown)
     return [slice(first, first + at_once) for first in range(0, len(work.setups), at_once)]
+
+
+def _at_once(shown: _Shown) -> int:
+    """Sums of lights that fit the memory."""
+    return max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
+
+
+def _light_layers(shown: _Shown, setup: LightSetup, shape: tuple[int, ...]) -> dict[str, Rows]:
+    """The person under each light of a setup [H, W, 3], by the lights' names.
+
+    Lights are relit when their rows are first read, as many at a time as fit the memory.
+    """
+    at_once = _at_once(shown)
+
+    @lru_cache(maxsize=1)
+    def some(first: int) -> list[Any]:
+        return shown.apart(replace(setup, lights=setup.lights[first : first + at_once]))
+
+    @lru_cache(maxsize=1)
+    def layer(number: int) -> Rows:
+        return shown.composer.light_layer(some(number - number % at_once)[number % at_once])
+
+    def rows_of(number: int) -> Rows:
+        return Computed(shape, lambda rows: layer(number)[rows])
+
+    return {name: rows_of(number) for number, name in enumerate(setup.names)}
 
 
 def _output(

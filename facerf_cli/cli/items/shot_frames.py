@@ -3,7 +3,7 @@
 import json
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property, lru_cache
 from typing import Any
@@ -20,12 +20,14 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import Face, face_at, read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
+from facerf_cli.film.cuts import CutFinder, takes
 from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.portrait.segment import Segmentation
 
 _DECODED = 12  # frames of a film that are kept as they were decoded
+_AHEAD = 8  # frames that are kept while cuts are looked for
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -73,25 +75,41 @@ def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:
         rows = [head]
         shot.track.parent.mkdir(parents=True, exist_ok=True)
         shot.track.write_text(json_line(head) + "\n", encoding="utf-8")
-    sightings = list(map(_sighting, rows[1:]))
-    if len(sightings) < len(shot.frames):
-        last = next((seen.landmarks_px for seen in reversed(sightings) if seen), None)
-        follower = Follower(options.face, options.landmarks_from, last)
-        frames = ShotFrames(shot, options)
+    if len(rows) <= len(shot.frames):
         with shot.track.open("a", encoding="utf-8") as stream:
-            for number in _shown(range(len(sightings), len(shot.frames)), shot, settings):
-                seen = _see(shot, number, frames, follower, options)
-                sightings.append(seen)
-                stream.write(json_line(_row(number, seen)) + "\n")
+            for row in _followed(shot, rows[1:], options, settings):
+                rows.append(row)
+                stream.write(json_line(row) + "\n")
                 stream.flush()
-    _say_gaps(shot, sightings)
+    _say(shot, rows[1:])
+
+
+def _followed(
+    shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions, settings: Settings
+) -> Iterator[dict[str, Any]]:
+    """Rows of the frames that follow those of some rows; after a cut the face is chosen as in a new film."""
+    take = rows[_cuts(rows)[-1] if _cuts(rows) else 0 :]
+    last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
+    follower = Follower(options.face, options.landmarks_from, last)
+    frames = ShotFrames(shot, options)
+    show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
+    finder = CutFinder(len(shot.frames), show)
+    for number in _shown(range(len(rows), len(shot.frames)), shot, settings):
+        cut = shot.cuts and finder.is_cut(number)
+        if cut:
+            follower = Follower(options.face, options.landmarks_from)
+        yield _row(number, _see(shot, number, show, follower, options), cut)
 
 
 def _see(
-    shot: Shot, number: int, frames: ShotFrames, follower: Follower, options: PhotoOptions
+    shot: Shot,
+    number: int,
+    show: Callable[[int], np.ndarray],
+    follower: Follower,
+    options: PhotoOptions,
 ) -> Sighting | None:
     if options.landmarks is None:
-        return follower.see(to_display(frames.image(number).pixels))
+        return follower.see(show(number))
     path = companion(shot.frames[number], options.landmarks, LANDMARK_SUFFIXES, "--landmarks")
     return Sighting(read_landmarks(path), 0.0)
 
@@ -102,6 +120,7 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
     return {
         "frames": len(shot.frames),
         "files": [[state.st_size, state.st_mtime_ns] for state in states],
+        "cuts": shot.cuts,
         "face": options.face,
         "landmarks_from": options.landmarks_from,
         "landmarks": options.landmarks,
@@ -124,10 +143,16 @@ def _rows(shot: Shot) -> list[dict[str, Any]]:
     return rows
 
 
-def _row(number: int, seen: Sighting | None) -> dict[str, Any]:
+def _row(number: int, seen: Sighting | None, cut: bool) -> dict[str, Any]:
+    row: dict[str, Any] = {"frame": number, **({"cut": True} if cut else {})}
     if seen is None:
-        return {"frame": number, "landmarks": None}
-    return {"frame": number, "landmarks": seen.landmarks_px.round(3), "expected_error": round(seen.error, 4)}
+        return row | {"landmarks": None}
+    return row | {"landmarks": seen.landmarks_px.round(3), "expected_error": round(seen.error, 4)}
+
+
+def _cuts(rows: Sequence[dict[str, Any]]) -> list[int]:
+    """First frames of takes, but for that of the first take."""
+    return [number for number, row in enumerate(rows) if row.get("cut")]
 
 
 def _sighting(row: dict[str, Any]) -> Sighting | None:
@@ -145,28 +170,61 @@ def _shown(numbers: range, shot: Shot, settings: Settings) -> Sequence[int]:
     return shown
 
 
-def _say_gaps(shot: Shot, sightings: Sequence[Sighting | None]) -> None:
+def _say(shot: Shot, rows: Sequence[dict[str, Any]]) -> None:
+    """Say where a film cuts, and where its face is not seen."""
+    sightings, cuts = list(map(_sighting, rows)), _cuts(rows)
     if not any(sightings):
         raise InputError(f"{shot.frames[0].input_path}: no frame shows a face; give another film")
-    for first, last in gaps(sightings):
-        bridged = first > 0 and last + 1 < len(sightings) and last - first < LONGEST_GAP
-        names = f"frame {first}" if first == last else f"frames {first} to {last}"
-        result = "bridged by the frames around" if bridged else "not made; cut them off"
-        log.warning("%s: %s: the face is not seen; %s", shot.base.name, names, result)
+    if cuts:
+        at = f"frame{'s' * (len(cuts) > 1)} {', '.join(map(str, cuts))}"
+        log.warning(
+            "%s: cuts at %s: each part is a shot for itself (--no-cuts: one shot)", shot.base.name, at
+        )
+    for take in takes(len(sightings), cuts):
+        inside = sightings[take.start : take.stop]
+        for first, last in gaps(inside):
+            bridged = first > 0 and last + 1 < len(inside) and last - first < LONGEST_GAP
+            result = "bridged by the frames around" if bridged else "not made; cut them off"
+            names = _named_frames(take.start + first, take.start + last)
+            log.warning("%s: %s: the face is not seen; %s", shot.base.name, names, result)
+
+
+def _named_frames(first: int, last: int) -> str:
+    return f"frame {first}" if first == last else f"frames {first} to {last}"
 
 
 @lru_cache(maxsize=1)
-def _opened(shot: Shot, options: PhotoOptions) -> tuple[ShotFrames, ShotView]:
-    frames = ShotFrames(shot, options)
-    models = load_models_once(options)
-    sightings = [_sighting(row) for row in _rows(shot)[1:]]
-    view = ShotView(models, models.sides(options.texture_side), frames.pixels, sightings)
-    return frames, view
+def _opened(shot: Shot, options: PhotoOptions) -> ShotFrames:
+    return ShotFrames(shot, options)
 
 
-def view_of(shot: Shot, options: PhotoOptions) -> ShotView:
-    """The view of a shot whose face was followed; kept for the frames that this process makes."""
-    return _opened(shot, options)[1]
+@lru_cache(maxsize=1)
+def _takes(shot: Shot) -> tuple[list[Sighting | None], list[range]]:
+    """Sightings of a shot that was followed, and the frames of its takes."""
+    rows = _rows(shot)[1:]
+    return list(map(_sighting, rows)), takes(len(rows), _cuts(rows))
+
+
+def takes_with_face(shot: Shot) -> list[range]:
+    """The frames of each take of a shot that was followed, of those that show the face."""
+    sightings, found = _takes(shot)
+    return [take for take in found if any(sightings[take.start : take.stop])]
+
+
+@lru_cache(maxsize=1)
+def _view(shot: Shot, take: range, options: PhotoOptions) -> ShotView:
+    models, sightings = load_models_once(options), _takes(shot)[0]
+    inside = [seen if number in take else None for number, seen in enumerate(sightings)]
+    return ShotView(models, models.sides(options.texture_side), _opened(shot, options).pixels, inside)
+
+
+def view_of(shot: Shot, number: int, options: PhotoOptions) -> ShotView:
+    """The view of the take of a frame; kept for the frames that this process makes.
+
+    To a view no other take shows a face, so that nothing crosses a cut.
+    """
+    take = next(take for take in _takes(shot)[1] if number in take)
+    return _view(shot, take, options)
 
 
 @contextmanager
@@ -180,18 +238,18 @@ def _named(shot: Shot, number: int) -> Iterator[None]:
 
 def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[LinearImage, Face, Segmentation]:
     """A frame, its face, and its person, steadied by the frames around it."""
-    frames, view = _opened(shot, options)
+    view = view_of(shot, number, options)
     with _named(shot, number):
         face, found = face_at(view.landmarks_px(number)), view.segmentation(number)
-    return frames.image(number), face, found
+    return _opened(shot, options).image(number), face, found
 
 
 def seen_frame(
     shot: Shot, number: int, options: PhotoOptions, portrait: bool = True
 ) -> tuple[LinearImage, FittedFace]:
     """A frame, and its head with what is steadied by the frames around it; see `ShotView.steady`."""
-    frames, view = _opened(shot, options)
+    view = view_of(shot, number, options)
     with _named(shot, number):
         head, steady = view.head(number), view.steady(number, portrait)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
-    return frames.image(number), FittedFace("", face_at(landmarks_px), head, steady)
+    return _opened(shot, options).image(number), FittedFace("", face_at(landmarks_px), head, steady)

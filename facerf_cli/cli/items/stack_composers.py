@@ -9,8 +9,8 @@ from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_
 from facerf_cli.composite import Relit, RelitRows
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
-from facerf_cli.resize import resized
-from facerf_cli.strips import Rows, whole
+from facerf_cli.resize import resized_rows
+from facerf_cli.strips import Computed, Rows
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
@@ -54,20 +54,27 @@ class PersonStack:
 
     def rows(self, relit: Relit, ev: float, behind: Rows | None) -> RelitRows:
         """The person before the photo's background at `ev`, before another, or with alpha."""
-        person, matte = self._person(relit)
-        if behind is None and (self.photo is None or not self.keeps_background):
-            return RelitRows(person, matte)
-        shown = whole(behind) if behind is not None else np.float32(2.0**-ev) * np.asarray(self.photo)
-        return RelitRows(shown + matte[..., None] * (person - shown))
+        (person, matte), photo, gain = self._person(relit), self.photo, np.float32(2.0**-ev)
+        if behind is None:
+            if photo is None or not self.keeps_background:
+                return RelitRows(person, matte)
+            behind = Computed(photo.shape, lambda rows: gain * photo[rows])
+        shown = behind
 
-    def light_layer(self, relit: Relit) -> np.ndarray:
+        def of(rows: slice) -> np.ndarray:
+            below = shown[rows]
+            return np.asarray(below + matte[rows][..., None] * (person[rows] - below))
+
+        return RelitRows(Computed(person.shape, of))
+
+    def light_layer(self, relit: Relit) -> Rows:
         """The person under one of several lights, over black."""
         person, matte = self._person(relit)
-        return np.asarray(person * matte[..., None])
+        return Computed(person.shape, lambda rows: person[rows] * matte[rows][..., None])
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
         """The matte and the layer of normals; raises UsageError for others."""
-        normals = resized(self.header.normals, *self._size())
+        normals = resized_rows(self.header.normals, self._size())
         return {"person.A": self._matte()} | _only_normals(names, normals)
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
@@ -77,17 +84,17 @@ class PersonStack:
             return auto_exposure_ev(person, seen)
         return anchored_exposure_ev(person, self.header.source, self.face * seen, seen)
 
-    def _person(self, relit: Relit) -> tuple[np.ndarray, np.ndarray]:
+    def _person(self, relit: Relit) -> tuple[Rows, Rows]:
         """The person's own colours [H, W, 3], and its matte [H, W]."""
-        own = _straight(_pixels(relit), self.header.seen)
-        if self.photo is None or self._size() == self.header.seen.shape:
+        own, photo = _straight(_pixels(relit), self.header.seen), self.photo
+        if photo is None or self._size() == self.header.seen.shape:
             return own, self.header.seen
         source = self.header.source
-        change = own / (source + _DARK * source.mean())
-        return self.photo * resized(change, *self._size()), self._matte()
+        change = resized_rows(own / (source + _DARK * source.mean()), self._size())
+        return Computed(photo.shape, lambda rows: photo[rows] * change[rows]), self._matte()
 
-    def _matte(self) -> np.ndarray:
-        return resized(self.header.seen, *self._size())
+    def _matte(self) -> Rows:
+        return resized_rows(self.header.seen, self._size())
 
     def _size(self) -> tuple[int, int]:
         height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
@@ -104,7 +111,7 @@ def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
     return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
 
 
-def _only_normals(names: Sequence[str], normals: np.ndarray) -> dict[str, Rows]:
+def _only_normals(names: Sequence[str], normals: Rows) -> dict[str, Rows]:
     if other := [name for name in names if name != "normal"]:
         raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
     return {"normal": normals} if names else {}

@@ -1,5 +1,7 @@
 """Sums of a stack's lights as images, with known answers."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from facerf_cli.cli.items.stack_composers import PersonStack
 from facerf_cli.composite import Relit
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
+from facerf_cli.strips import whole
 
 SIDE = 4
 
@@ -50,8 +53,22 @@ def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_i
 
 def test_layers_of_lights_add_up() -> None:
     composer = PersonStack(header(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
-    apart = composer.light_layer(lit(0.2)) + composer.light_layer(lit(0.4))
-    np.testing.assert_allclose(apart, composer.light_layer(lit(0.6)), rtol=1e-5)
+    one, other, both = (whole(composer.light_layer(lit(radiance))) for radiance in (0.2, 0.4, 0.6))
+    np.testing.assert_allclose(one + other, both, rtol=1e-5)
+
+
+def test_a_large_photo_is_composed_in_rows() -> None:
+    """The memory at any time is that of the rows that are read, whatever is behind the person."""
+    photo = np.full((2048, 512, 3), 0.2, np.float32)
+    composer, behind = PersonStack(header(), header().seen, photo), np.full((2048, 512, 3), 3.0, np.float32)
+    for image in (composer.rows(lit(0.6), 1.0, None), composer.rows(lit(0.6), 1.0, behind)):
+        tracemalloc.start()
+        middle = image.pixels[1000:1010]
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert middle.shape == (10, 512, 3) and peak < photo.nbytes / 10
+        np.testing.assert_allclose(middle, image.whole().pixels[1000:1010], rtol=1e-6)
+    np.testing.assert_allclose(image.whole().pixels[:, -1], 3.0)
 
 
 def test_exposure_and_layers() -> None:
