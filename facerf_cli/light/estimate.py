@@ -285,6 +285,7 @@ class RefinedLight:
     steps: int
 
 
+@torch.enable_grad()
 def refine_light(
     evidence: LightEvidence,
     start: Tensor,

@@ -23,6 +23,13 @@ def test_the_loss_falls_and_the_light_comes_nearer() -> None:
     assert (refined.weights >= 0).all() and refined.steps > 5
 
 
+def test_gradients_are_taken_where_the_caller_needs_none() -> None:
+    evidence = lit(shaded_ball(), some_weights())
+    with torch.no_grad():  # as in `facerf evaluate`
+        refined = refine_light(evidence, some_weights() + 0.1, edges)
+    assert refined.loss_after < refined.loss_before
+
+
 def test_a_start_that_is_best_is_given_back() -> None:
     weights = some_weights()
     evidence = lit(shaded_ball(), weights)
