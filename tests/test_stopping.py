@@ -53,7 +53,9 @@ def temporaries(folder: Path) -> list[Path]:
 def test_a_signal_ends_whatever_runs_and_leaves_nothing(
     kind: str, number: signal.Signals, tmp_path: Path
 ) -> None:
-    process = started(tmp_path, kind)
+    process = started(
+        tmp_path, kind, preexec_fn=lambda: signal.signal(number, signal.SIG_DFL)
+    )  # under nohup, too
     assert temporaries(tmp_path)
     process.send_signal(number)
     _, said = process.communicate(timeout=50)  # less than the writer's 60 s

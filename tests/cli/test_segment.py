@@ -34,7 +34,7 @@ def test_every_file_is_there_and_in_the_report(cut: Path) -> None:
     assert row["outputs"] == [f"astronaut{ending}" for ending in ENDINGS]
     assert all((cut / name).is_file() for name in row["outputs"])
     assert 0 < row["confidence"] <= 1 and row["certainty"] in ("sure", "unsure", "doubtful")
-    assert set(row["factors"]) == {"unclear", "small", "profile", "covered", "turned"}
+    assert set(row["factors"]) == {"unclear", "small", "profile", "covered", "turned", "blurred"}
 
 
 def test_classes_sum_to_the_matte_over_the_whole_frame(layers: dict[str, np.ndarray]) -> None:
