@@ -35,10 +35,9 @@ def main() -> None:
     pred = required(given.pred, "images of facerf_all.py", "--pred")
     sums: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2))
     for subject, photo, relit, truth, regions in pairs(bench, pred):
-        for name, image in candidates(photo, relit, truth, regions):
-            for region, mask in regions.items():
-                if name.startswith("region"):
-                    image = scaled(relit, truth, mask)
+        images = list(candidates(photo, relit, truth, regions["head"]))
+        for region, mask in regions.items():
+            for name, image in (*images, ("region's scale known", scaled(relit, truth, mask))):
                 error = np.square(image - truth)[mask].mean(), np.square(truth)[mask].mean()
                 for group in ("all", subject):
                     sums[group, name, region] += error
@@ -79,12 +78,10 @@ def pairs(
 
 
 def candidates(
-    photo: np.ndarray, relit: np.ndarray, truth: np.ndarray, regions: dict[str, np.ndarray]
+    photo: np.ndarray, relit: np.ndarray, truth: np.ndarray, head: np.ndarray
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Names and images; that of the regions' scales is made by region."""
-    head = regions["head"]
+    """Names and images [H, W], given the mask of the head."""
     yield "as they are", relit
-    yield "region's scale known", relit
     for blur_px in BLURS_PX:
         wide = [gaussian_filter(image * head, blur_px) for image in (truth, relit)]
         yield f"ratio known, {blur_px} px", relit * wide[0] / np.maximum(wide[1], DARK)

@@ -26,10 +26,8 @@ def intensity_of(light: StudioLight) -> Tensor:
 def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     """Unit directions [n, 3] of a far light and its share [n] in each; a surface that faces it receives 1."""
     if light.azel_deg is None:
-        directions = rig_directions(_AROUND)
-        return directions, torch.full(
-            (_AROUND,), 4 / _AROUND
-        )  # the mean of a cosine over the sphere is 1 / 4
+        share = 4 / _AROUND  # the mean of a cosine over the sphere is 1 / 4
+        return rig_directions(_AROUND), torch.full((_AROUND,), share)
     middle = azel_to_direction(*light.azel_deg)
     if light.size_deg == 0:  # to the last bit
         return middle[None], torch.ones(1)

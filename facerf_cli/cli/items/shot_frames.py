@@ -88,7 +88,7 @@ def _followed(
     shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions, settings: Settings
 ) -> Iterator[dict[str, Any]]:
     """Rows of the frames that follow those of some rows; after a cut the face is chosen as in a new film."""
-    take = rows[_cuts(rows)[-1] if _cuts(rows) else 0 :]
+    take = rows[[0, *_cuts(rows)][-1] :]
     last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
     follower = Follower(options.face, options.landmarks_from, last)
     frames = ShotFrames(shot, options)
