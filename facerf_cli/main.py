@@ -38,7 +38,7 @@ from facerf_cli.cli.train import train
 from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
-from facerf_cli.stopping import end_on_signals
+from facerf_cli.stopping import end_again, end_on_signals
 
 _PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
 # The verbs by panel of the help, in the order of a user's day.
@@ -164,7 +164,10 @@ def main(arguments: Sequence[str]) -> int:
     configure_logging()
     try:
         line = repeat_options(global_options_first(arguments or ["--help"]))
-        code = app(args=line, prog_name="facerf", standalone_mode=False)
+        try:
+            code = app(args=line, prog_name="facerf", standalone_mode=False)
+        finally:
+            end_again()
         sys.stdout.flush()
         if code == 130:  # typer turns Ctrl-C into this exit code
             return _fail(None, "interrupted", 130)

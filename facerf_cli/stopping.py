@@ -2,6 +2,9 @@
 
 Python runs a handler between two of its instructions, and a library may be minutes away from the next. A
 thread therefore waits for the signal's number too (`signal.set_wakeup_fd`).
+
+A library may also catch the exit and continue with half of its work (`except BaseException`, as trimesh's
+writer of OBJ does): `end_again` raises it once more, before an output gets its name and after an item.
 """
 
 import os
@@ -12,10 +15,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 _cleaners: list[Callable[[], None]] = []
 _unhurried: list[None] = []  # an entry for each block that ends by itself
+_ended_by: list[int] = []  # the signal whose exit was raised
 _AT_ONCE_S = 1.0  # a second Ctrl-C within this time is the first one, which a shell and a terminal both send
 
 
@@ -30,11 +34,18 @@ def end_on_signals(patience_s: float, interrupts: bool = True) -> None:
         signal.signal(number, _unwind)
     if interrupts and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, _Interrupt())
+    sys.unraisablehook = _silent_about_exits
     if hasattr(signal, "SIGHUP"):  # elsewhere a pipe cannot be waited for
         ours, theirs = os.pipe()
         os.set_blocking(theirs, False)
         signal.set_wakeup_fd(theirs, warn_on_full_buffer=False)
         threading.Thread(target=_watch, args=(ours, patience_s), daemon=True).start()
+
+
+def end_again() -> None:
+    """Raise the exit of a signal again if there was one and the process still runs."""
+    if _ended_by:
+        _raise_exit(_ended_by[0])
 
 
 def clean_by(cleaner: Callable[[], None]) -> None:
@@ -54,7 +65,20 @@ def unhurried() -> Iterator[None]:
 
 def _unwind(number: int, _: FrameType | None) -> NoReturn:
     signal.signal(number, signal.SIG_IGN)  # a second one must not interrupt the cleaning
+    _raise_exit(number)
+
+
+def _raise_exit(number: int) -> NoReturn:
+    _ended_by[:] = [number]
+    if number == signal.SIGINT:
+        raise KeyboardInterrupt
     sys.exit(128 + number)
+
+
+def _silent_about_exits(unraisable: Any) -> None:
+    """Report an exception that Python cannot raise, unless it is an exit: `end_again` raises that."""
+    if not (_ended_by and isinstance(unraisable.exc_value, (SystemExit, KeyboardInterrupt))):
+        sys.__unraisablehook__(unraisable)
 
 
 class _Interrupt:
@@ -67,7 +91,7 @@ class _Interrupt:
         now_s = time.monotonic()
         if self._first_s is None:
             self._first_s = now_s
-            raise KeyboardInterrupt
+            _raise_exit(number)
         if now_s - self._first_s > _AT_ONCE_S:
             _end(number)
 

@@ -35,9 +35,32 @@ finally:
         time.sleep(0.5)
 """
 
+SWALLOWER = """
+import sys, time
+from pathlib import Path
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.stopping import end_on_signals
 
-def started(tmp_path: Path, kind: str, **options: object) -> subprocess.Popen:
-    (tmp_path / "writer.py").write_text(WRITER)
+class Slow:
+    def __del__(self):  # Python ignores what is raised here
+        time.sleep(60)
+
+end_on_signals(2)
+with atomic_path(Path(sys.argv[1], "a.bin")) as temporary:
+    temporary.write_bytes(b"half")
+    Path(sys.argv[1], "started").touch()
+    if sys.argv[2] == "library":
+        try:
+            time.sleep(60)
+        except BaseException:
+            pass
+    else:
+        Slow()
+"""
+
+
+def started(tmp_path: Path, kind: str, program: str = WRITER, **options: object) -> subprocess.Popen:
+    (tmp_path / "writer.py").write_text(program)
     command = [sys.executable, str(tmp_path / "writer.py"), str(tmp_path), kind]
     process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, **options)
     wait_until((tmp_path / "started").exists, process)
@@ -80,3 +103,15 @@ def test_a_second_ctrl_c_at_once_does_not_stop_the_cleaning(tmp_path: Path) -> N
     _, said = process.communicate(timeout=50)
     assert said.count(b"Traceback") == 1  # of the first, which this small program does not catch
     assert not temporaries(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["library", "destructor"])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGHUP, 129), (signal.SIGINT, -signal.SIGINT)])
+def test_an_exit_that_was_swallowed_is_raised_before_an_output_gets_its_name(
+    kind: str, number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    process = started(tmp_path, kind, SWALLOWER)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=50)
+    assert process.returncode == code and b"ignored" not in said
+    assert not (tmp_path / "a.bin").exists() and not temporaries(tmp_path)

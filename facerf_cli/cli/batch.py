@@ -30,6 +30,7 @@ from facerf_cli.files.folder_lock import alone_in
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
+from facerf_cli.stopping import end_again
 from facerf_cli.workers import process_died, spread
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
@@ -289,6 +290,7 @@ class _Work:
             return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
         finally:
             memory.give_back()
+            end_again()
 
 
 def _broken(item: Item, error: Exception) -> _Result:

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.stopping import clean_by
+from facerf_cli.stopping import clean_by, end_again
 
 _ABANDONED_S = (
     24 * 3600
@@ -49,6 +49,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         room.mkdir(mode=0o700)
         _open.add(room)
         yield temporary
+        end_again()  # what was written may lack what a library left out
         if not temporary.exists():
             raise FacerfError(f"{path}: could not be written")
         _sync_all(temporary)
