@@ -33,6 +33,9 @@ def main() -> None:
     parser.add_argument("--items", type=int, default=10_000)
     parser.add_argument("--with", dest="more", default="", help="further arguments of the verb")
     given = parser.parse_args()
+    signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's background job ignores it, and its own
     verb = VERBS[given.verb]
     verb = replace(verb, arguments=(*verb.arguments, *shlex.split(given.more)))
     with tempfile.TemporaryDirectory() as name:

@@ -371,8 +371,9 @@ def _open_report(
     for item in todo:
         rows.pop((verb, item.name), None)
     for item in finished:
-        skipped = _Result(item, 0.0, Outcome(outputs_of(item)))
-        rows.setdefault((verb, item.name), _report_row(verb, skipped, path.parent) | {"status": "skipped"})
+        if (verb, item.name) not in rows:
+            skipped = _Result(item, 0.0, Outcome(outputs_of(item)))
+            rows[verb, item.name] = _report_row(verb, skipped, path.parent) | {"status": "skipped"}
     try:
         with atomic_path(path) as temporary:
             temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")

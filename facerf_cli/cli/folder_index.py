@@ -8,10 +8,10 @@ row of a name counts. With `--shard` each process writes an index of its own and
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path, PurePosixPath
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 from facerf_cli.cli.options import Shard
@@ -20,7 +20,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.json_reader import parse_json
-from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.files.regular import is_regular, regular_size, require_regular
 from facerf_cli.logs import json_line
 
 _INDEXES = ".facerf-index*.jsonl"
@@ -73,9 +73,9 @@ class _Rows:
         if isinstance(row.get("of"), dict):
             self.recipes[str(row.get("recipe"))] = row["of"]
         elif "output" in row:
-            name = PurePosixPath(str(row["output"]))
-            if not name.is_absolute() and ".." not in name.parts:
-                self.outputs[name.as_posix()] = row
+            name = str(row["output"])
+            if not name.startswith("/") and ".." not in name.split("/"):
+                self.outputs[name] = row
         elif "sha256" in row:
             self.files[str(row.get("file"))] = row
 
@@ -127,8 +127,9 @@ class FolderIndex:
         The reason is empty where they never were made.
         """
         stale: dict[Path, str] = {}
+        input_digest = cache(lambda: self._digest_or_none(input_path))
         for number, path in enumerate(outputs):
-            reason = self._why(number, path, input_path)
+            reason = self._why(number, path, input_digest)
             if reason is not None:
                 stale[path] = reason
         self.edited += [path for path in outputs if path not in stale and self._is_edited(path)]
@@ -136,9 +137,10 @@ class FolderIndex:
             return None, frozenset()
         return next(filter(None, stale.values()), ""), frozenset(stale)
 
-    def _why(self, number: int, path: Path, input_path: Path) -> str | None:
+    def _why(self, number: int, path: Path, input_digest: Callable[[], str | None]) -> str | None:
         row = self._rows.outputs.get(self._name(path))
-        if not is_regular(path):
+        size = regular_size(path)
+        if size is None:
             return "" if row is None else "an output is missing"
         if row is None or row.get("verb") != self._verb:
             return "there is no record of what they were made from"
@@ -146,9 +148,9 @@ class FolderIndex:
         if row.get("recipe") != key:
             old = self._rows.recipes.get(str(row.get("recipe")), {})
             return differences(old, recipe) or "other options" if old else "other options"
-        if self._digest_or_none(input_path) != row.get("input"):
+        if input_digest() != row.get("input"):
             return "the input changed"
-        if path.stat().st_size == 0:
+        if size == 0:
             return "an output is empty"
         return None
 

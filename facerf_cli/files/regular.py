@@ -9,10 +9,16 @@ from facerf_cli.errors import InputError
 
 def is_regular(path: Path) -> bool:
     """Return whether a path leads to a regular file; False for names that the system refuses."""
+    return regular_size(path) is not None
+
+
+def regular_size(path: Path) -> int | None:
+    """The bytes of a regular file; None for anything else, and for names that the system refuses."""
     try:
-        return stat.S_ISREG(os.stat(path).st_mode)
+        state = os.stat(path)
     except (OSError, ValueError):
-        return False
+        return None
+    return state.st_size if stat.S_ISREG(state.st_mode) else None
 
 
 def require_regular(path: Path, advice: str = "check the path") -> None:
