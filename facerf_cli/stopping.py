@@ -76,8 +76,8 @@ def _raise_exit(number: int) -> NoReturn:
 
 
 def _silent_about_exits(unraisable: Any) -> None:
-    """Report an exception that Python cannot raise, unless it is an exit: `end_again` raises that."""
-    if not (_ended_by and isinstance(unraisable.exc_value, (SystemExit, KeyboardInterrupt))):
+    """Report an exception that Python cannot raise, but none after a signal: an exit, or what it left open."""
+    if not _ended_by:
         sys.__unraisablehook__(unraisable)
 
 

@@ -1,15 +1,20 @@
 """`facerf relight` from the command line, with a network that is Lambert's law until it is trained."""
 
 import json
+import weakref
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from facerf_cli.composite import Relit
 from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.main import main
+from facerf_cli.pipeline import relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.synth.sky.skies import kind_of
 from tests.cli.toy_checkpoint import save_toy_checkpoint
@@ -88,6 +93,28 @@ def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     assert relight(given, tmp_path, *line) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert len(row["exposure_ev"]) == 3 and len(set(row["exposure_ev"].values())) == 1
+
+
+@pytest.mark.parametrize("composite", ["photo", "face"])
+@pytest.mark.parametrize(
+    ("lights", "kept"),
+    [(["--light", "40,10", "--light=-40,10"], 0), (["--light", "a=40,10", "--light", "b=0,40"], 1)],
+)  # of the second image its two lights, beside their sum
+def test_lights_that_are_written_are_given_up_before_others_are_relit(
+    composite: str, lights: list[str], kept: int, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    held: list[weakref.ref] = []
+
+    def watched(*arguments: Any) -> Iterator[Relit]:
+        assert sum(one() is not None for one in held) <= kept
+        for one in relit_by(*arguments):
+            held.append(weakref.ref(one.texture))
+            yield one
+
+    monkeypatch.setattr("facerf_cli.cli.items.relight_photos._HELD", 1 << 30)  # so that one light fits
+    monkeypatch.setattr("facerf_cli.cli.items.relight_photos.relit_by", watched)
+    assert relight(given, tmp_path, *lights, "--composite", composite) == 0
+    assert len(held) > 2
 
 
 def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:

@@ -3,9 +3,8 @@
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, Generic, Protocol, TypeVar, cast
 
 import numpy as np
 import torch
@@ -56,6 +55,7 @@ from facerf_cli.strips import Computed, Rows
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _STACK_BYTES = 130  # of a pixel of a stack, beside its photo
 _KEPT_PX = 12  # bytes of a pixel beside that photo: an image computed once for several formats
+T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 _of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
@@ -357,6 +357,7 @@ def _write_setups(
             if work.output.shown_suffix and not chosen_ev:
                 log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
+            del relit, image, layers, written  # a view of one holds all of its part, beside the next
 
 
 def _parts(shown: _Shown, work: Relight) -> list[slice]:
@@ -370,6 +371,19 @@ def _at_once(shown: _Shown) -> int:
     return max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
 
 
+class _Last(Generic[T]):
+    """A function of a number that remembers its last value, and gives it up before it computes another."""
+
+    def __init__(self, of: Callable[[int], T]) -> None:
+        self._of, self._held = of, dict[int, T]()
+
+    def __call__(self, number: int) -> T:
+        if number not in self._held:
+            self._held.clear()
+            self._held[number] = self._of(number)
+        return self._held[number]
+
+
 def _light_layers(shown: _Shown, setup: LightSetup, shape: tuple[int, ...]) -> dict[str, Rows]:
     """The person under each light of a setup [H, W, 3], by the lights' names.
 
@@ -377,11 +391,11 @@ def _light_layers(shown: _Shown, setup: LightSetup, shape: tuple[int, ...]) -> d
     """
     at_once = _at_once(shown)
 
-    @lru_cache(maxsize=1)
+    @_Last
     def some(first: int) -> list[Any]:
         return shown.apart(replace(setup, lights=setup.lights[first : first + at_once]))
 
-    @lru_cache(maxsize=1)
+    @_Last
     def layer(number: int) -> Rows:
         return shown.composer.light_layer(some(number - number % at_once)[number % at_once])
 
@@ -411,4 +425,5 @@ def _exposures_ev(
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
             chosen_ev = round(composer.exposure_ev(relit, work.exposure), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
+            del relit  # a view of one holds all of its part, beside the next
     return found
