@@ -76,7 +76,7 @@ def _raise_exit(number: int) -> NoReturn:
 
 
 def _silent_about_exits(unraisable: Any) -> None:
-    """Report an exception that Python cannot raise, but none after a signal: an exit, or what it left open."""
+    """Report an exception that Python cannot raise, but not after a signal: an exit, what it left open."""
     if not _ended_by:
         sys.__unraisablehook__(unraisable)
 
