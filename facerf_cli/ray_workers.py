@@ -160,6 +160,8 @@ def _answer_of(ray: Any, reference: Any) -> "_Answer | str":
         raise FacerfError(f"--ray: {_first_sentence(error)}") from error
     except lost as error:
         return _first_sentence(error)
+    except errors.LocalRayletDiedError:  # the node of this process
+        raise
     except errors.RayError as error:
         raise FacerfError(f"--ray: {_first_sentence(error)}") from error
 

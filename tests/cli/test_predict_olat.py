@@ -122,6 +122,18 @@ def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path) -> None
     assert predict(given, tmp_path / "x", *line, "--network-alone") == 2
 
 
+@pytest.mark.parametrize("frame", ["uv", "photo"])
+def test_the_contact_sheet_does_not_grow_with_the_lights(
+    frame: str, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.cli.items.olat_stacks._SHEET_PX", 9 * 20**2)
+    assert predict(given, tmp_path, "--lights", "9", "--frame", frame, "--size", "64") == 0
+    sheet = read_image(tmp_path / "astronaut_olat.png").pixels
+    assert (
+        sheet.shape[0] * sheet.shape[1] <= 12 * 22**2
+    )  # tiles of 20 pixels, gaps of 2 and a place left over
+
+
 def test_the_stack_is_enough_to_render_the_face(given: Path, tmp_path: Path) -> None:
     header = stack_of(given, tmp_path, "--lights", "2", "--pose", "30,-5,2").header
     fit = fit_from_arrays(header.fit)

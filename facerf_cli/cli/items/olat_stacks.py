@@ -1,5 +1,6 @@
 """The OLAT stack of one photo's face, and its contact sheet."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +40,7 @@ from facerf_cli.raster.camera import crop_camera
 from facerf_cli.resize import shrunk_photo
 from facerf_cli.strips import whole
 
-_TILE_PX = 128  # of the contact sheet
+_TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 _FRONT, _FEWEST_FRONT = (
     0.05,
     9,
@@ -110,7 +111,7 @@ def _of_person(
             relit = relit_by(composition, head, reflectance, some, single)
             layers = np.stack([whole(composition.light_layer(one)) for one in relit])
             batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
-            scale = _TILE_PX / max(batch.shape[-2:])
+            scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
             tiles.append(small.permute(0, 2, 3, 1).numpy())
             yield batch
@@ -142,7 +143,8 @@ def _olats(
 ) -> Iterator[Tensor]:
     """Yield OLATs in batches [l, 3, H, W], textures or images; small images [l, h, w, 3] go to `tiles`."""
     models = load_models_once(work.photo)
-    large, small = _uv_and_coverage(face, work), _uv_and_coverage(face, work, 2 * _TILE_PX)
+    large = _uv_and_coverage(face, work)
+    small = _uv_and_coverage(face, work, 2 * _tile_px(len(directions)))
     olats = predict_olat(
         models,
         face.head,
@@ -189,6 +191,11 @@ def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat)
         fit=fit_to_arrays(face.fit),
         metadata=_metadata(item, work),
     )
+
+
+def _tile_px(lights: int) -> int:
+    """The longer side of a contact sheet's tiles, such that their sum does not grow with the lights."""
+    return min(_TILE_PX, math.isqrt(_SHEET_PX // lights))
 
 
 def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarray:
