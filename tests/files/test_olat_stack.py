@@ -4,6 +4,7 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,18 @@ def test_a_stack_survives_its_file(tmp_path: Path) -> None:
         assert np.abs(getattr(read, name) - getattr(written, name)).max() < 1e-3, name
     assert np.array_equal(read.rotation, written.rotation)  # JSON keeps every digit
     assert str(read.fit["model"]) == "builtin" and np.array_equal(read.fit["alpha"], written.fit["alpha"])
+
+
+def test_parts_are_compressed_in_one_thread(tmp_path: Path) -> None:
+    before, seen = oiio.get_int_attribute("exr_threads"), []
+
+    def olats() -> Iterator[torch.Tensor]:
+        for light in OLATS:
+            seen.append(oiio.get_int_attribute("exr_threads"))
+            yield light[None]
+
+    write_olat_stack(tmp_path / "a.exr", header(), olats())
+    assert seen == [-1] * LIGHTS and oiio.get_int_attribute("exr_threads") == before
 
 
 def test_other_programs_see_a_part_a_light(path: Path) -> None:
