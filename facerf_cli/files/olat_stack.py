@@ -38,7 +38,6 @@ _LIGHT_BYTES = 6  # of a pixel: half floats
 _SUM_BYTES = 30  # of a pixel of a light that is summed: half floats, floats, and a copy of them
 _AT_ONCE = 16  # lights that are summed
 _OPEN = 256  # lights that are read before a stack is opened again
-_WRITTEN = 64  # lights that are written before freed memory is given back
 _SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
 _MOST_PARTS = 4097  # 4096 lights and the source
 _MOST_HEADER_BYTES = 1 << 20  # of the JSON
@@ -79,16 +78,14 @@ class OlatStack:
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
     """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive."""
     specs = _specs(header)
-    images = (image for batch in olats for image in batch.permute(0, 2, 3, 1).cpu().numpy())
-    with atomic_path(path) as temporary, _few_compressors():
+    images = (image for batch in _apart(olats) for image in batch.permute(0, 2, 3, 1).cpu().numpy())
+    with atomic_path(path) as temporary, _one_thread():
         stream = oiio.ImageOutput.create(str(temporary))
         assert stream is not None, f"{path}: a stack is an .exr"
         good = stream.open(str(temporary), tuple(specs))
         for number, (image, spec) in enumerate(zip(images, specs[:-1], strict=True)):
             good = good and (number == 0 or stream.open(str(temporary), spec, "AppendSubimage"))
             good = good and stream.write_image(_as_half(path, image))
-            if number % _WRITTEN == 0:
-                memory.give_back()
         good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
         source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
         good = good and stream.write_image(_as_half(path, source))
@@ -97,12 +94,20 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
             raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
 
 
-@contextmanager
-def _few_compressors() -> Iterator[None]:
-    """Compress in this thread: OpenEXR keeps two compressors a thread for each part until it closes a file.
+def _apart(olats: Iterable[Tensor]) -> Iterator[Tensor]:
+    """Pass batches on when what their prediction has freed is given back.
 
-    With two threads a light took 1.1 MB, and now 0.2.
+    OpenEXR keeps 1.8 MB a thread for each part until it closes a file, and touches little of it: that is
+    cheap in fresh memory, not in what a prediction has filled.
     """
+    for batch in olats:
+        memory.give_back()
+        yield batch
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compress in this thread, since OpenEXR keeps memory for each of its threads and each part."""
     threads = oiio.get_int_attribute("exr_threads")
     oiio.attribute("exr_threads", -1)
     try:

@@ -69,16 +69,18 @@ def test_a_stack_survives_its_file(tmp_path: Path) -> None:
     assert str(read.fit["model"]) == "builtin" and np.array_equal(read.fit["alpha"], written.fit["alpha"])
 
 
-def test_parts_are_compressed_in_one_thread(tmp_path: Path) -> None:
-    before, seen = oiio.get_int_attribute("exr_threads"), []
+def test_a_part_leaves_little_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, threads, given_back = oiio.get_int_attribute("exr_threads"), [], []
+    monkeypatch.setattr(memory, "give_back", lambda: given_back.append(len(threads)))
 
     def olats() -> Iterator[torch.Tensor]:
         for light in OLATS:
-            seen.append(oiio.get_int_attribute("exr_threads"))
+            threads.append(oiio.get_int_attribute("exr_threads"))
             yield light[None]
 
     write_olat_stack(tmp_path / "a.exr", header(), olats())
-    assert seen == [-1] * LIGHTS and oiio.get_int_attribute("exr_threads") == before
+    assert threads == [-1] * LIGHTS and oiio.get_int_attribute("exr_threads") == before
+    assert given_back == [1, 2, 3, 4, 5]  # after each prediction, before its parts
 
 
 def test_other_programs_see_a_part_a_light(path: Path) -> None:
