@@ -24,6 +24,7 @@ _WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their 
 _LEAST_TEXELS = 200  # fewer do not determine where light comes from
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
 _RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
+_ALIKE = 0.3  # the same, against differences of lights from around
 _REACHES = 0.1  # share of the largest mean radiance of the face under a light; below it, it is not solved for
 _CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
@@ -102,24 +103,42 @@ def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
     )
 
 
-def estimate_weights(olats: Tensor, image: Tensor) -> Tensor:
+def estimate_weights(olats: Tensor, image: Tensor, lamps: int | None = None) -> Tensor:
     """Solve Eq. (leastsq) for non-negative weights [L, C], which sum images [L, C, N] to an image [C, N].
 
     Iteratively reweighted least squares, a channel at a time: clipped, covered and misfitted elements lose
-    weight. All images are scene-linear.
+    weight. All images are scene-linear. If `lamps` are given, only so many first lights are free; the others
+    are light from around, and are held to be alike.
     """
-    channels = [_channel_weights(a, b) for a, b in zip(olats.unbind(1), image, strict=True)]
+    channels = [_channel_weights(a, b, lamps) for a, b in zip(olats.unbind(1), image, strict=True)]
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def _channel_weights(olats: Tensor, image: Tensor) -> np.ndarray:
+def lamp_error(lamp: Tensor, around: Tensor, image: Tensor) -> float:
+    """Root of the mean squared error of an image [N] as a sum of those of a lamp and of light from around."""
+    lights, target = torch.stack([lamp, around], -1).double().numpy(), image.double().numpy()
+    weights = _reweighted(lights, target, np.zeros((0, 2)))
+    return float(np.sqrt(np.square(lights @ weights - target).mean()))
+
+
+def _channel_weights(olats: Tensor, image: Tensor, lamps: int | None) -> np.ndarray:
     lights, target = olats.double().T.numpy(), image.double().numpy()  # [N, L], [N]
     if not len(target):  # nothing is visible enough
         return np.zeros(lights.shape[1])
-    ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
+    hold = _RIDGE * np.eye(lights.shape[1])
+    if lamps is not None:
+        others = lights.shape[1] - lamps
+        alike = np.zeros((others, lights.shape[1]))
+        alike[:, lamps:] = np.eye(others) - 1 / others
+        hold = np.concatenate([hold, _ALIKE * alike])
+    return _reweighted(lights, target, hold * np.linalg.norm(target))
+
+
+def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """Non-negative weights [L] with lights [N, L] @ weights = target [N] and hold [H, L] @ weights = 0."""
     trust = np.ones(len(target))
     for _ in range(_ROUNDS):
-        rows = np.concatenate([lights * trust[:, None], ridge])
+        rows = np.concatenate([lights * trust[:, None], hold])
         basis, square = qr(rows, mode="economic")  # reduces N rows to L
         weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
         error = np.abs(lights @ weights - target)
