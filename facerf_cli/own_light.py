@@ -16,7 +16,7 @@ from torch import Tensor
 
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.field import SEEN_WELL, Field, shrunk, weighted_sum
-from facerf_cli.light.estimate import estimate_weights, lamp_error
+from facerf_cli.light.estimate import estimate_lamps, lamp_error
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
@@ -82,7 +82,7 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
     lamp = _lamp(frames)
     pairs = [(torch.cat([one.under(lamp), one.around]), one) for one in frames]
     olats = torch.cat([one.seen(olats) for olats, one in pairs], -1)
-    return RigLight(torch.cat([lamp, _rig()]), estimate_weights(olats, _photo(frames), lamps=len(lamp)))
+    return RigLight(torch.cat([lamp, _rig()]), estimate_lamps(olats, _photo(frames), len(lamp)))
 
 
 def _lamp(frames: Sequence[_Frame]) -> Tensor:

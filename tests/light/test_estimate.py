@@ -4,6 +4,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.light.estimate import (
     LightEvidence,
+    estimate_lamps,
     estimate_signed_weights,
     estimate_smooth_weights,
     estimate_weights,
@@ -192,7 +193,7 @@ def test_light_from_around_is_even_as_far_as_the_image_allows() -> None:
     olats, image = flat(lit(evidence, weights))
     first = [lamp, *(k for k in range(LIGHTS) if k != lamp)]
     noise = 0.02 * image.mean() * torch.randn(image.shape, generator=torch.Generator().manual_seed(3))
-    even = estimate_weights(olats[first], image + noise, lamps=1)
+    even = estimate_lamps(olats[first], image + noise, 1)
     free = estimate_weights(olats[first], image + noise)
     assert even[1:].std() < 0.03 < free[1:].std()
     assert (even[0] - 0.9).abs().max() < 0.1
