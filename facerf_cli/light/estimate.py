@@ -145,7 +145,7 @@ def _channels(olats: Tensor, image: Tensor) -> list[tuple[np.ndarray, np.ndarray
 
 
 def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Non-negative weights [L] with lights [N, L] @ weights = target [N] and hold [H, L] @ weights = held [H].
+    """Solve lights [N, L] @ weights = target [N] and hold [H, L] @ weights = held [H] for weights [L] >= 0.
 
     The latter counts in shares of the target's norm.
     """
