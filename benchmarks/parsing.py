@@ -76,7 +76,7 @@ def main() -> None:
         measure_yale_b(options.yale_b, options.every)
 
 
-def differences(own_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
+def apart_percent(own_px: np.ndarray, other_px: np.ndarray) -> np.ndarray:
     """Differences [68, 2] of landmarks along and across the line of the eyes, in percent of its length."""
     left, right = OUTER_EYE_CORNERS
     line = other_px[right] - other_px[left]
@@ -107,7 +107,7 @@ def measure_yale_b(folder: Path, every: int) -> None:
             bin_ = next(f"{a}-{b} deg" for a, b in pairwise(ANGLES_DEG) if angle < b)
             counts[bin_] += np.array([1, bool(own), bool(other)])
             if own:
-                off = [(subject, differences(own[0].landmarks_px, reference))]
+                off = [(subject, apart_percent(own[0].landmarks_px, reference))]
                 apart["frontal"] += off if flash == frontal else []
                 apart["up to 60 deg"] += off if angle <= 60 else []
                 apart["beyond 60 deg"] += off if angle > 60 else []
@@ -145,7 +145,7 @@ def measure_photos(folder: Path) -> None:
                 default=None,
             )
             if near is not None:
-                off = differences(face.landmarks_px, near.landmarks_px)
+                off = apart_percent(face.landmarks_px, near.landmarks_px)
                 print(
                     "; all {:.2f} %, inner {:.2f} %".format(*distances(off)),
                     end="",
@@ -211,7 +211,7 @@ def measure_held_out(folder: Path) -> None:
             gradients.append(float(((slopes[0] - slopes[1]) ** 2).sum()) / 1000)
             if crop.present[0] and crop.known[0, :68].all():
                 error_percent.append(
-                    distances(differences(found.landmarks[0, :68].numpy(), crop.landmarks[0, :68].numpy()))
+                    distances(apart_percent(found.landmarks[0, :68].numpy(), crop.landmarks[0, :68].numpy()))
                 )
     both, true_count, chosen_count = counts.T
     scores = {
