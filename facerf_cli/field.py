@@ -1,8 +1,7 @@
 """The neural reflectance field of one face: its texture under any single light, and any sum of lights."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -11,17 +10,16 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
-from facerf_cli.light.estimate import LightEvidence, estimate_weights
+from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.quotient import Quotient
-from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
 from facerf_cli.network.inputs import without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
-_LIGHT_SIDE, _QUOTIENT_LIGHTS = 128, 50  # texels on which light is estimated; lights for the photo's quotient
-_SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
+_LIGHT_SIDE = 128  # texels on which light is estimated
+SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,49 +75,6 @@ class Field:
         return max(1, min(most, self.memory_bytes // bytes_per_light))
 
 
-@dataclass(frozen=True, eq=False)
-class OwnLight:
-    """The estimated light of a photo over a coarse rig, and the field's quotient under it."""
-
-    light: RigLight
-    quotient: Quotient
-
-
-def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> OwnLight:
-    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
-
-    A light that is `held` over the frames of a shot, by `light_of_frames`, is not estimated again.
-    """
-    small, olats = _coarse_olats(models, face)
-    light = _estimated([small], [olats]) if held is None else held
-    quotient = Quotient.of(small.texture, weighted_sum([olats], light.weights[None])[0], small.visible)
-    return OwnLight(light, quotient)
-
-
-def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
-    """Estimate one light, on small textures, from several frames of a shot together."""
-    pairs = [_coarse_olats(models, face) for face in faces]
-    return _estimated([small for small, _ in pairs], [olats for _, olats in pairs])
-
-
-def _coarse_olats(models: Models, face: FaceTexture) -> tuple[FaceTexture, Tensor]:
-    small = shrunk(face)
-    return small, torch.cat(list(Field(models, small).olats(_coarse_rig())))
-
-
-def _estimated(faces: Sequence[FaceTexture], olats: Sequence[Tensor]) -> RigLight:
-    """The light over the coarse rig that explains what faces show well."""
-    seen = [face.visible > _SEEN_WELL for face in faces]
-    lit = torch.cat([one[..., mask] for one, mask in zip(olats, seen, strict=True)], -1)
-    photos = torch.cat([face.texture[:, mask] for face, mask in zip(faces, seen, strict=True)], -1)
-    return RigLight(_coarse_rig(), estimate_weights(lit, photos))
-
-
-def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
-    """Compute the quotient image by which the network's field is corrected to its own photo."""
-    return own_light(models, face).quotient
-
-
 def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
     """The photo's side of the evidence for its light, without lights; InputError if too little is visible.
 
@@ -127,7 +82,7 @@ def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
     since the field of open eyes is not learnt (paper, 'Results').
     """
     small = shrunk(face)
-    mask = (small.visible > _SEEN_WELL) & (interior_texture(_LIGHT_SIDE)[0] > 0.5)
+    mask = (small.visible > SEEN_WELL) & (interior_texture(_LIGHT_SIDE)[0] > 0.5)
     if not keep_eyes:
         mask &= region_mask("eyes", _LIGHT_SIDE) < 0.5
     evidence = LightEvidence(torch.zeros(0, 3), torch.zeros(0, 3, *mask.shape), small.texture, mask)
@@ -141,11 +96,6 @@ def shrunk(face: FaceTexture) -> FaceTexture:
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
     small = F.interpolate(fields, side, mode="area")[0]
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
-
-
-@cache
-def _coarse_rig() -> Tensor:
-    return rig_directions(_QUOTIENT_LIGHTS)
 
 
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:

@@ -30,9 +30,7 @@ from facerf_cli.face.landmarks import Face, FaceBox, to_display
 from facerf_cli.field import (
     MEMORY_BYTES,
     Field,
-    own_light,
     photo_evidence,
-    photo_quotient,
     shrunk,
     weighted_sums,
 )
@@ -43,6 +41,7 @@ from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
 from facerf_cli.near_textures import near_texture
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
+from facerf_cli.own_light import own_light, photo_quotient
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
 from facerf_cli.portrait.occluders import uncovered
 from facerf_cli.portrait.person import look_at_person

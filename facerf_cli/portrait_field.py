@@ -21,11 +21,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
-from facerf_cli.field import Field, OwnLight
+from facerf_cli.field import Field
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
+from facerf_cli.own_light import OwnLight
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson

@@ -16,6 +16,7 @@ LEVELS = (
     ("pipeline",),
     (
         "field",
+        "own_light",
         "baselines",
         "composite",
         "group_photo",

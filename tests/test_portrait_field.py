@@ -9,10 +9,10 @@ import torch
 from facerf_cli.composite import Target
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.head import Head
-from facerf_cli.field import own_light
 from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import RigLight, azel_to_direction
 from facerf_cli.models import Models, load_models
+from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, portrait_network

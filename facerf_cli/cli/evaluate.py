@@ -274,6 +274,17 @@ def yale_b(
             rich_help_panel=DATA,
         ),
     ] = None,
+    room: Annotated[
+        float,
+        typer.Option(
+            "--room",
+            metavar="SHARE",
+            min=0.0,
+            max=1.0,
+            help="Light from all around that comes with each flash, as a room sends it back: a share of it.",
+            rich_help_panel=DATA,
+        ),
+    ] = 0.0,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     network_alone: NetworkAloneOption = False,
@@ -295,7 +306,7 @@ def yale_b(
     photo = PhotoOptions(
         settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
     )
-    return run_yale_b(folder, options, photo, shifts, subjects or [], network_alone)
+    return run_yale_b(folder, options, photo, shifts, subjects or [], network_alone, room)
 
 
 def pairs(

@@ -15,13 +15,13 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
-from facerf_cli.field import light_of_frames
 from facerf_cli.film.follow import Sighting, path_of
 from facerf_cli.film.shot_fit import fit_frames, identity_of, spread_over
 from facerf_cli.film.smoothing import MAPS_REACH, steadied
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models, Sides
 from facerf_cli.network.portrait import PortraitMaps
+from facerf_cli.own_light import light_of_frames
 from facerf_cli.portrait.occluders import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image

@@ -24,6 +24,7 @@ _WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their 
 _LEAST_TEXELS = 200  # fewer do not determine where light comes from
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
 _RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
+_EVEN, _ONE_COLOUR = 0.3, 0.3  # the same, against uneven light from around, and lights of several colours
 _REACHES = 0.1  # share of the largest mean radiance of the face under a light; below it, it is not solved for
 _CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
@@ -108,20 +109,53 @@ def estimate_weights(olats: Tensor, image: Tensor) -> Tensor:
     Iteratively reweighted least squares, a channel at a time: clipped, covered and misfitted elements lose
     weight. All images are scene-linear.
     """
-    channels = [_channel_weights(a, b) for a, b in zip(olats.unbind(1), image, strict=True)]
-    return torch.from_numpy(np.stack(channels, -1)).float()
+    pairs = _channels(olats, image)
+    solved = [_reweighted(a, b, _RIDGE * np.eye(len(olats)), np.zeros(len(olats))) for a, b in pairs]
+    return torch.from_numpy(np.stack(solved, -1)).float()
 
 
-def _channel_weights(olats: Tensor, image: Tensor) -> np.ndarray:
-    lights, target = olats.double().T.numpy(), image.double().numpy()  # [N, L], [N]
+def estimate_lamps(olats: Tensor, image: Tensor, lamps: int) -> Tensor:
+    """Solve Eq. (leastsq) for weights [L, C] of some lamps and light from around, as `estimate_weights` does.
+
+    The lights after the first `lamps` are the light from around; it is as even, and all lights are as much of
+    one colour, as the image allows.
+    """
+    count, even = len(olats), np.zeros((len(olats) - lamps, len(olats)))
+    even[:, lamps:] = np.eye(count - lamps) - 1 / (count - lamps)
+    ((lights, target),) = _channels(olats.mean(1, keepdim=True), image.mean(0, keepdim=True))
+    grey = _reweighted(lights, target, _EVEN * even, np.zeros(len(even)))
+    solved = []
+    for own, shown in _channels(olats, image):
+        explained = own @ grey
+        gain = (shown @ explained) / max(explained @ explained, _TINY)
+        solved.append(_reweighted(own, shown, _ONE_COLOUR * np.eye(count), _ONE_COLOUR * gain * grey))
+    return torch.from_numpy(np.stack(solved, -1)).float()
+
+
+def lamp_error(lamp: Tensor, around: Tensor, image: Tensor) -> float:
+    """Root of the mean squared error of an image [N] as a sum of those of a lamp and of light from around."""
+    lights, target = torch.stack([lamp, around], -1).double().numpy(), image.double().numpy()
+    weights = _reweighted(lights, target, np.zeros((0, 2)), np.zeros(0))
+    return float(np.sqrt(np.square(lights @ weights - target).mean()))
+
+
+def _channels(olats: Tensor, image: Tensor) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Lights [N, L] and target [N] of each channel of images [L, C, N] and [C, N]."""
+    return [(a.double().T.numpy(), b.double().numpy()) for a, b in zip(olats.unbind(1), image, strict=True)]
+
+
+def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Solve lights [N, L] @ weights = target [N] and hold [H, L] @ weights = held [H] for weights [L] >= 0.
+
+    The latter counts in shares of the target's norm.
+    """
     if not len(target):  # nothing is visible enough
         return np.zeros(lights.shape[1])
-    ridge = _RIDGE * np.linalg.norm(target) * np.eye(lights.shape[1])
-    trust = np.ones(len(target))
+    trust, size = np.ones(len(target)), np.linalg.norm(target)
     for _ in range(_ROUNDS):
-        rows = np.concatenate([lights * trust[:, None], ridge])
+        rows = np.concatenate([lights * trust[:, None], size * hold])
         basis, square = qr(rows, mode="economic")  # reduces N rows to L
-        weights, _ = nnls(square, basis[: len(target)].T @ (target * trust))
+        weights, _ = nnls(square, basis.T @ np.concatenate([target * trust, size * held]))
         error = np.abs(lights @ weights - target)
         limit = _OUTLIER * np.median(error) + _TINY
         trust = np.sqrt(np.minimum(1, limit / np.maximum(error, limit)))

@@ -8,10 +8,11 @@ E = sum_l w_l s_l, the corrected image of a light is
 
 where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l in each pixel over the photo's
 lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
-lights is the sum of their corrections.
+lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does, its
+likeness falls in proportion: a shadow's error, which is a large share of little light, stays as small there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +27,7 @@ _SMALL_PX = 48  # side at which likeness is measured
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Q - 1 [3, S, S], p [S, S], the floor f, the mean of E, and E [s, s] small and grey, over the person."""
+    """Q - 1 [3, S, S], p [S, S], the floor f, the mean of E over the person, and E [S, S], grey."""
 
     excess: Tensor
     mean_likeness: Tensor
@@ -47,16 +48,16 @@ class Correction:
         ratio = ((photo + floor) / (explained + floor).clamp_min(1e-9)).clamp(*_RANGE)
         mean = float((explained.mean(0) * person).sum() / total)
         plain = Correction(
-            (ratio - 1) * person, torch.ones_like(person), floor, mean, _small(explained, person), person
+            (ratio - 1) * person, torch.ones_like(person), floor, mean, explained.mean(0), person
         )
-        likeness, whole = plain._likeness(olats), plain._with_floor(olats)
+        whole, likeness = plain._with_floor(olats), plain._likeness(olats)
         shares = torch.einsum("lc,lcij->lij", weights, whole)
-        mean_likeness = torch.einsum("l,lij->ij", likeness, shares) / shares.sum(0).clamp_min(1e-9)
-        return Correction(plain.excess, mean_likeness.clamp_min(1e-3), floor, mean, plain.explained, person)
+        mean_likeness = (likeness * shares).sum(0) / shares.sum(0).clamp_min(1e-9)
+        return replace(plain, mean_likeness=mean_likeness.clamp_min(1e-3))
 
     def terms(self, olats: Tensor) -> tuple[Tensor, Tensor]:
         """Factors and additions [l, 3, S, S] by which images [l, 3, S, S] of single lights are corrected."""
-        power = self._likeness(olats)[:, None, None, None] / self.mean_likeness
+        power = self._likeness(olats)[:, None] / self.mean_likeness
         change = power.clamp(max=_LARGEST) * self.excess
         return (1 + change).clamp_min(0), change * self.floor * self._brightness(olats)
 
@@ -69,16 +70,17 @@ class Correction:
         return (means / max(self.mean, 1e-9))[:, None, None, None]
 
     def _likeness(self, olats: Tensor) -> Tensor:
-        """p_l [l]: the cosine between image and explanation, to a power."""
-        small = _small(olats, self.person)
-        lengths = small.flatten(-2).norm(dim=-1) * self.explained.norm()
-        cosine = (small * self.explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
-        return cosine.clamp(0, 1) ** SHARPNESS
+        """p_l [l, S, S]."""
+        small, explained = _small(olats.mean(1), self.person), _small(self.explained, self.person)
+        lengths = small.flatten(-2).norm(dim=-1) * explained.norm()
+        cosine = (small * explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
+        allowed = self._brightness(olats)[:, 0] * (self.explained + self.floor)
+        brighter = self._with_floor(olats).mean(1) / allowed.clamp_min(1e-9)
+        return cosine.clamp(0, 1)[:, None, None] ** SHARPNESS / brighter.clamp_min(1)
 
 
-def _small(images: Tensor, person: Tensor) -> Tensor:
-    """Grey images [..., s, s] of images [..., 3, S, S], over the person."""
-    grey = (images.mean(-3) * person)[None] if images.dim() == 3 else (images.mean(-3) * person)
-    size = (_SMALL_PX, _SMALL_PX)
-    small = F.interpolate(grey[None], size, mode="area")[0]
-    return small[0] if images.dim() == 3 else small
+def _small(grey: Tensor, person: Tensor) -> Tensor:
+    """Grey images [..., s, s] of grey images [..., S, S], over the person."""
+    shown = (grey * person).flatten(0, -3)[None] if grey.dim() > 2 else (grey * person)[None, None]
+    small = F.interpolate(shown, (_SMALL_PX, _SMALL_PX), mode="area")[0]
+    return small if grey.dim() > 2 else small[0]

@@ -27,11 +27,13 @@ from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.synth.backgrounds import background_of
 from facerf_cli.synth.face_crops import blurred
+from facerf_cli.synth.feature_warp import FeatureWarp
 from facerf_cli.synth.random_fields import Uniform
 
 # Shares of samples: without a person, of a body without its head, grey, turned far, with a second person, and
-# with something before the face.
+# with something before the face; of a face whose features were moved.
 _EMPTY, _HEADLESS, _GREY, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.25, 0.15, 0.3, 0.25
+_WARPED = 0.75
 _TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
 # Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
 _SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
@@ -101,7 +103,10 @@ class StoredPortraits:
         photo = self._photo(people, generator)
         headless = torch.rand((), generator=generator) < _HEADLESS
         move = _Placement.below(photo, generator) if headless else _Placement.draw(photo, generator)
-        crop = move.crop(photo, side)
+        warp = None
+        if not headless and torch.rand((), generator=generator) < _WARPED:
+            warp = FeatureWarp.draw(photo.landmarks_px[:68], generator)
+        crop = move.crop(photo, side, warp)
         if headless:
             crop = replace(crop, known=torch.zeros_like(crop.known), present=torch.zeros(1))
         if torch.rand((), generator=generator) < _EMPTY:
@@ -191,8 +196,8 @@ class _Placement:
         x = (uniform(0.3, 0.6) * (1 - 2 * (torch.rand((), generator=generator) < 0.5).float())).view(1)
         return _Placement(matrix, _middle(photo) - matrix @ torch.cat([x, uniform(-0.35, 0.2, 1)]))
 
-    def crop(self, photo: _Photo, side: int) -> PortraitCrops:
-        """Resample a photo: the image is radiance times alpha over black.
+    def crop(self, photo: _Photo, side: int, warp: FeatureWarp | None = None) -> PortraitCrops:
+        """Resample a photo, its features perhaps moved: the image is radiance times alpha over black.
 
         Below the stored photo its lowest row goes on, and is true where it shows a garment. Beside it nothing
         is known of a person who touches the border there.
@@ -200,6 +205,9 @@ class _Placement:
         along = (torch.arange(side) + PIXEL_CENTRE) / side - 0.5
         y, x = torch.meshgrid(along, along, indexing="ij")
         place = torch.stack([x, y], -1) @ self.matrix.T + self.centre
+        landmarks_px = photo.landmarks_px
+        if warp is not None:
+            place, landmarks_px = place + warp.shift(place), warp.shown_at(landmarks_px)
         grid = 2 * place / photo.side_px - 1
         stored = torch.cat([photo.radiance, photo.alpha[None]])[None]
         smaller = float(self.matrix.norm()) / 2**0.5 / side  # stored pixels in a pixel
@@ -212,7 +220,7 @@ class _Placement:
         beside = (grid[..., 0].abs() > 1) | (grid[..., 1] < -1)
         below = (grid[..., 1] > 1) & (label != class_index("garment"))
         lost = (beside | below) & (seen[3] > 0)
-        landmarks = (photo.landmarks_px - self.centre) @ torch.linalg.inv(self.matrix).T + 0.5
+        landmarks = (landmarks_px - self.centre) @ torch.linalg.inv(self.matrix).T + 0.5
         known = ((landmarks > 0.01) & (landmarks < 0.99)).all(-1)  # false for NaN
         return PortraitCrops(
             crops=seen[:3][None],

@@ -19,11 +19,12 @@ class Portrait {
     this.pixels = this.side * this.side;
     this.shadows = new Shadows(arrays, this.side / NETWORK_PX);
     this.people = arrays.share.reduce((a, b) => a + b);
-    this.explainedLength = Math.hypot(...arrays.explained);
+    this.explained = this.small(arrays.explained);
+    this.explainedLength = Math.hypot(...this.explained);
     this.kept = new Map();
   }
 
-  // Shading and highlights [side, side] of a light of rgb 1, and two numbers of their correction.
+  // Shading and highlights [side, side] of a light of rgb 1, and what their correction takes.
   single(toward) {
     const key = toward.join();
     if (!this.kept.has(key)) {
@@ -67,37 +68,46 @@ class Portrait {
     return doubled(sum, 1, small);
   }
 
+  // A grey plane of the person, small.
+  small(grey) {
+    return averaged(grey.map((value, i) => value * this.arrays.share[i]), 1, this.side, this.side / SMALL_PX);
+  }
+
   corrected(shade, glow) {
-    const { albedo, share, explained } = this.arrays;
-    const { pixels } = this;
+    const { albedo, share, explained, likeness } = this.arrays;
+    const { pixels, floor } = this;
     const grey = new Float32Array(pixels);
     let total = 0;
     for (let i = 0; i < pixels; i++) {
-      const mean = (albedo[i] + albedo[pixels + i] + albedo[2 * pixels + i]) / 3;
-      grey[i] = (mean * shade[i] + glow[i]) * share[i];
-      total += grey[i];
+      grey[i] = ((albedo[i] + albedo[pixels + i] + albedo[2 * pixels + i]) / 3) * shade[i] + glow[i];
+      total += grey[i] * share[i];
     }
-    const small = averaged(grey, 1, this.side, this.side / SMALL_PX);
+    const small = this.small(grey);
     let along = 0;
-    for (let i = 0; i < small.length; i++) along += small[i] * explained[i];
+    for (let i = 0; i < small.length; i++) along += small[i] * this.explained[i];
     const cosine = along / Math.max(Math.hypot(...small) * this.explainedLength, 1e-12);
-    const likeness = Math.min(1, Math.max(0, cosine)) ** this.likenessPower;
-    return { shade, glow, likeness, brightness: total / Math.max(this.people, 1) / Math.max(this.mean, 1e-9) };
+    const alike = Math.min(1, Math.max(0, cosine)) ** this.likenessPower;
+    const brightness = total / Math.max(this.people, 1) / Math.max(this.mean, 1e-9);
+    const power = new Float32Array(pixels);
+    for (let i = 0; i < pixels; i++) {
+      const brighter = (grey[i] + floor * brightness) / Math.max(brightness * (explained[i] + floor), 1e-9);
+      power[i] = Math.min(alike / Math.max(brighter, 1) / likeness[i], MOST_LIKELY);
+    }
+    return { shade, glow, power, brightness };
   }
 
   // Shading and highlights [6, side, side] of lights {single, rgb}, as the photo corrects them.
   sum(lights) {
-    const { excess, likeness } = this.arrays;
+    const { excess } = this.arrays;
     const { pixels } = this;
     const result = new Float32Array(6 * pixels);
     for (const { single, rgb } of lights) {
       if (!(rgb[0] || rgb[1] || rgb[2])) continue;
-      const { shade, glow } = single;
+      const { shade, glow, power } = single;
       const added = this.floor * single.brightness;
       for (let i = 0; i < pixels; i++) {
-        const power = Math.min(single.likeness / likeness[i], MOST_LIKELY);
         for (let c = 0; c < 3; c++) {
-          const change = power * excess[c * pixels + i];
+          const change = power[i] * excess[c * pixels + i];
           const factor = change > -1 ? 1 + change : 0;
           result[c * pixels + i] += rgb[c] * shade[i] * factor;
           result[(3 + c) * pixels + i] += rgb[c] * (glow[i] * factor + change * added);

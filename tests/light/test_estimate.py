@@ -4,9 +4,11 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.light.estimate import (
     LightEvidence,
+    estimate_lamps,
     estimate_signed_weights,
     estimate_smooth_weights,
     estimate_weights,
+    lamp_error,
 )
 from facerf_cli.light.sphere import rig_directions
 
@@ -180,3 +182,26 @@ def test_evidence_without_a_face_or_a_light_is_refused_in_words() -> None:
         hidden.require_a_face()
     with pytest.raises(InputError, match="black"):
         shaded_ball().require_a_face()
+
+
+def test_light_from_around_is_even_as_far_as_the_image_allows() -> None:
+    """24 images of a ball have a rank of about 9: free weights would be anything; lamps stay free."""
+    evidence = shaded_ball()
+    weights = torch.full((LIGHTS, 3), 0.1)
+    lamp = int(evidence.directions[:, 2].argmax())
+    weights[lamp] = 0.9
+    olats, image = flat(lit(evidence, weights))
+    first = [lamp, *(k for k in range(LIGHTS) if k != lamp)]
+    noise = 0.02 * image.mean() * torch.randn(image.shape, generator=torch.Generator().manual_seed(3))
+    even = estimate_lamps(olats[first], image + noise, 1)
+    free = estimate_weights(olats[first], image + noise)
+    assert even[1:].std() < 0.03 < free[1:].std()
+    assert (even[0] - 0.9).abs().max() < 0.1
+
+
+def test_the_error_of_a_lamp_is_least_where_it_is() -> None:
+    evidence = shaded_ball()
+    grey = evidence.olats[..., evidence.mask].mean(1)
+    image = 0.8 * grey[5] + 0.3 * grey.mean(0)
+    errors = [lamp_error(lamp, grey.mean(0), image) for lamp in grey]
+    assert errors[5] == min(errors) and errors[5] < 1e-6 < sorted(errors)[1]

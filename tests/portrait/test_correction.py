@@ -66,3 +66,19 @@ def test_no_light_becomes_negative() -> None:
     photo[:, 20:30, 20:40] = 0
     factor, _ = Correction.of(photo, olats(), WEIGHTS, PERSON).terms(olats())
     assert factor.min() >= 0
+
+
+def test_the_error_of_a_shadow_is_not_enlarged_in_the_light() -> None:
+    """A mark in the shadow of the photo's light, under a light without the shadow."""
+    shadow = torch.ones(SIDE, SIDE)
+    shadow[46:62, 16:44] = 0.1  # so small that both lights are alike
+    plain = 0.5 + torch.linspace(0, 0.5, SIDE).expand(SIDE, SIDE)
+    images = torch.stack([plain * shadow, plain])[:, None].expand(-1, 3, -1, -1)
+    weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
+    photo = images[0].clone()
+    photo[2, 50:60, 20:40] *= 3  # blue noise
+    factor, added = Correction.of(photo, images, weights, PERSON).terms(images)
+    change = (images * (factor - 1) + added)[:, 2, 52:58, 24:36].mean((1, 2))
+    brightness = images[1].mean() / images[0].mean()
+    assert change[0] > 0.1  # the photo comes back
+    assert 0 < change[1] < 1.01 * brightness * change[0]

@@ -30,14 +30,15 @@ def run_yale_b(
     shifts: Path | None,
     subjects: Sequence[str],
     network_alone: bool,
+    room: float,
 ) -> int:
     """Measure the subjects of Extended Yale B, all if none are named; the exit code."""
     database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
     chosen = _chosen(database, subjects)
     methods = MethodOptions.of(photo, options)
-    work = _YaleB(methods, database, network_alone)
+    work = _YaleB(methods, database, network_alone, room)
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
-    tables = layout(database, chosen, network_alone)
+    tables = layout(database, chosen, network_alone, room)
     prepare = partial(prepare_methods, methods, options)
     return run_protocol(tables, items, work, options, photo.settings, photo, prepare)
 
@@ -58,13 +59,14 @@ class _YaleB:
     methods: MethodOptions
     database: YaleB
     network_alone: bool
+    room: float
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         methods = load_methods(self.methods)
         photo = self.methods.photo
         geometry = photo.geometry or methods[0].models.default_geometry
         return compare_sitter(
-            self.database, item.name, methods, self.network_alone, geometry, photo.landmarks_from
+            self.database, item.name, methods, self.network_alone, geometry, photo.landmarks_from, self.room
         )
 
 

@@ -30,6 +30,8 @@ from facerf_cli.evaluation.summary import Layout
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.light.studio import StudioLight
+from facerf_cli.light.studio_points import far_samples
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
 
@@ -75,7 +77,9 @@ FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = 
 }
 
 
-def layout(database: YaleB, subjects: Sequence[str], network_alone: bool = False) -> Layout:
+def layout(
+    database: YaleB, subjects: Sequence[str], network_alone: bool = False, room: float = 0.0
+) -> Layout:
     """The contents of the tables, and the notes below them."""
     return Layout(
         name="yale-b",
@@ -83,15 +87,17 @@ def layout(database: YaleB, subjects: Sequence[str], network_alone: bool = False
         metrics=("si_mse", "ssim"),
         by=("column", "angle", "subjects"),
         published=published(),
-        notes=tuple(_notes(database, subjects, network_alone)),
+        notes=tuple(_notes(database, subjects, network_alone, room)),
     )
 
 
-def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool) -> Iterator[str]:
+def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool, room: float) -> Iterator[str]:
     """Notes below the figures."""
     yield f"The field is {'the network alone' if network_alone else 'corrected by its source image'}."
     yield "Grey images, values as given, which are close to linear in light; the mask is one ellipse."
     yield "The flashes' strength is not known: metrics that do not fit a scale (MSE, PSNR) say little."
+    if room:
+        yield f"Each flash comes with {room:.3g} of its light from all around, as of a room (--room)."
     if database.shifts:
         yield "Images are aligned to their subject's frontal one by the given shifts."
     else:
@@ -132,11 +138,13 @@ def compare_sitter(
     network_alone: bool = False,
     geometry: Geometry = "landmarks",
     landmarks_from: LandmarksFrom = "facerf",
+    room: float = 0.0,
 ) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
-    A subject's sources share the landmarks, or the box, of its frontal image. Raises InputError where no face
-    is found in that, or an image cannot be read.
+    `room` is what the room sends back from all around, as a share of what a flash sends. A subject's sources
+    share the landmarks, or the box, of its frontal image. Raises InputError where no face is found in that,
+    or an image cannot be read.
     """
     sitter = Sitter(database, subject)
     questions = list(sitter.questions())
@@ -146,7 +154,7 @@ def compare_sitter(
     for source in dict.fromkeys(question.source for question in questions):
         asked = [question for question in questions if question.source == source]
         photo = sitter.image(source)
-        relit = _relit_by_all(sitter, photo, face, asked, methods, network_alone)
+        relit = _relit_by_all(sitter, photo, face, asked, methods, network_alone, room)
         for row, question in enumerate(asked):
             yield Comparison(
                 case=_case(subject, question),
@@ -180,12 +188,18 @@ def _relit_by_all(
     asked: Sequence[Question],
     methods: Sequence[Method],
     network_alone: bool,
+    room: float,
 ) -> Mapping[str, list[np.ndarray]]:
     """The images [H, W] of a source under every light of the questions, by method."""
     weights = torch.from_numpy(np.stack([sitter.weights(question.light) for question in asked])).float()
     used = weights.sum(0) > 0
-    rgb_weights = weights[:, used, None].expand(-1, -1, 3)
     directions = torch.from_numpy(np.stack([flash.direction for flash in sitter.flashes])).float()[used]
+    weights = weights[:, used]
+    if room:
+        around, share = far_samples(StudioLight())
+        directions = torch.cat([directions, around])
+        weights = torch.cat([weights, room * share * weights.sum(1, keepdim=True)], 1)
+    rgb_weights = weights[..., None].expand(-1, -1, 3)
     pixels, heads = _rgb(photo), dict[int, Head]()
     relit = {}
     for method in methods:

@@ -164,6 +164,9 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
     assert "angle" not in by_name["yaleB07/dome/A-070E+00"].case.facts
     centre = side.predictions["a"][110, 84]
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
+    in_room = {one.case.name: one for one in compare_sitter(small, "yaleB07", methods, room=0.5)}
+    lighter = in_room["yaleB07/frontal/A-070E+00"].predictions["a"][110, 84]
+    np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
 
 def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:
@@ -206,6 +209,8 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
 
 def test_notes_below_the_figures(small: YaleB, tmp_path: Path) -> None:
     plain = layout(small, ["yaleB05"])
+    assert not any("--room" in note for note in plain.notes)
+    assert any("0.03 of its light" in note for note in layout(small, ["yaleB05"], room=0.03).notes)
     assert any("no --shifts" in note for note in plain.notes)
     assert any("chosen on yaleB05" in note for note in plain.notes)
     assert any("1 known to be" in note for note in plain.notes)

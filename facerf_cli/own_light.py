@@ -1,0 +1,135 @@
+"""The light of a photo as its own field explains it, and the quotient that corrects the field to the photo.
+
+A flash on the camera lights a face much as a few lamps around it do, and a free fit to a coarse rig takes
+these, since the field is not exact: then the field is corrected for shadows that the photo does not have. So
+the light is one lamp, which may be anywhere, and light from around, which is as even as the photo allows.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.head import FaceTexture
+from facerf_cli.field import SEEN_WELL, Field, shrunk, weighted_sum
+from facerf_cli.light.estimate import estimate_lamps, lamp_error
+from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.models import Models
+
+_AROUND = 50  # lights of the rig from around
+_RINGS_DEG = (12.0, 5.0)  # of the search for the lamp, each around the best place so far
+_EVERY = 4  # texel that the search looks at
+_RING = 6  # places on a ring
+
+
+@dataclass(frozen=True, eq=False)
+class OwnLight:
+    """The estimated light of a photo, the lamp first, and the field's quotient under it."""
+
+    light: RigLight
+    quotient: Quotient
+
+
+def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> OwnLight:
+    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
+
+    A light that is `held` over the frames of a shot, by `light_of_frames`, is not estimated again.
+    """
+    frame = _Frame.of(models, face)
+    light = _estimated([frame]) if held is None else held
+    small = frame.field.face
+    explained = weighted_sum([frame.under(light.directions[:1]), frame.around], light.weights[None])[0]
+    return OwnLight(light, Quotient.of(small.texture, explained, small.visible))
+
+
+def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
+    """Estimate one light, on small textures, from several frames of a shot together."""
+    return _estimated([_Frame.of(models, face) for face in faces])
+
+
+def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
+    """Compute the quotient image by which the network's field is corrected to its own photo."""
+    return own_light(models, face).quotient
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """The network's field of a small texture, and its OLATs [L, 3, t, t] under the rig from around."""
+
+    field: Field
+    around: Tensor
+
+    @staticmethod
+    def of(models: Models, face: FaceTexture) -> "_Frame":
+        field = Field(models, shrunk(face))
+        return _Frame(field, torch.cat(list(field.olats(_rig()))))
+
+    def under(self, directions: Tensor) -> Tensor:
+        """OLATs [l, 3, t, t] under lights [l, 3]."""
+        return torch.cat(list(self.field.olats(directions)))
+
+    def seen(self, images: Tensor) -> Tensor:
+        """What the photo shows well [..., N] of images [..., t, t]."""
+        return images[..., self.field.face.visible > SEEN_WELL]
+
+
+def _estimated(frames: Sequence[_Frame]) -> RigLight:
+    lamp = _lamp(frames)
+    pairs = [(torch.cat([one.under(lamp), one.around]), one) for one in frames]
+    olats = torch.cat([one.seen(olats) for olats, one in pairs], -1)
+    return RigLight(torch.cat([lamp, _rig()]), estimate_lamps(olats, _photo(frames), len(lamp)))
+
+
+def _lamp(frames: Sequence[_Frame]) -> Tensor:
+    """Direction [1, 3] of the lamp that explains the frames best, together with even light from around."""
+    photo, around = (
+        _photo(frames).mean(0),
+        torch.cat([one.seen(one.around.mean((0, 1))) for one in frames], -1),
+    )
+
+    def errors(olats: Sequence[Tensor]) -> list[float]:
+        """Errors of lamps, given their OLATs [l, 3, t, t] of each frame."""
+        lamps = torch.cat([one.seen(of_one.mean(1)) for of_one, one in zip(olats, frames, strict=True)], -1)
+        return [lamp_error(lamp, around, photo) for lamp in lamps]
+
+    if not len(photo):  # nothing is visible enough
+        return _rig()[:1]
+    places, found = _rig(), errors([one.around for one in frames])
+    for ring_deg in _RINGS_DEG:
+        best = places[found.index(min(found))]
+        ring = _ring(best, ring_deg)
+        places, found = (
+            torch.cat([best[None], ring]),
+            [min(found), *errors([one.under(ring) for one in frames])],
+        )
+    return places[found.index(min(found))][None]
+
+
+def _grey(olats: Sequence[Tensor], frames: Sequence[_Frame]) -> Tensor:
+    """Means [l, n] of the channels of each frame's OLATs [l, 3, t, t], where the search looks."""
+    pairs = zip(olats, frames, strict=True)
+    return torch.cat([one.seen(of_one.mean(1)) for of_one, one in pairs], -1)[:, ::_EVERY]
+
+
+def _photo(frames: Sequence[_Frame]) -> Tensor:
+    """What the photos [3, N] of frames show well."""
+    return torch.cat([one.seen(one.field.face.texture) for one in frames], -1)
+
+
+def _ring(axis: Tensor, degrees: float) -> Tensor:
+    """Directions [_RING, 3] at an angle from a direction [3]."""
+    across = F.normalize(torch.linalg.cross(axis, torch.eye(3)[axis.abs().argmin()]), dim=0)
+    other = torch.linalg.cross(axis, across)
+    turns = torch.arange(_RING)[:, None] * (2 * math.pi / _RING)
+    sideways = turns.cos() * across + turns.sin() * other
+    return F.normalize(axis + math.tan(math.radians(degrees)) * sideways, dim=-1)
+
+
+@cache
+def _rig() -> Tensor:
+    return rig_directions(_AROUND)

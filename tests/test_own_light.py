@@ -1,0 +1,74 @@
+"""The light of a photo, by faces that the field itself has lit."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from facerf_cli.face.head import FaceTexture
+from facerf_cli.field import Field, shrunk
+from facerf_cli.files.images import read_image
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.models import Models, load_models
+from facerf_cli.own_light import light_of_frames, own_light
+from facerf_cli.pipeline import fit_photo
+from facerf_cli.portrait.find import find_faces
+
+PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
+AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
+OFF_DEG = 7.0  # the last ring of the search has 5; the nearest light of the rig is 10 to 16 away
+RIG_DEG = 10.0
+COLOUR = 0.25  # relative error of the lamp's colour: the photo shows it only times that of the skin
+
+
+@pytest.fixture(scope="module")
+def models() -> Models:
+    return load_models(None, "builtin", torch.device("cpu"))
+
+
+@pytest.fixture(scope="module")
+def face(models: Models) -> FaceTexture:
+    photo = read_image(PHOTO).pixels
+    head = fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px)
+    small = shrunk(head.face)
+    return replace(small, visible=torch.ones_like(small.visible))
+
+
+def lit(models: Models, face: FaceTexture, light: RigLight) -> FaceTexture:
+    """The face as the field shows it under a light."""
+    return replace(face, texture=Field(models, face).relit(light.directions, light.weights[None])[0])
+
+
+def degrees_between(one: torch.Tensor, other: torch.Tensor) -> float:
+    return float(torch.rad2deg(torch.acos((one @ other).clamp(-1, 1))))
+
+
+@pytest.mark.parametrize("azel_deg", [(7.0, -6.0), (-38.0, 12.0), (55.0, 30.0)])
+def test_a_lamp_is_found_where_it_is(
+    models: Models, face: FaceTexture, azel_deg: tuple[float, float]
+) -> None:
+    lamp = azel_to_direction(*azel_deg)
+    assert min(degrees_between(one, lamp) for one in rig_directions(50)) > RIG_DEG
+    colour = torch.tensor([[1.0, 0.8, 0.6]])
+    shown = lit(models, face, RigLight(lamp[None], colour))
+    for light in (own_light(models, shown).light, light_of_frames(models, [shown, shown])):
+        assert degrees_between(light.directions[0], lamp) < OFF_DEG
+        assert light.weights[0].sum() > 0.6 * light.weights.sum()
+        torch.testing.assert_close(light.weights[0] / light.weights[0, 0], colour[0], rtol=COLOUR, atol=0)
+
+
+def test_light_from_all_around_has_no_lamp(models: Models, face: FaceTexture) -> None:
+    found = own_light(models, lit(models, face, AROUND)).light.weights
+    assert found[0].sum() < 0.1 * found.sum()
+    assert found[1:].std() < 0.3 * found[1:].mean()
+
+
+def test_the_quotient_is_of_the_light_that_is_held(models: Models, face: FaceTexture) -> None:
+    """A frame of a shot is explained by the shot's light."""
+    lamp, other = (RigLight(azel_to_direction(x, 0.0)[None], torch.ones(1, 3)) for x in (30.0, -30.0))
+    shown = lit(models, face, lamp)
+    held = light_of_frames(models, [lit(models, face, other)])
+    own, wrong = own_light(models, shown), own_light(models, shown, held)
+    assert wrong.light is held
+    assert (wrong.quotient.ratio.log().abs().mean()) > 2 * own.quotient.ratio.log().abs().mean()
