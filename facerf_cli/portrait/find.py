@@ -31,6 +31,7 @@ _MOST_ERROR, _SURE_ERROR = 0.06, 0.018  # expected, of a face and of a sure one,
 _SAME = 0.35  # overlap over union from which on two boxes hold one face
 _DETECTOR_PX = 1280  # longest side of the image that the detector looks at
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
+_BEYOND = 1.6  # side of a square around a face that is larger than the photo, in sides of the photo
 _TILES = 3  # along each side of the photo, half as large as it
 
 
@@ -116,7 +117,7 @@ def _sure(found: list[Seen]) -> list[Seen]:
 def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     """Squares to look at, the likeliest first."""
     yield [*map(_square, detected_boxes(image, _DETECTOR_PX)), _whole(image)]
-    yield [_whole(image, turn_rad) for turn_rad in _TURNS]
+    yield [_whole(image, sides=_BEYOND), *(_whole(image, turn_rad) for turn_rad in _TURNS)]
     yield _tiles(image)
 
 
@@ -175,9 +176,9 @@ def _square(box_px: Box) -> Square:
     return Square((left + right) / 2, (top + bottom) / 2, _BOX_SIDES * (right - left + bottom - top) / 2)
 
 
-def _whole(image: np.ndarray, turn_rad: float = 0.0) -> Square:
+def _whole(image: np.ndarray, turn_rad: float = 0.0, sides: float = 1.0) -> Square:
     height, width = image.shape[:2]
-    return Square(width / 2, height / 2, float(max(height, width)), turn_rad)
+    return Square(width / 2, height / 2, float(max(height, width)) * sides, turn_rad)
 
 
 def _tiles(image: np.ndarray) -> list[Square]:

@@ -152,3 +152,14 @@ def test_views_are_weighed_by_what_is_expected_of_them():
     found = averaged([unsure, sure])
     assert np.allclose(found.landmarks_px - first.landmarks_px, [2.4, 0])  # weights 1/4 and 1
     assert found.square == first.square and np.allclose(found.error_px, 2)
+
+
+def test_a_face_that_is_larger_than_the_photo():
+    """From the eyes to the mouth; the photo looked at as a whole alone is seen upside down."""
+    (whole,) = detect_faces(PHOTO)
+    face = whole.landmarks_px
+    x0, x1 = (int(face[corner, 0]) for corner in (37, 44))
+    y0, y1 = int(face[37, 1]) - 4, int(face[57, 1])
+    (near,) = detect_faces(np.kron(PHOTO[y0:y1, x0:x1], np.ones((3, 3, 1), np.uint8)))
+    off = np.linalg.norm(near.landmarks_px / 3 + [x0, y0] - face, axis=1)
+    assert off[INNER].mean() < 0.12 * iod_px(face)
