@@ -74,7 +74,7 @@ class _Frame:
         return torch.cat(list(self.field.olats(directions)))
 
     def seen(self, images: Tensor) -> Tensor:
-        """What the photo shows well [..., N] of images [..., t, t]."""
+        """Texels [..., N] of images [..., t, t] that the photo shows well."""
         return images[..., self.field.face.visible > SEEN_WELL]
 
 
@@ -117,7 +117,7 @@ def _grey(olats: Sequence[Tensor], frames: Sequence[_Frame]) -> Tensor:
 
 
 def _photo(frames: Sequence[_Frame]) -> Tensor:
-    """What the photos [3, N] of frames show well."""
+    """Texels [3, N] that the photos of frames show well."""
     return torch.cat([one.seen(one.field.face.texture) for one in frames], -1)
 
 

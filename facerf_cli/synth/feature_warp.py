@@ -46,7 +46,7 @@ class FeatureWarp:
         )
 
     def shift(self, places: Tensor) -> Tensor:
-        """Where what is shown at places [..., 2] is taken from, relative to them."""
+        """Offsets from places [..., 2] to those that are shown there."""
         total = torch.zeros_like(places)
         for centre, reach, move, stretch in zip(
             self.centres, self.reaches, self.moves, self.stretches, strict=True
@@ -57,7 +57,7 @@ class FeatureWarp:
         return total
 
     def shown_at(self, places: Tensor) -> Tensor:
-        """Where what lies at places [..., 2] is shown."""
+        """Places at which those at [..., 2] are shown, the inverse of the warp."""
         shown = places
         for _ in range(_ROUNDS):
             shown = places - self.shift(shown)
