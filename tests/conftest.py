@@ -3,7 +3,7 @@
 import os
 import signal
 import tarfile
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +67,8 @@ def _seeded() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _with_all_memory() -> None:
-    """A budget that an earlier test set is gone."""
+def _with_all_memory() -> Iterator[None]:
+    """A budget that a test sets is gone after it, for the fixtures of the next module, too."""
+    memory.set_limit(memory.default_limit())
+    yield
     memory.set_limit(memory.default_limit())

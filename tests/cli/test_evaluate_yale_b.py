@@ -120,6 +120,6 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
     methods = MethodOptions.of(PhotoOptions(Settings()), EvaluateOptions(Path("out"), ("field", "prt")))
-    sent = pickle.loads(pickle.dumps(evaluate_images._YaleB(methods, read_yale_b(folder), False)))
-    assert sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
+    sent = pickle.loads(pickle.dumps(evaluate_images._YaleB(methods, read_yale_b(folder), False, 0.1)))
+    assert sent.room == 0.1 and sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

@@ -71,7 +71,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     )
     line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0", "--ball"]
     assert relight(given, tmp_path, *line) == 0
-    assert predicted == [False, True]  # for the photo's own light, and for all setups
+    assert predicted.count(True) == 1 and predicted[-1]  # for all setups, after the photo's own light
     names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
     names.append("astronaut_light_40_10+-40_0_1_0_0")
     images = sorted(name + suffix for name in names for suffix in (".exr", ".png"))
@@ -81,8 +81,9 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     assert row["status"] == "done" and row["quality"] == "good" and len(row["exposure_ev"]) == 5
     assert row["exposure_ev"][names[0]] == row["exposure_ev"][names[1]]  # a turning sky does not pump
     assert len(capsys.readouterr().out.splitlines()) == 10
+    predicted.clear()
     assert relight(given, tmp_path, *line) == 0
-    assert len(predicted) == 2  # finished already
+    assert not predicted  # finished already
 
 
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
