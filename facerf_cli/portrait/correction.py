@@ -20,6 +20,7 @@ from torch import Tensor
 
 _FLOOR = 0.05  # f, as a share of the mean of the photo's person
 _RANGE = (0.2, 5.0)  # of Q
+_DARK = 4.0  # floors: the radiance below which a photo's colours are noise
 SHARPNESS = 20.0  # exponent of the likeness
 _LARGEST = 1.5  # of p_l / p
 _SMALL_PX = 48  # side at which likeness is measured
@@ -45,7 +46,7 @@ class Correction:
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         total = person.sum().clamp_min(1.0)
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
-        ratio = ((photo + floor) / (explained + floor).clamp_min(1e-9)).clamp(*_RANGE)
+        ratio = _ratio(photo, explained, floor)
         mean = float((explained.mean(0) * person).sum() / total)
         plain = Correction(
             (ratio - 1) * person, torch.ones_like(person), floor, mean, explained.mean(0), person
@@ -77,6 +78,15 @@ class Correction:
         allowed = self._brightness(olats)[:, 0] * (self.explained + self.floor)
         brighter = self._with_floor(olats).mean(1) / allowed.clamp_min(1e-9)
         return cosine.clamp(0, 1)[:, None, None] ** SHARPNESS / brighter.clamp_min(1)
+
+
+def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
+    """Q [3, S, S], of one value in all channels where the photo is so dark that its colour is noise."""
+    ratio = (photo + floor) / (explained + floor).clamp_min(1e-9)
+    shown = photo.mean(0, keepdim=True)
+    grey = (shown + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
+    coloured = shown**2 / (shown**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
+    return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:

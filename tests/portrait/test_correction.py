@@ -76,9 +76,16 @@ def test_the_error_of_a_shadow_is_not_enlarged_in_the_light() -> None:
     images = torch.stack([plain * shadow, plain])[:, None].expand(-1, 3, -1, -1)
     weights = torch.tensor([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]])
     photo = images[0].clone()
-    photo[2, 50:60, 20:40] *= 3  # blue noise
+    photo[:, 50:60, 20:40] *= 3  # not so deep a shadow
     factor, added = Correction.of(photo, images, weights, PERSON).terms(images)
     change = (images * (factor - 1) + added)[:, 2, 52:58, 24:36].mean((1, 2))
     brightness = images[1].mean() / images[0].mean()
     assert change[0] > 0.1  # the photo comes back
     assert 0 < change[1] < 1.01 * brightness * change[0]
+
+
+def test_colours_of_what_is_nearly_black_are_not_multiplied() -> None:
+    photo = photo_under(WEIGHTS)
+    photo[:, 20:30, 20:40] = torch.tensor([2e-3, 1e-3, 5e-3]).view(3, 1, 1)
+    excess = Correction.of(photo, olats(), WEIGHTS, PERSON).excess[:, 22:28, 24:36]
+    assert (excess + 1).amax(0).max() < 1.05 * (excess + 1).amin(0).min()
