@@ -10,6 +10,7 @@ where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l i
 lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
 lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does, its
 likeness falls in proportion: a shadow's error, which is a large share of little light, stays as small there.
+Where the photo is nearly black its colours are noise, and Q is of one value in all channels.
 """
 
 from dataclasses import dataclass, replace
