@@ -91,7 +91,6 @@ def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:
-    """Grey images [..., s, s] of grey images [..., S, S], over the person."""
-    shown = (grey * person).flatten(0, -3)[None] if grey.dim() > 2 else (grey * person)[None, None]
-    small = F.interpolate(shown, (_SMALL_PX, _SMALL_PX), mode="area")[0]
-    return small if grey.dim() > 2 else small[0]
+    """Grey images [n, s, s] of grey ones [n, S, S] or [S, S], over the person."""
+    shown = (grey * person).reshape(1, -1, *person.shape)
+    return F.interpolate(shown, (_SMALL_PX, _SMALL_PX), mode="area")[0]
