@@ -23,6 +23,7 @@ def joined_processes() -> Iterator[None]:
     dist.init_process_group(backend, timeout=_TIMEOUT)
     try:
         yield
+        _meet()  # a process that leaves while others still talk to it can be aborted
     finally:
         dist.destroy_process_group()
 
@@ -50,10 +51,15 @@ def process_device(device: torch.device) -> torch.device:
 def first_process_first() -> Iterator[None]:
     """Run a block in process 0, then in all others at once, so that they find the files that it made."""
     if process_rank() > 0:
-        mean_over_processes(torch.zeros(1))  # on the CPU, where a barrier would take a GPU
+        _meet()
     yield
     if process_rank() == 0:
-        mean_over_processes(torch.zeros(1))
+        _meet()
+
+
+def _meet() -> None:
+    """Wait for all processes, on the CPU, where a barrier would take a GPU."""
+    mean_over_processes(torch.zeros(1))
 
 
 def distributed(objective: nn.Module, skips_networks: bool) -> nn.Module:
