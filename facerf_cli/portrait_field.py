@@ -196,9 +196,13 @@ class PortraitField:
 
 @torch.no_grad()
 def maps_of(person: SeenPerson) -> PortraitMaps:
-    """The light transport of a person, as the Portrait Network sees it."""
-    rig = rig_directions(_SUMMARY_LIGHTS)
-    return portrait_network()(person.inputs(rig, person.visibility(rig)))
+    """The light transport of a person, as the Portrait Network sees it.
+
+    It is the mean of the network's maps and of those that it sees in a mirror, whose errors differ.
+    """
+    rig, network = rig_directions(_SUMMARY_LIGHTS), portrait_network()
+    inputs = person.inputs(rig, person.visibility(rig))
+    return network(inputs).averaged(network(inputs.mirrored()).mirrored())
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

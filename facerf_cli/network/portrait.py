@@ -71,12 +71,31 @@ class PortraitInputs:
         """Move the inputs to `device`."""
         return PortraitInputs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
+    def mirrored(self) -> "PortraitInputs":
+        """The people as a mirror shows them."""
+        seen = {name: getattr(self, name).flip(-1) for name in self.__dataclass_fields__}
+        seen["normals"] = _mirrored_x(seen["normals"])
+        seen["reached"] = _mirrored_harmonics(seen["reached"], _REACH)
+        return PortraitInputs(**seen)
+
     def stacked(self) -> Tensor:
         """All of it [B, C, S, S] as the first layer sees it."""
         root = (self.image.clamp(0, 4) + 0.005).sqrt() - 0.5
         own = (self.own.clamp(0, 4) + 0.02).sqrt() - 1
         layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached, own)
         return torch.cat(layers, 1)
+
+
+def _mirrored_x(vectors: Tensor) -> Tensor:
+    """Vectors [B, 3, S, S], x to the other side."""
+    return torch.cat([-vectors[:, :1], vectors[:, 1:]], 1)
+
+
+def _mirrored_harmonics(coefficients: Tensor, order: int) -> Tensor:
+    """Coefficients [B, K, S, S] of the function of (-x, y, z): the azimuth a from +x becomes 180 - a."""
+    orders = [m for degree in range(order + 1) for m in range(-degree, degree + 1)]
+    signs = [(-1.0) ** m if m >= 0 else -((-1.0) ** m) for m in orders]
+    return coefficients * coefficients.new_tensor(signs).view(-1, 1, 1)
 
 
 def reached_by(directions: Tensor, visible: Tensor, side: int) -> Tensor:
@@ -109,6 +128,26 @@ class PortraitMaps(NamedTuple):
     lit: Tensor
     around: Tensor
     shadow: Tensor
+
+    def mirrored(self) -> "PortraitMaps":
+        """Maps of the people as a mirror shows them: under mirrored lights their images are mirrored."""
+        maps = PortraitMaps(*(values.flip(-1) for values in self))
+        return maps._replace(
+            normals=_mirrored_x(maps.normals),
+            strands=_mirrored_x(maps.strands),
+            lit=_mirrored_harmonics(maps.lit, LIT_ORDER),
+            around=_mirrored_harmonics(maps.around, LIT_ORDER),
+            shadow=_mirrored_harmonics(maps.shadow, SHADOW_ORDER),
+        )
+
+    def averaged(self, other: "PortraitMaps") -> "PortraitMaps":
+        """Mean of two predictions; a strand and its opposite are the same."""
+        mean = PortraitMaps(*((one + two) / 2 for one, two in zip(self, other, strict=True)))
+        alike = (self.strands * other.strands).sum(1, keepdim=True).sign()
+        return mean._replace(
+            normals=F.normalize(mean.normals, dim=1),
+            strands=F.normalize(self.strands + alike * other.strands, dim=1),
+        )
 
     def shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].

@@ -57,6 +57,21 @@ def plain_maps() -> PortraitMaps:
     )
 
 
+def random_maps(seed: int) -> PortraitMaps:
+    random = torch.Generator().manual_seed(seed)
+    wide, half = (1, 3, SIDE, SIDE), (SIDE // 2, SIDE // 2)
+    return plain_maps()._replace(
+        albedo=torch.rand(wide, generator=random),
+        normals=F.normalize(torch.randn(wide, generator=random), dim=1),
+        strands=F.normalize(torch.randn(wide, generator=random), dim=1),
+        gloss=torch.rand(wide, generator=random),
+        trust=torch.rand(1, 1, SIDE, SIDE, generator=random),
+        lit=torch.randn(1, 16, *half, generator=random),
+        around=torch.randn(1, 16, *half, generator=random),
+        shadow=torch.randn(1, 25, *half, generator=random),
+    )
+
+
 def one_light(azimuth_deg: float, elevation_deg: float) -> Tensor:
     return azel_to_direction(azimuth_deg, elevation_deg)[None, None]
 
@@ -111,16 +126,7 @@ def test_highlights_lie_where_the_half_vector_meets_the_normal() -> None:
 
 def test_near_lights_have_a_direction_for_each_pixel() -> None:
     """Where all directions are one, they are that of a far light; halves lit apart are two far lights."""
-    random = torch.Generator().manual_seed(3)
-    wide, half = (1, 3, SIDE, SIDE), (SIDE // 2, SIDE // 2)
-    maps = plain_maps()._replace(
-        normals=F.normalize(torch.randn(wide, generator=random), dim=1),
-        gloss=torch.rand(wide, generator=random),
-        trust=torch.rand(1, 1, SIDE, SIDE, generator=random),
-        lit=torch.randn(1, 16, *half, generator=random),
-        around=torch.randn(1, 16, *half, generator=random),
-        shadow=torch.randn(1, 25, *half, generator=random),
-    )
+    maps = random_maps(seed=3)
     lights = torch.cat([one_light(40, 20), one_light(-60, 10)], 1)
     far = maps.olats(lights, lit_everywhere(2))
     by_pixel = lights[:, :, None, None].expand(-1, -1, SIDE, SIDE, -1)
@@ -140,6 +146,36 @@ def test_strands_shine_across_themselves() -> None:
         maps.shaded(one_light(*at), lit_everywhere())[1].mean() for at in ((60.0, 0.0), (0.0, 60.0))
     )
     assert aside == pytest.approx(0.1, rel=1e-3) and above < 0.05
+
+
+def test_a_mirrored_person_under_mirrored_light_is_the_mirrored_image() -> None:
+    maps, light = random_maps(seed=4), one_light(50, 20)
+    visible = torch.rand(1, 1, SIDE, SIDE, generator=torch.Generator().manual_seed(5))
+    mirrored = maps.mirrored().olats(one_light(-50, 20), visible.flip(-1))
+    torch.testing.assert_close(mirrored, maps.olats(light, visible).flip(-1), rtol=1e-4, atol=1e-5)
+    for one, two in zip(maps.mirrored().mirrored(), maps, strict=True):
+        torch.testing.assert_close(one, two)
+
+
+def test_inputs_in_a_mirror_are_those_of_the_mirrored_person() -> None:
+    rig = rig_directions(48)
+    opposite = rig * torch.tensor([-1.0, 1, 1])
+    visible = torch.rand(48, 8, 8, generator=torch.Generator().manual_seed(6))
+    given = replace(inputs(), reached=reached_by(rig, visible, SIDE)[None])
+    seen = given.mirrored()
+    torch.testing.assert_close(seen.reached[0], reached_by(opposite, visible.flip(-1), SIDE))
+    torch.testing.assert_close(seen.image, given.image.flip(-1))
+    torch.testing.assert_close(seen.normals[:, 0], -given.normals[:, 0].flip(-1))
+    torch.testing.assert_close(seen.normals[:, 1:], given.normals[:, 1:].flip(-1))
+
+
+def test_the_mean_of_two_predictions_takes_a_strand_and_its_opposite_as_one() -> None:
+    maps, other = random_maps(seed=4), random_maps(seed=7)
+    mean = maps.averaged(other)
+    torch.testing.assert_close(mean.albedo, (maps.albedo + other.albedo) / 2)
+    torch.testing.assert_close(mean.normals.norm(dim=1), torch.ones(1, SIDE, SIDE))
+    turned = maps.averaged(maps._replace(strands=-maps.strands))
+    torch.testing.assert_close(turned.strands, maps.strands)
 
 
 def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
