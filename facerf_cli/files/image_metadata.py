@@ -5,13 +5,15 @@ source type.
 """
 
 import logging
+import os
+import shutil
 import struct
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from xml.sax.saxutils import quoteattr
 
 import OpenImageIO as oiio
@@ -199,38 +201,50 @@ def embed_xmp(path: Path, metadata: Attributes) -> None:
     """Insert an XMP packet into a finished PNG, JPEG or TIFF; a file of another kind stays as it is."""
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         return
-    data, packet = path.read_bytes(), xmp_packet(metadata)
-    if data.startswith(_TIFF_START):
-        path.write_bytes(_tiff_with_xmp(data, packet))
-        return
-    if data.startswith(_JPEG_START):
+    packet = xmp_packet(metadata)
+    with path.open("r+b") as stream:
+        start = stream.read(len(_PNG_SIGNATURE))
+        if start.startswith(_TIFF_START):
+            _add_to_tiff(stream, packet)
+    if start.startswith(_JPEG_START):
         body = _JPEG_XMP_SIGNATURE + packet
         segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
         at = len(_JPEG_START)
-        if data[at : at + 2] == b"\xff\xe0":  # the JFIF segment must stay first
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    elif data.startswith(_PNG_SIGNATURE):
+        if start[at : at + 2] == b"\xff\xe0":  # the JFIF segment must stay first
+            at += 2 + int.from_bytes(start[at + 2 : at + 4], "big")
+        _insert(path, at, segment)
+    elif start == _PNG_SIGNATURE:
         body = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + packet
         segment = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
-        at = len(_PNG_SIGNATURE) + 25  # after the header chunk, whose length is fixed
-    else:
-        return
-    path.write_bytes(data[:at] + segment + data[at:])
+        _insert(path, len(_PNG_SIGNATURE) + 25, segment)  # after the header chunk, whose length is fixed
 
 
-def _tiff_with_xmp(data: bytes, packet: bytes) -> bytes:
+def _insert(path: Path, at: int, segment: bytes) -> None:
+    """Insert bytes into a file, of which little is in memory at a time."""
+    longer = path.with_name(f"{path.name}.xmp")
+    with path.open("rb") as before, longer.open("xb") as after:
+        after.write(before.read(at) + segment)
+        shutil.copyfileobj(before, after)
+    longer.replace(path)
+
+
+def _add_to_tiff(stream: BinaryIO, packet: bytes) -> None:
     """Append an XMP packet to a little-endian TIFF, and its directory with the tag that points to it."""
-    (at,) = struct.unpack_from("<I", data, 4)
-    (count,) = struct.unpack_from("<H", data, at)
-    entries = [data[at + 2 + 12 * index :][:12] for index in range(count)]
+    stream.seek(len(_TIFF_START))
+    stream.seek(int.from_bytes(stream.read(4), "little"))
+    (count,) = struct.unpack("<H", stream.read(2))
+    entries = [stream.read(12) for _ in range(count)]
+    following = stream.read(4)  # the offset of the next directory
     kept = [entry for entry in entries if struct.unpack_from("<H", entry)[0] != _TIFF_XMP_TAG]
-    data += bytes(len(data) % 2)  # offsets are even
-    added = struct.pack("<HHII", _TIFF_XMP_TAG, 1, len(packet), len(data))
-    data += packet + bytes(len(packet) % 2)
+    end = stream.seek(0, os.SEEK_END)
+    place = end + end % 2  # offsets are even
+    added = struct.pack("<HHII", _TIFF_XMP_TAG, 1, len(packet), place)
     directory = sorted([*kept, added], key=lambda entry: int(struct.unpack_from("<H", entry)[0]))
-    end = data[at + 2 + 12 * count :][:4]  # the offset of the next directory
-    header = _TIFF_START + struct.pack("<I", len(data))
-    return header + data[8:] + struct.pack("<H", len(directory)) + b"".join(directory) + end
+    stream.write(bytes(end % 2) + packet + bytes(len(packet) % 2))
+    at = stream.tell()
+    stream.write(struct.pack("<H", len(directory)) + b"".join(directory) + following)
+    stream.seek(len(_TIFF_START))
+    stream.write(struct.pack("<I", at))
 
 
 def xmp_packet(metadata: Attributes) -> bytes:

@@ -3,6 +3,7 @@
 import math
 import os
 import re
+import tracemalloc
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,8 +13,8 @@ import pytest
 
 from facerf_cli.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.errors import InputError
-from facerf_cli.files.image_metadata import read_header, xmp_packet
-from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.image_metadata import embed_xmp, read_header, xmp_packet
+from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, Provenance
 
@@ -122,6 +123,21 @@ def test_xmp_marks_a_display_image_as_synthetic(tmp_path: Path, suffix: str) -> 
     assert found[IPTC] == COMPOSITE_SOURCE_TYPE and found["{urn:facerf:1}synthetic"] == "1"
     assert found["{urn:facerf:1}input"] == 'a "b" <c> ü.jpg'
     np.testing.assert_allclose(read_image(path).pixels, pixels, atol=0.01)  # and is still readable
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
+def test_a_packet_is_added_without_the_file_in_memory(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"a.{suffix}"
+    noise = np.random.default_rng(0).random((1200, 1600, 3), np.float32)
+    write_tiff(path, noise) if suffix == "tif" else write_display(path, noise)
+    size = path.stat().st_size
+    tracemalloc.start()
+    embed_xmp(path, {"facerf:input": "another.jpg"})
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert b"another.jpg" in path.read_bytes() and list(tmp_path.iterdir()) == [path]
+    assert most < size / 4
+    assert read_image(path).pixels.shape == noise.shape
 
 
 def test_attributes_without_an_xmp_name_are_left_out() -> None:
