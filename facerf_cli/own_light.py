@@ -23,7 +23,6 @@ from facerf_cli.models import Models
 
 _AROUND = 50  # lights of the rig from around
 _RINGS_DEG = (12.0, 5.0)  # of the search for the lamp, each around the best place so far
-_EVERY = 4  # texel that the search looks at
 _RING = 6  # places on a ring
 
 
@@ -87,10 +86,8 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
 
 def _lamp(frames: Sequence[_Frame]) -> Tensor:
     """Direction [1, 3] of the lamp that explains the frames best, together with even light from around."""
-    photo, around = (
-        _photo(frames).mean(0),
-        torch.cat([one.seen(one.around.mean((0, 1))) for one in frames], -1),
-    )
+    photo = _photo(frames).mean(0)
+    around = torch.cat([one.seen(one.around.mean((0, 1))) for one in frames], -1)
 
     def errors(olats: Sequence[Tensor]) -> list[float]:
         """Errors of lamps, given their OLATs [l, 3, t, t] of each frame."""
@@ -103,17 +100,9 @@ def _lamp(frames: Sequence[_Frame]) -> Tensor:
     for ring_deg in _RINGS_DEG:
         best = places[found.index(min(found))]
         ring = _ring(best, ring_deg)
-        places, found = (
-            torch.cat([best[None], ring]),
-            [min(found), *errors([one.under(ring) for one in frames])],
-        )
+        found = [min(found), *errors([one.under(ring) for one in frames])]
+        places = torch.cat([best[None], ring])
     return places[found.index(min(found))][None]
-
-
-def _grey(olats: Sequence[Tensor], frames: Sequence[_Frame]) -> Tensor:
-    """Means [l, n] of the channels of each frame's OLATs [l, 3, t, t], where the search looks."""
-    pairs = zip(olats, frames, strict=True)
-    return torch.cat([one.seen(of_one.mean(1)) for of_one, one in pairs], -1)[:, ::_EVERY]
 
 
 def _photo(frames: Sequence[_Frame]) -> Tensor:
