@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.light.sh import sh_basis
+from facerf_cli.light.sh import mirror_signs, sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.parsing import Halving, Residual
 from facerf_cli.network.settings import Blocks, Classes, Side, WidthsOfFour, settings_from
@@ -75,7 +75,7 @@ class PortraitInputs:
         """The people as a mirror shows them."""
         seen = {name: getattr(self, name).flip(-1) for name in self.__dataclass_fields__}
         seen["normals"] = _mirrored_x(seen["normals"])
-        seen["reached"] = _mirrored_harmonics(seen["reached"], _REACH)
+        seen["reached"] = _mirrored_harmonics(seen["reached"])
         return PortraitInputs(**seen)
 
     def stacked(self) -> Tensor:
@@ -91,11 +91,10 @@ def _mirrored_x(vectors: Tensor) -> Tensor:
     return torch.cat([-vectors[:, :1], vectors[:, 1:]], 1)
 
 
-def _mirrored_harmonics(coefficients: Tensor, order: int) -> Tensor:
-    """Coefficients [B, K, S, S] of the function of (-x, y, z): the azimuth a from +x becomes 180 - a."""
-    orders = [m for degree in range(order + 1) for m in range(-degree, degree + 1)]
-    signs = [(-1.0) ** m if m >= 0 else -((-1.0) ** m) for m in orders]
-    return coefficients * coefficients.new_tensor(signs).view(-1, 1, 1)
+def _mirrored_harmonics(coefficients: Tensor) -> Tensor:
+    """Coefficients [B, K, S, S] of the function of (-x, y, z)."""
+    signs = mirror_signs(coefficients.shape[1]).to(coefficients)
+    return coefficients * signs.view(-1, 1, 1)
 
 
 def reached_by(directions: Tensor, visible: Tensor, side: int) -> Tensor:
@@ -135,9 +134,9 @@ class PortraitMaps(NamedTuple):
         return maps._replace(
             normals=_mirrored_x(maps.normals),
             strands=_mirrored_x(maps.strands),
-            lit=_mirrored_harmonics(maps.lit, LIT_ORDER),
-            around=_mirrored_harmonics(maps.around, LIT_ORDER),
-            shadow=_mirrored_harmonics(maps.shadow, SHADOW_ORDER),
+            lit=_mirrored_harmonics(maps.lit),
+            around=_mirrored_harmonics(maps.around),
+            shadow=_mirrored_harmonics(maps.shadow),
         )
 
     def averaged(self, other: "PortraitMaps") -> "PortraitMaps":
