@@ -26,7 +26,7 @@ from facerf_cli.logs import LOGGER_NAME, shown
 
 MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 60.0, 2000
 _LONGEST_MESSAGE = 3000
-_LARGEST_BYTES = 4 << 20  # of a case's file
+LARGEST_BYTES = 4 << 20  # of a case's file
 _PACKAGE = "facerf_cli"
 
 
@@ -49,7 +49,7 @@ def damaged(door: Door, name: str, seed: int, number: int) -> tuple[str, bytes]:
     content = sound[file]
     for _ in range(draw.choice((1, 1, 2))):
         try:
-            content = draw.choice(door.faults)(content, draw)[:_LARGEST_BYTES]
+            content = draw.choice(door.faults)(content, draw)[:LARGEST_BYTES]
         except Exception:  # an earlier fault broke the structure that this one changes
             content = mutations.bytes_(content, draw)
     return file, content
@@ -137,15 +137,7 @@ def _one_child(name: str, seed: int, cases: range) -> Iterator[Ended]:
 
 def _serve(door: Door, name: str, seed: int, cases: range, folder: Path, pipe: int) -> None:
     """The child: each case's file is written, opened and removed."""
-    null = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(null, stream)
-    logging.getLogger(LOGGER_NAME).handlers[:] = [logging.NullHandler()]
-    logging.getLogger(LOGGER_NAME).propagate = False
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY_BYTES
-    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    confine()
     begin = _peak_mib()
     for number in cases:
         place = folder / str(number)
@@ -160,6 +152,19 @@ def _serve(door: Door, name: str, seed: int, cases: range, folder: Path, pipe: i
         row = [number, outcome, said, round(grown, 1), round(seconds, 3)]
         fields = ("number", "outcome", "said", "grown_mib", "seconds")
         os.write(pipe, json.dumps(dict(zip(fields, row, strict=True))).encode() + b"\n")
+
+
+def confine() -> None:
+    """Let this process say nothing, have `MEMORY_BYTES` more than now, and leave no core file."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(null, stream)
+    logging.getLogger(LOGGER_NAME).handlers[:] = [logging.NullHandler()]
+    logging.getLogger(LOGGER_NAME).propagate = False
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _peak_mib() -> float:
