@@ -23,7 +23,7 @@ _QUALITY = 95
 _BYTES, _ZERO = 255, 127  # of the basis: steps, and the byte of 0
 _SPACING = 0.5  # sigma of the Gaussians, as a share of the distance between lights
 _CLIPPED = 0.1  # percent of a plane's weights beyond the range of its bytes, on each side
-_PIXELS_AT_ONCE = 1 << 16
+_VALUES_AT_ONCE = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,9 @@ def write_relight_web(
 def _blocks(images: np.ndarray) -> Iterator[tuple[slice, np.ndarray]]:
     """Pixels of all images [n, 3 L] in 0..1, some at a time, and their place among all."""
     flat = images.reshape(len(images), -1, 3)
-    for first in range(0, flat.shape[1], _PIXELS_AT_ONCE):
-        rows = slice(first, min(flat.shape[1], first + _PIXELS_AT_ONCE))
+    pixels = max(1, _VALUES_AT_ONCE // (3 * len(images)))
+    for first in range(0, flat.shape[1], pixels):
+        rows = slice(first, min(flat.shape[1], first + pixels))
         values = flat[:, rows].transpose(1, 0, 2).reshape(rows.stop - first, -1)
         yield rows, values.astype(np.float32) / _BYTES
 

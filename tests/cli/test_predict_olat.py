@@ -113,6 +113,14 @@ def test_the_format_of_web_viewers_has_the_lights_from_in_front(given: Path, tmp
     assert predict(given, tmp_path / "few", *few) == 1
 
 
+def test_the_format_of_web_viewers_asks_for_its_memory(given: Path, tmp_path: Path, capsys: Capture) -> None:
+    line = ["predict-olat", str(PHOTO), "--landmarks", str(given / "astronaut.json"), "-o", str(tmp_path)]
+    line += ["--lights", "2000", "--frame", "face", "--size", "256", "--format", "relight"]
+    assert main(["--memory", "0.5", "--checkpoint", str(given / "lambert.safetensors"), *line]) == 1
+    assert "fewer --lights or a smaller --size" in capsys.readouterr().err
+    assert not (tmp_path / "astronaut_relight").exists()
+
+
 def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path) -> None:
     line = ["--lights", SIDES, "--frame", "photo", "--size", "256", "--page"]
     assert predict(given, tmp_path, *line) == 0

@@ -1,10 +1,12 @@
 """The web format of Relight is read back by a small decoder, written from the description of the format."""
 
 import json
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from facerf_cli.files.relight_web import RelightWebSettings, write_relight_web
@@ -86,3 +88,15 @@ def test_fewer_planes_are_written_as_asked(tmp_path: Path) -> None:
     )
     assert len(list((tmp_path / "out").glob("plane_*.jpg"))) == 2
     assert Decoder(tmp_path / "out").info["nplanes"] == 6
+
+
+def test_many_lights_take_no_more_memory_than_their_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.files.relight_web._VALUES_AT_ONCE", 1 << 18)
+    images = np.random.default_rng(0).integers(0, 255, (40, 192, 192, 3), np.uint8)
+    tracemalloc.start()
+    write_relight_web(tmp_path / "many", images, rig_directions(40).numpy())
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 2 * images.nbytes  # all values as floats would be four times as large

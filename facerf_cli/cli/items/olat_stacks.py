@@ -41,16 +41,16 @@ from facerf_cli.resize import shrunk_photo
 from facerf_cli.strips import whole
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
-_FRONT, _FEWEST_FRONT = (
-    0.05,
-    9,
-)  # least z of a light from in front; lights below which nothing is interpolated
+_FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
+_HALF_AND_SHOWN = 9  # bytes a pixel of an image for web viewers: half floats, then bytes
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
 
 
 def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, Any]]:
     """Predict and write the stack of each chosen face of a photo; the files, and facts for the report."""
     directions = directions_of(work.lights)
+    if work.format == "relight":
+        directions = _from_in_front(item, directions)
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
     outputs: list[Path] = []
@@ -64,7 +64,7 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
         if work.format == "exr":
             write_olat_stack(stack, header, olats)
         else:
-            _write_relight_web(item, stack.parent, header, olats)
+            _write_relight_web(stack.parent, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
             write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
@@ -72,23 +72,33 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
     return outputs, facts_of(faces) | {"lights": len(directions)}
 
 
-def _write_relight_web(item: Item, folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
-    """Write the images of the lights from in front, exposed alike so that the brightest is well shown."""
-    front = header.directions[:, 2] > _FRONT
-    if front.sum() < _FEWEST_FRONT:
+def _from_in_front(item: Item, directions: Tensor) -> Tensor:
+    """The lights that web viewers show; InputError if they are too few."""
+    front = directions[directions[:, 2] > _FRONT]
+    if len(front) < _FEWEST_FRONT:
         raise InputError(
             f"{item.input_path}: --format relight needs {_FEWEST_FRONT} lights from in front, not "
-            f"{front.sum()}; "
-            "give more --lights"
+            f"{len(front)}; give more --lights"
         )
-    images = torch.cat([batch.half() for batch in olats])[torch.from_numpy(front)]
-    brightest = np.stack([image.float().mean(0).numpy() for image in images]).max(0)
-    ev = auto_exposure_ev(np.repeat(brightest[..., None], 3, 2), header.seen)
-    shown = np.empty((len(images), *images.shape[2:], 3), np.uint8)
-    for image, half in zip(shown, images, strict=True):
+    return front
+
+
+def _write_relight_web(folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
+    """Write the images, exposed alike so that the brightest is well shown."""
+    lights, (height, width) = len(header.directions), header.seen.shape
+    needed = _HALF_AND_SHOWN * lights * height * width
+    memory.require(f"--format relight of {lights} lights", needed, "fewer --lights or a smaller --size")
+    halves, brightest = [], torch.zeros(height, width)
+    for batch in olats:
+        halves.append(batch.half())
+        brightest = torch.maximum(brightest, batch.mean(1).amax(0))
+    ev = auto_exposure_ev(brightest[..., None].expand(-1, -1, 3).numpy(), header.seen)
+    shown = np.empty((lights, height, width, 3), np.uint8)
+    for image, half in zip(shown, (half for batch in halves for half in batch), strict=True):
         exposed = half.float().permute(1, 2, 0).numpy() * np.float32(2.0**ev)
         image[:] = np.round(encode_display(exposed, SOFT_VIEW) * 255)
-    write_relight_web(folder, shown, header.directions[front], {"exposure_ev": ev})
+    del halves
+    write_relight_web(folder, shown, header.directions, {"exposure_ev": ev})
 
 
 def _of_person(
