@@ -21,7 +21,7 @@ CORPUS = ROOT / "tests" / "corpus"
 FINDINGS = sorted(path.relative_to(CORPUS) for path in CORPUS.rglob("*") if path.is_file())
 BY_FOLDER = {re.sub(r"\W+", "_", name): name for name in DOORS}  # as inputs.py names them
 NOT_FOR_IT = {"environment maps", "options", "command lines"}  # have samples that they refuse
-SCRIPTS = ("inputs", "kills", "places")
+SCRIPTS = ("inputs", "coverage", "kills", "places")
 
 
 @pytest.mark.parametrize("finding", FINDINGS, ids=lambda path: path.as_posix())

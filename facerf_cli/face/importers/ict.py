@@ -39,7 +39,7 @@ _PARTS = {  # first and last vertex; an eyeball is its sclera, which covers the 
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
 # Errors that reading a damaged archive can raise.
-_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
+_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile, UnicodeDecodeError, MemoryError)
 _ARCHIVE_ERRORS = (OSError, EOFError, RuntimeError, lzma.LZMAError, tarfile.TarError, *_ZIP_ERRORS)
 _ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 
@@ -134,9 +134,8 @@ def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
                     raise InputError(f"{path}: {name} is too large; fetch ICT-FaceKit again")
                 yield found[1], text
     except _ARCHIVE_ERRORS as error:
-        raise InputError(
-            f"{path}: cannot be read ({one_line(str(error))}); fetch ICT-FaceKit again"
-        ) from None
+        reason = one_line(str(error) or type(error).__name__)
+        raise InputError(f"{path}: cannot be read ({reason}); fetch ICT-FaceKit again") from None
 
 
 def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:

@@ -226,3 +226,10 @@ def test_what_is_not_ict_facekit_is_refused_in_one_line(case: str, tmp_path: Pat
     with pytest.raises(InputError, match=message) as refused:
         import_face_model("ict-facekit", make(tmp_path))
     assert str(tmp_path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_an_archive_that_asks_for_too_much_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = zipped(tmp_path / "a.zip")
+    monkeypatch.setattr(zipfile.ZipFile, "namelist", lambda _: bytearray(1 << 62))
+    with pytest.raises(InputError, match="MemoryError"):
+        import_face_model("ict-facekit", path)
