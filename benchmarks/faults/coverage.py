@@ -80,13 +80,14 @@ def _row(name: str, seed: int, seconds: int, findings: Path) -> bool:
 
 def _fuzz(door: Door, seed: int, seconds: int, folder: Path, findings: Path, counts: RawArray) -> None:
     """The child: libFuzzer ends it after so many seconds, or at a crash or a hang."""
-    files = sorted(door.sound())
     begin = folder / "begin"
     begin.mkdir()
-    with atheris.instrument_imports(["facerf_cli"]):  # of what the door imports only when it opens
+    with atheris.instrument_imports(["facerf_cli"]):  # of what only this door and its samples import
+        sound = door.sound()
+        files = sorted(sound)
         for number, file in enumerate(files):
-            (begin / str(number)).write_bytes(bytes([number]) + door.sound()[file])
-            _outcome(door, folder / "case", file, door.sound()[file])
+            (begin / str(number)).write_bytes(bytes([number]) + sound[file])
+            _outcome(door, folder / "case", file, sound[file])
     confine()
     os.dup2(os.open(folder / "said", os.O_WRONLY | os.O_CREAT), 2)
     kinds = set()
@@ -112,7 +113,7 @@ def _fuzz(door: Door, seed: int, seconds: int, folder: Path, findings: Path, cou
         except Exception:  # an earlier fault broke the structure that this one changes
             return atheris.Mutate(data, most)
 
-    longest = min(LARGEST_BYTES, 4096 + 2 * max(map(len, door.sound().values())))
+    longest = min(LARGEST_BYTES, 4096 + 2 * max(map(len, sound.values())))
     options = {
         "seed": seed,
         "max_total_time": seconds,
