@@ -194,9 +194,9 @@ def _index(path: Path) -> None:
 
 
 def _report(path: Path) -> None:
-    from facerf_cli.cli.batch import _open_report
+    from facerf_cli.cli.report import open_report
 
-    _open_report(path, "segment", [], [], lambda _: [])
+    open_report(path, "segment", [], [], lambda _: [])
 
 
 def _figures(path: Path) -> None:
@@ -207,9 +207,9 @@ def _figures(path: Path) -> None:
 
 def _names(path: Path) -> None:
     """The file's content is a name: of an input, in a report, a page and a message."""
-    from facerf_cli.cli.batch import _rows_of
     from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
     from facerf_cli.cli.naming import NamePattern
+    from facerf_cli.cli.report import rows_of
     from facerf_cli.logs import json_line, shown
     from facerf_cli.viewer.page import IndexEntry, index_page
 
@@ -228,7 +228,7 @@ def _names(path: Path) -> None:
         assert out in Path(os.path.normpath(made)).parents, f"out of the folder: {made!a}"
     report = path.parent / "report.jsonl"
     report.write_text(json_line({"verb": "x", "item": item.name}) + "\n", encoding="utf-8")
-    (row,) = _rows_of(report)
+    (row,) = rows_of(report)
     assert row["item"] == json.loads(json_line({"item": item.name}))["item"]
     assert "<script>x" not in index_page([IndexEntry(f"<script>x{name}", name, "")])
     assert shown(name).isprintable()

@@ -123,9 +123,9 @@ def _kill_at(call: str, count: int, after: bool) -> None:
         return wrapped
 
     if call == "row":
-        from facerf_cli.cli import batch
+        from facerf_cli.cli import report
 
-        batch.json_line = counted(batch.json_line)
+        report.json_line = counted(report.json_line)
     else:
         setattr(os, call, counted(getattr(os, call)))
 

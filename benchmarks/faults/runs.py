@@ -14,7 +14,7 @@ from pathlib import Path
 
 from benchmarks._common import ASTRONAUT
 from benchmarks.faults import samples
-from facerf_cli.cli.batch import REPORT_NAME
+from facerf_cli.cli.report import REPORT_NAME
 from facerf_cli.files import atomic
 
 _OWN = (REPORT_NAME, ".facerf-index.jsonl")

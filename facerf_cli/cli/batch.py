@@ -14,7 +14,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +24,15 @@ from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
-from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import atomic_path, sweep_leftovers
+from facerf_cli.cli.report import ItemResult, Outcome, add_row, open_report, report_name, unusable
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.files.atomic import sweep_leftovers
 from facerf_cli.files.folder_lock import alone_in
-from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
-from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
+from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, unexpected
 from facerf_cli.stopping import end_again
 from facerf_cli.workers import process_died, spread
 
-REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -47,27 +46,6 @@ class BatchOptions:
     jobs: int = 1  # 0, with `--ray`: as many as there are processors
     in_a_row: int = 1  # neighbouring items that one of the processes takes
     print_outputs: bool = True  # on stdout; not those that are to be joined
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of `process`: the files it wrote, and facts for the report's row."""
-
-    outputs: Sequence[Path]
-    facts: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Result:
-    """The end of one item, in a form that can be sent between processes."""
-
-    item: Item
-    seconds: float
-    outcome: Outcome | None = None
-    made: Made | None = None
-    error: str = ""
-    trace: str = ""
-    stops_the_run: FacerfError | None = None
 
 
 def run_batch(
@@ -134,7 +112,7 @@ def run_items(
             try:
                 stack.enter_context(alone_in(options.output, _lock_name(settings.shard)))
             except OSError as error:
-                raise _unusable(options.output, error) from error
+                raise unusable(options.output, error) from error
         batch = _Batch(verb, items, process, outputs_of, options, settings)
         if index is None and recipes_of:
             index = FolderIndex(options.output, verb, settings.shard, recipes_of)
@@ -167,7 +145,7 @@ def _run_alone(
     if options.dry_run:
         _say_what_is_made_again(reasons)
         return _list_what_would_be_done(todo, finished, outputs_of)
-    report = _open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
+    report = open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
     if index and (todo or index.has_news):
         index.open()
     _say_what_is_skipped(reasons, options)
@@ -196,8 +174,7 @@ def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderInd
                     raise result.stops_the_run
                 if index and result.made:
                     index.add(result.made, batch.outputs_of(result.item))
-                with report.open("a", encoding="utf-8") as stream:
-                    stream.write(json_line(_report_row(batch.verb, result, batch.options.output)) + "\n")
+                add_row(report, batch.verb, result)
                 failures += _print_result(result, batch.options)
     finally:
         if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
@@ -216,11 +193,6 @@ def all_finished(
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
     share = settings.shard.share(items)
     return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
-
-
-def report_name(shard: Shard) -> str:
-    """The report's name; each shard has its own, since shards run at the same time."""
-    return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
 
 
 def _lock_name(shard: Shard) -> str:
@@ -264,18 +236,18 @@ class _OfFile:
 
 @dataclass(frozen=True)
 class _Work:
-    """Runs `process` on an item and returns a `_Result`, whatever happens."""
+    """Runs `process` on an item and returns a `ItemResult`, whatever happens."""
 
     process: Callable[[Item], Outcome]
     indexed: bool
     memory_bytes: int
 
-    def __call__(self, item: Item) -> _Result:
+    def __call__(self, item: Item) -> ItemResult:
         start_s = time.perf_counter()
         memory.set_limit(self.memory_bytes)
 
-        def result(**ends: Any) -> _Result:
-            return _Result(item, round(time.perf_counter() - start_s, 3), **ends)
+        def result(**ends: Any) -> ItemResult:
+            return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
             read = read_row(item.input_path) if self.indexed and is_regular(item.input_path) else None
@@ -293,9 +265,9 @@ class _Work:
             end_again()
 
 
-def _broken(item: Item, error: Exception) -> _Result:
+def _broken(item: Item, error: Exception) -> ItemResult:
     """The result of an item whose process died."""
-    return _Result(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
+    return ItemResult(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
 
 
 def _why_again(
@@ -351,72 +323,7 @@ def _list_what_would_be_done(
     return 0
 
 
-def _open_report(
-    path: Path,
-    verb: str,
-    todo: list[Item],
-    finished: list[Item],
-    outputs_of: Callable[[Item], Sequence[Path]],
-) -> Path:
-    """Start the report: older rows stay, except those of items that are about to be made again.
-
-    A run without `--shard` takes over the rows of earlier shards.
-    """
-    rows = {(row.get("verb"), row.get("item")): row for row in _rows_of(path)}
-    for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
-        for row in _rows_of(shard):
-            key = row.get("verb"), row.get("item")
-            if key not in rows or rows[key].get("status") == "failed":
-                rows[key] = row
-    for item in todo:
-        rows.pop((verb, item.name), None)
-    for item in finished:
-        if (verb, item.name) not in rows:
-            skipped = _Result(item, 0.0, Outcome(outputs_of(item)))
-            rows[verb, item.name] = _report_row(verb, skipped, path.parent) | {"status": "skipped"}
-    try:
-        with atomic_path(path) as temporary:
-            temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
-    except FacerfError as error:
-        raise _unusable(path.parent, error.__cause__ or error) from error
-    return path
-
-
-def _unusable(folder: Path, error: BaseException) -> UsageError:
-    reason = error.strerror if isinstance(error, OSError) else error
-    return UsageError(f"-o {folder}: cannot be written to ({reason}); give another folder")
-
-
-def _rows_of(path: Path) -> Iterator[dict[str, Any]]:
-    if not is_regular(path):
-        return
-    for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-        try:
-            row = parse_json(line)
-        except ValueError:  # a run that was killed may leave half a line
-            continue
-        if isinstance(row, dict) and isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
-            yield row
-
-
-def _report_row(verb: str, result: _Result, output_folder: Path) -> dict[str, Any]:
-    outcome = result.outcome or Outcome([])
-    row = {
-        "verb": verb,
-        "item": result.item.name,
-        "input": result.item.input_path,
-        "status": "failed" if result.error else "done",
-        "seconds": result.seconds,
-        "error": shown(result.error) or None,
-        "outputs": [
-            path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
-            for path in outcome.outputs
-        ],
-    }
-    return row | {name: value for name, value in outcome.facts.items() if name not in row}
-
-
-def _print_result(result: _Result, options: BatchOptions) -> int:
+def _print_result(result: ItemResult, options: BatchOptions) -> int:
     """Print outputs to stdout, an error to stderr; return 1 for a failure."""
     if result.error:
         log.error("%s", result.error)
@@ -435,8 +342,8 @@ def print_path(text: object) -> None:
 
 
 def _with_progress(
-    results: Iterator[_Result], total: int, verb: str, settings: Settings
-) -> Iterator[_Result]:
+    results: Iterator[ItemResult], total: int, verb: str, settings: Settings
+) -> Iterator[ItemResult]:
     """Pass the results through, with a progress bar on stderr if that is a terminal."""
     # imported here, since --help does without it
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
     LIGHT,
@@ -18,6 +18,7 @@ from facerf_cli.cli.options import (
     settings_of,
 )
 from facerf_cli.cli.recipe import OneRecipe
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_files
+from facerf_cli.cli.batch import BatchOptions, run_files
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.naming import file_pattern
@@ -34,6 +34,7 @@ from facerf_cli.cli.photo_options import (
     TextureSizeOption,
 )
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import (
     NoCutsOption,
     PhotosArgument,

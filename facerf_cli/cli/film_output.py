@@ -9,12 +9,13 @@ from typing import Annotated, Protocol, Self
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
 from facerf_cli.cli.folder_index import FolderIndex
 from facerf_cli.cli.inputs import FILM_SUFFIXES, Item
 from facerf_cli.cli.options import IMAGE, Overwrite, Settings
 from facerf_cli.cli.output_options import Format
 from facerf_cli.cli.recipe import DigestOf, Recipe, RecipesOf
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import UsageError
 from facerf_cli.logs import LOGGER_NAME

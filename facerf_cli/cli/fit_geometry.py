@@ -5,7 +5,7 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
     DryRunOption,
@@ -27,6 +27,7 @@ from facerf_cli.cli.photo_options import (
     TextureSizeOption,
 )
 from facerf_cli.cli.recipe import OneRecipe
+from facerf_cli.cli.report import Outcome
 
 _OUTPUTS = (
     "_texture.exr",

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import (
     IMAGE,
@@ -32,6 +32,7 @@ from facerf_cli.cli.photo_options import (
     TextureSizeOption,
 )
 from facerf_cli.cli.recipe import OneRecipe
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import UsageError
 

@@ -7,13 +7,13 @@ from typing import Literal
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.cli.backgrounds import BackgroundChoice
-from facerf_cli.cli.batch import Outcome
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling
 from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import Shot, follow_all, recipe_of_shots
 from facerf_cli.cli.values import Exposure
 from facerf_cli.errors import FacerfError, UsageError

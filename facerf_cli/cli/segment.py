@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_files
+from facerf_cli.cli.batch import BatchOptions, run_files
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import (
@@ -20,6 +20,7 @@ from facerf_cli.cli.options import (
 )
 from facerf_cli.cli.photo_options import FaceOption, LandmarksFromOption, LandmarksOption, PhotoOptions
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
     NoCutsOption,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_files, sums_up
+from facerf_cli.cli.batch import BatchOptions, run_files, sums_up
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.options import (
     IMAGE,
@@ -26,6 +26,7 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
 )
 from facerf_cli.cli.recipe import OneRecipe
+from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import UsageError
 
 _PAGE, _INDEX = ".html", "index.html"

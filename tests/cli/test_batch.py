@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, run_batch
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.recipe import Recipe
+from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.logs import configure_logging
@@ -165,7 +166,8 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SLOW_VERB = """
 import sys, time
 from pathlib import Path
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_batch
+from facerf_cli.cli.batch import BatchOptions, run_batch
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.recipe import Recipe
 from facerf_cli.files.atomic import atomic_path

@@ -9,10 +9,11 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.capture.draft_lights import read_light_list
-from facerf_cli.cli.batch import _exist, print_path, report_name
+from facerf_cli.cli.batch import _exist, print_path
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import Shard
+from facerf_cli.cli.report import report_name
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.case import read_array
 from facerf_cli.face.fit import load_fit

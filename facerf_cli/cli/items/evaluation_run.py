@@ -13,13 +13,14 @@ import numpy as np
 from PIL import Image
 
 from facerf_cli import __version__
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.cli.batch import BatchOptions, run_items, sums_up
 from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation_key import evaluation_key, item_key, networks_of
 from facerf_cli.cli.items.photos import face_model
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.case import Comparison, Others
 from facerf_cli.evaluation.case_files import (

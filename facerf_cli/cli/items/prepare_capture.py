@@ -17,7 +17,7 @@ from facerf_cli.capture.draft import as_text, draft_stage
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.select import Selection, has_new_frames, select_frames
 from facerf_cli.capture.stage_json import STAGE_FILE
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.cli.batch import BatchOptions, run_items, sums_up
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.capture_findings import (
     CheckOnly,
@@ -30,6 +30,7 @@ from facerf_cli.cli.items.capture_findings import (
 )
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.prepare_dataset import Checks, PrepareOptions
+from facerf_cli.cli.report import Outcome
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,

@@ -8,11 +8,12 @@ from typing import Any
 from rich.progress import track
 
 from facerf_cli import memory
-from facerf_cli.cli.batch import BatchOptions, Outcome, run_items
+from facerf_cli.cli.batch import BatchOptions, run_items
 from facerf_cli.cli.inputs import Item, collect_items
 from facerf_cli.cli.lights import MAP_SUFFIXES
 from facerf_cli.cli.options import Settings, workers_of
 from facerf_cli.cli.relight_dataset import RelightDataset
+from facerf_cli.cli.report import Outcome
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import RELIT, draw_pairs, image_path, pairs_path
 from facerf_cli.dataset.relight import relight_subject

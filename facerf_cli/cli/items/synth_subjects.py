@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from facerf_cli.cli.batch import Outcome, run_items, sums_up
+from facerf_cli.cli.batch import run_items, sums_up
 from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.synth_stage import SynthStage
 from facerf_cli.synth.path_tracer import load_mitsuba
 from facerf_cli.synth.stage import StageSettings, close_capture, open_capture, write_subject
