@@ -236,7 +236,7 @@ class _OfFile:
 
 @dataclass(frozen=True)
 class _Work:
-    """Runs `process` on an item and returns a `ItemResult`, whatever happens."""
+    """Runs `process` on an item and returns an `ItemResult`, whatever happens."""
 
     process: Callable[[Item], Outcome]
     indexed: bool
