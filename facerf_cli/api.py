@@ -6,7 +6,7 @@ command line (docs/design.md).
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -31,6 +31,9 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.strips import whole
 
 Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
+Background = Literal["photo", "none"]
+_UNIT = 1e-3  # how far the length of a unit direction may be from 1
+_ALIKE = 1e-3  # difference of two crops of one photo, of its brightest value
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +50,12 @@ class Light:
     def single(
         azimuth_deg: float, elevation_deg: float, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> "Light":
-        """One light; azimuth > 0 is the image's right, elevation > 0 above."""
+        """One light; azimuth > 0 is the image's right, elevation > 0 above.
+
+        Raises ValueError for an elevation beyond 90 degrees, a negative colour or what is no number.
+        """
+        if not (np.isfinite((azimuth_deg, *rgb)).all() and abs(elevation_deg) <= 90 and min(rgb) >= 0):
+            raise ValueError(f"no light from {azimuth_deg}, {elevation_deg} degrees of {rgb}")
         direction = azel_to_direction(azimuth_deg, elevation_deg)
         return Light(direction.numpy()[None], np.array([rgb], np.float32))
 
@@ -71,14 +79,13 @@ class Light:
         return Light(directions, np.concatenate([self.weights, other.weights]))
 
     def _rig(self) -> RigLight:
-        directions, weights = (
-            torch.from_numpy(np.ascontiguousarray(values, np.float32))
-            for values in (self.directions, self.weights)
-        )
-        if directions.ndim != 2 or directions.shape != weights.shape or directions.shape[1] != 3:
-            shapes = f"{list(directions.shape)} and {list(weights.shape)}"
+        weights = torch.from_numpy(np.ascontiguousarray(self.weights, np.float32))
+        if np.shape(self.directions) != weights.shape:
+            shapes = f"{list(np.shape(self.directions))} and {list(weights.shape)}"
             raise ValueError(f"directions and weights have shapes {shapes}, not [L, 3]")
-        return RigLight(directions, weights)
+        if not weights.isfinite().all():
+            raise ValueError("weights are not all finite")
+        return RigLight(_directions(self.directions), weights)
 
 
 def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:
@@ -140,10 +147,28 @@ def fit_photo(
 
 
 def _checked(photo: np.ndarray) -> np.ndarray:
-    photo = np.ascontiguousarray(photo, np.float32)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
+    if not np.issubdtype(photo.dtype, np.floating):
+        raise ValueError(f"photo holds {photo.dtype}; give scene-linear floats, as read_image does")
+    photo = np.ascontiguousarray(photo, np.float32)
+    if not np.isfinite(photo).all():
+        raise ValueError("photo holds values that are not finite")
     return photo
+
+
+def _directions(values: np.ndarray) -> torch.Tensor:
+    directions = torch.from_numpy(np.ascontiguousarray(values, np.float32))
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"directions have shape {list(directions.shape)}, not [L, 3]")
+    if not ((directions.norm(dim=1) - 1).abs() < _UNIT).all():
+        raise ValueError("directions are not all of length 1")
+    return directions
+
+
+def _one_of(choices: Any, name: str, value: str) -> None:
+    if value not in get_args(choices):
+        raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
 
 
 def relight(
@@ -155,18 +180,23 @@ def relight(
     alone: bool = False,
     reflectance: RelightKind = "portrait",
     network_alone: bool = False,
-    background: Literal["photo", "none"] = "photo",
+    background: Background = "photo",
 ) -> np.ndarray:
     """Relight a photo's person: the photo [H, W, 3], or with `alone` the face with alpha [H, W, 4].
 
     `pose` turns the head, which shows the face alone. `network_alone` leaves out the correction by the photo.
-    Without a background ("none") the person has alpha [H, W, 4]; colours are not multiplied by it.
+    Without a background ("none") the person has alpha [H, W, 4]; colours are not multiplied by it. Raises
+    ValueError for another photo than that of the head.
     """
+    _one_of(RelightKind, "reflectance", reflectance)
+    _one_of(Background, "background", background)
     if network_alone and reflectance not in ("field", "portrait"):
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     fit = _posed(head.fit, pose)
     target = Target(fit, "face" if alone or pose is not None else "photo", background=background)
-    photo = np.ascontiguousarray(photo, np.float32)
+    photo = _checked(photo)
+    if not np.allclose(head.fit.crop.apply(photo), head.cropped, rtol=0, atol=_ALIKE * head.cropped.max()):
+        raise ValueError("photo is not the one that the head was fitted in; fit it again")
     with torch.no_grad():
         of_head = pipeline.reflectance_of(models, head, reflectance, network_alone, photo=photo)
         image = pipeline.relight(models, photo, head, light._rig(), target, of_head)
@@ -185,7 +215,7 @@ def predict_olat(
     `lights` is the size of a uniform rig, or unit directions [L, 3] in camera space.
     """
     rig = np.asarray(lights)
-    directions = torch.from_numpy(rig).float() if rig.ndim else rig_directions(int(rig))
+    directions = _directions(rig) if rig.ndim else rig_directions(int(rig))
     fit = _posed(head.fit, pose)
     rotation = None if fit is None else fit.rotation
     batches = pipeline.predict_olat(models, head, directions, rotation, network_alone)
@@ -198,6 +228,7 @@ def estimate_light(models: Models, head: Head, lights: int = 150, reflectance: K
 
     Raises InputError where too little of the face is visible.
     """
+    _one_of(Kind, "reflectance", reflectance)
     with torch.no_grad():
         light = pipeline.estimate_light(models, head, reflectance, rig_directions(lights)).light
     return Light(light.directions.numpy(), light.weights.numpy())

@@ -62,13 +62,15 @@ class Target:
     """The pose and the surroundings in which a relit head is shown.
 
     `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its
-    person relit, or the rendered face alone. A `matte` [H, W] in 0..1 says what is relit, by default all.
-    Behind it stays the photo, or nothing, or what is given with each light.
+    person relit, or the rendered face alone. A `matte` [H, W] in 0..1 says what is relit, by default all;
+    it is multiplied by the `alpha` [H, W] of the photo itself. Behind it stays the photo, or nothing, or
+    what is given with each light.
     """
 
     fit: FaceFit | None = None
     composite: Literal["photo", "face"] = "photo"
     matte: np.ndarray | None = None
+    alpha: np.ndarray | None = None
     background: Background = "photo"
 
 

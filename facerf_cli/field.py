@@ -13,7 +13,7 @@ from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.models import Models
-from facerf_cli.network.inputs import without_cast
+from facerf_cli.network.inputs import is_grey, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
@@ -48,7 +48,7 @@ class Field:
         normals = normals[None].to(device)
         visible = face.visible[None, None]
         texture = without_cast(face.texture[None], visible, self.models.source_colours)
-        source = (texture, face.normals[None], visible)
+        source, grey = (texture, face.normals[None], visible), is_grey(face.texture)
         with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
             encoded = network.encode(*(tensor.to(device) for tensor in source))
         for chunk in torch.split(lights, self._batch(len(lights))):
@@ -56,6 +56,7 @@ class Field:
             with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
                 olats = network.decode(encoded, normals, chunk[None].to(device))[0]
             olats = olats.float().cpu()
+            olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
             yield self.quotient.corrected(olats) if self.quotient else olats
 
     @property

@@ -162,9 +162,12 @@ def composition_of(
     if photo is None or target.composite == "face":
         return Composition(models.face, photo, head, target)
     person = WholePerson(photo, reflectance) if isinstance(reflectance, PortraitField) else None
-    if target.matte is None:
-        target = replace(target, matte=person.matte if person else person_matte(photo, head))
-    return Composition(models.face, photo, head, target, person)
+    matte = target.matte
+    if matte is None:
+        matte = person.matte if person else person_matte(photo, head)
+    if target.alpha is not None:
+        matte = matte * target.alpha
+    return Composition(models.face, photo, head, replace(target, matte=matte), person)
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,6 +25,7 @@ from facerf_cli.field import Field
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.inputs import is_grey
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.own_light import OwnLight
 from facerf_cli.portrait.classes import class_index
@@ -202,7 +203,8 @@ def maps_of(person: SeenPerson) -> PortraitMaps:
     """
     rig, network = rig_directions(_SUMMARY_LIGHTS), portrait_network()
     inputs = person.inputs(rig, person.visibility(rig))
-    return network(inputs).averaged(network(inputs.mirrored()).mirrored())
+    maps = network(inputs).averaged(network(inputs.mirrored()).mirrored())
+    return maps.without_colours() if is_grey(inputs.image[0]) else maps
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

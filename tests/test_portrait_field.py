@@ -76,6 +76,14 @@ def test_under_its_own_light_the_photo_comes_back(
     assert isinstance(alone, PortraitField) and alone.correction is None
 
 
+def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
+    grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
+    head = fit_photo(models, grey, find_faces(grey, "grey")[0].landmarks_px, models.sides(64))
+    field = reflectance_of(models, head, "portrait", photo=grey)
+    image = relight(models, grey, head, lamp(60), Target(background="none"), field).pixels
+    np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
+
+
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
     rig = rig_directions(48)
     given = field.person.inputs(rig, field.person.visibility(rig))

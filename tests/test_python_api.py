@@ -1,5 +1,6 @@
 """The Python API: the page in the docs runs, and it gives what the command line gives."""
 
+import math
 import re
 import subprocess
 import sys
@@ -79,8 +80,45 @@ def test_what_cannot_be_used_is_said(page: dict[str, Any]) -> None:
         facerf.fit_photo(models, np.zeros((200, 300), np.float32))
     with pytest.raises(InputError):
         facerf.Light.from_envmap(np.ones((30, 40, 3), np.float32))
-    with pytest.raises(ValueError, match="not \\[L, 3\\]"):
-        facerf.relight(models, page["photo"], page["head"], facerf.Light(np.ones((2, 3)), np.ones((3, 3))))
+    with pytest.raises(ValueError, match="uint8"):
+        facerf.fit_photo(models, np.zeros((200, 300, 3), np.uint8))
+    with pytest.raises(ValueError, match="not finite"):
+        facerf.segment(np.full((200, 300, 3), np.nan, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("light", "said"),
+    [
+        (facerf.Light(np.ones((2, 3)), np.ones((3, 3))), "not \\[L, 3\\]"),
+        (facerf.Light(np.ones((2, 3)), np.ones((2, 3))), "length 1"),
+        (facerf.Light(np.eye(3), np.full((3, 3), np.nan)), "not all finite"),
+    ],
+)
+def test_lights_that_are_none(page: dict[str, Any], light: facerf.Light, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        facerf.relight(page["models"], page["photo"], page["head"], light)
+    with pytest.raises(ValueError, match=said):
+        light.to_envmap(16)
+
+
+@pytest.mark.parametrize("wrong", [(math.nan, 0), (0, 300), (0, 0, (1, -1, 1))])
+def test_a_single_light_that_is_none(wrong: Any) -> None:
+    with pytest.raises(ValueError, match="no light from"):
+        facerf.Light.single(*wrong)
+
+
+def test_words_and_photos_that_do_not_fit(page: dict[str, Any]) -> None:
+    models, photo, head, light = (page[name] for name in ("models", "photo", "head", "two"))
+    with pytest.raises(ValueError, match="not one of photo, none"):
+        facerf.relight(models, photo, head, light, background="nonne")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not one of portrait, field"):
+        facerf.relight(models, photo, head, light, reflectance="foo")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not one of field"):
+        facerf.estimate_light(models, head, reflectance="portrait")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="fit it again"):
+        facerf.relight(models, photo[::2, ::2], head, light)
+    with pytest.raises(ValueError, match="length 1"):
+        facerf.predict_olat(models, head, np.ones((2, 3)))
 
 
 def test_importing_it_loads_nothing_heavy() -> None:

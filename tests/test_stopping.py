@@ -59,10 +59,23 @@ with atomic_path(Path(sys.argv[1], "a.bin")) as temporary:
 """
 
 
-def started(tmp_path: Path, kind: str, program: str = WRITER, **options: object) -> subprocess.Popen:
+def started(
+    tmp_path: Path,
+    kind: str,
+    program: str = WRITER,
+    heeds: signal.Signals = signal.SIGINT,
+    ignores: signal.Signals | None = None,
+) -> subprocess.Popen:
+    """A program that heeds a signal, even where the tests run under nohup."""
+
+    def prepare() -> None:
+        signal.signal(heeds, signal.SIG_DFL)
+        if ignores is not None:
+            signal.signal(ignores, signal.SIG_IGN)
+
     (tmp_path / "writer.py").write_text(program)
     command = [sys.executable, str(tmp_path / "writer.py"), str(tmp_path), kind]
-    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, **options)
+    process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, preexec_fn=prepare)
     wait_until((tmp_path / "started").exists, process)
     return process
 
@@ -76,9 +89,7 @@ def temporaries(folder: Path) -> list[Path]:
 def test_a_signal_ends_whatever_runs_and_leaves_nothing(
     kind: str, number: signal.Signals, tmp_path: Path
 ) -> None:
-    process = started(
-        tmp_path, kind, preexec_fn=lambda: signal.signal(number, signal.SIG_DFL)
-    )  # under nohup, too
+    process = started(tmp_path, kind, heeds=number)
     assert temporaries(tmp_path)
     process.send_signal(number)
     _, said = process.communicate(timeout=50)  # less than the writer's 60 s
@@ -87,7 +98,7 @@ def test_a_signal_ends_whatever_runs_and_leaves_nothing(
 
 
 def test_a_hangup_that_is_ignored_stays_so(tmp_path: Path) -> None:
-    process = started(tmp_path, "python", preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))
+    process = started(tmp_path, "python", ignores=signal.SIGHUP)
     process.send_signal(signal.SIGHUP)
     time.sleep(0.5)
     assert process.poll() is None  # as nohup wants it
@@ -110,7 +121,7 @@ def test_a_second_ctrl_c_at_once_does_not_stop_the_cleaning(tmp_path: Path) -> N
 def test_an_exit_that_was_swallowed_is_raised_before_an_output_gets_its_name(
     kind: str, number: signal.Signals, code: int, tmp_path: Path
 ) -> None:
-    process = started(tmp_path, kind, SWALLOWER)
+    process = started(tmp_path, kind, SWALLOWER, number)
     process.send_signal(number)
     _, said = process.communicate(timeout=50)
     assert process.returncode == code and b"ignored" not in said

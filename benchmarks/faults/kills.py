@@ -59,6 +59,7 @@ def main() -> None:
 
 
 def _undisturbed(verb: Verb, folder: Path) -> tuple[dict[str, bytes], float]:
+    verb.begin(folder / "in", folder / "whole")
     begin = time.monotonic()
     ended = run(verb.line(folder / "in", folder / "whole"), notes=folder / "said")
     assert ended.code == 0, ended.said
@@ -68,7 +69,7 @@ def _undisturbed(verb: Verb, folder: Path) -> tuple[dict[str, bytes], float]:
 def _aimed(verb: Verb, folder: Path, whole: dict[str, bytes], draw: random.Random, most: int) -> list[str]:
     """Kill at one of the first `most` calls that change the disk, up to three times, then finish."""
     out, found = folder / "out", []
-    fresh(out).rmdir()
+    verb.begin(folder / "in", out)
     for _ in range(draw.choice((1, 1, 2, 3))):
         call, count, after = draw.choice(_CALLS), draw.randrange(1, most), draw.random() < 0.5
         ended = run(verb.line(folder / "in", out), partial(_kill_at, call, count, after))
@@ -82,7 +83,7 @@ def _random(
 ) -> list[str]:
     """Send a signal at any time, up to three times, then finish."""
     out, found = folder / "out", []
-    fresh(out).rmdir()
+    verb.begin(folder / "in", out)
     for _ in range(draw.choice((1, 1, 2, 3))):
         notes, number = folder / "said", draw.choice(_SIGNALS)
         process = start(verb.line(folder / "in", out), lambda: None, notes)

@@ -22,15 +22,27 @@ _OWN = (REPORT_NAME, ".facerf-index.jsonl")
 
 @dataclass(frozen=True)
 class Verb:
-    """A verb on a folder of inputs: its arguments without inputs and output."""
+    """A verb on a folder of inputs: its arguments without inputs and output.
+
+    One that writes into the folder of its inputs (`in_place`) is given a copy of it as the output folder.
+    """
 
     name: str
     arguments: tuple[str, ...]
     fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
+    in_place: bool = False
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
+        if self.in_place:
+            return [self.name, str(output), *self.arguments]
         return [self.name, str(inputs), *self.arguments, "-o", str(output)]
+
+    def begin(self, inputs: Path, output: Path) -> None:
+        """Leave the output folder as it is before the first run."""
+        shutil.rmtree(output, ignore_errors=True)
+        if self.in_place:
+            shutil.copytree(inputs, output)
 
 
 def _fill_with_lights(folder: Path, count: int, _: int = 0) -> None:
@@ -51,6 +63,16 @@ def _fill_with_photos(folder: Path, count: int, side_px: int = 128) -> None:
         Image.fromarray(pixels).save(folder / f"photo_{number:05d}.png", compress_level=1)
 
 
+def _fill_with_captures(folder: Path, count: int, _: int = 0) -> None:
+    _run_here("synth-stage", "--subjects", str(count), "--lights", "12", "--size", "64", "-o", str(folder))
+
+
+def _fill_with_dataset(folder: Path, count: int, _: int = 0) -> None:
+    with tempfile.TemporaryDirectory() as stage:
+        _fill_with_captures(Path(stage), count)
+        _run_here("prepare-dataset", stage, "-o", str(folder))
+
+
 _ON_PHOTOS = {
     "segment": (),
     "fit-geometry": (),
@@ -58,7 +80,13 @@ _ON_PHOTOS = {
     "predict-olat": ("--lights", "4", "--frame", "uv"),
     "relight": ("--light", "75,20", "--exposure", "0"),
 }
-VERBS = {"convert-light": Verb("convert-light", ("--to", "sh"), _fill_with_lights)} | {
+_PAIRS = ("--envmaps", "procedural:2", "--per-subject", "4")
+_OTHERS = (
+    Verb("convert-light", ("--to", "sh"), _fill_with_lights),
+    Verb("prepare-dataset", (), _fill_with_captures),
+    Verb("relight-dataset", _PAIRS, _fill_with_dataset, in_place=True),
+)
+VERBS = {verb.name: verb for verb in _OTHERS} | {
     name: Verb(name, given, _fill_with_photos) for name, given in _ON_PHOTOS.items()
 }
 
@@ -69,15 +97,22 @@ def warm_up(verb: Verb) -> None:
 
     import OpenImageIO as oiio
 
-    from facerf_cli.main import main
-
     importlib.import_module("zoneinfo")  # late imports fail for a user who cannot read this Python
     oiio.attribute("threads", 1)  # a fork has one thread, and would wait for the others
     oiio.attribute("exr_threads", -1)
-    with tempfile.TemporaryDirectory() as name, redirect_stdout(StringIO()):
-        verb.fill(fresh(Path(name) / "in"), 1)
-        code = main([*verb.line(Path(name) / "in", Path(name) / "out"), "-q"])
-    assert code == 0, f"{verb.name} ends with {code}"
+    with tempfile.TemporaryDirectory() as name:
+        inputs, output = Path(name) / "in", Path(name) / "out"
+        verb.fill(fresh(inputs), 1)
+        verb.begin(inputs, output)
+        _run_here(*verb.line(inputs, output))
+
+
+def _run_here(*line: str) -> None:
+    from facerf_cli.main import main
+
+    with redirect_stdout(StringIO()):
+        code = main([*line, "-q"])
+    assert code == 0, f"{line[0]} ends with {code}"
 
 
 @dataclass(frozen=True)
@@ -152,13 +187,13 @@ def faults_of(folder: Path, whole: dict[str, bytes], finished: bool) -> list[str
     found += [f"missing: {name}" for name in whole if name not in there]
     found += [f"left: {path.name}" for path in folder.rglob(".*part-*")]
     found += [f"left: {path.name}" for path in folder.rglob(".facerf-lock*")]
-    if not (folder / REPORT_NAME).exists():
-        return [*found, "no report"]
-    rows = [json.loads(line) for line in (folder / REPORT_NAME).read_text().split("\n") if line]
-    twice = [item for item, count in Counter(row["item"] for row in rows).items() if count > 1]
-    found += [f"two rows: {item}" for item in twice]
-    found += [f"row of {row['item']}: {row['status']}" for row in rows if row["status"] == "failed"]
-    return found
+    reports = list(folder.rglob(REPORT_NAME))
+    for report in reports:
+        rows = [json.loads(line) for line in report.read_text().split("\n") if line]
+        twice = [item for item, count in Counter(row["item"] for row in rows).items() if count > 1]
+        found += [f"two rows: {item}" for item in twice]
+        found += [f"row of {row['item']}: {row['status']}" for row in rows if row["status"] == "failed"]
+    return found if reports else [*found, "no report"]
 
 
 def fresh(folder: Path) -> Path:

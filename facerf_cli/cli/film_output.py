@@ -12,7 +12,7 @@ import typer
 from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
 from facerf_cli.cli.folder_index import FolderIndex
 from facerf_cli.cli.inputs import FILM_SUFFIXES, Item
-from facerf_cli.cli.options import IMAGE, Overwrite, Settings
+from facerf_cli.cli.options import IMAGE, Overwrite, Settings, folder_not_file
 from facerf_cli.cli.output_options import Format
 from facerf_cli.cli.recipe import DigestOf, Recipe, RecipesOf
 from facerf_cli.cli.report import Outcome
@@ -170,6 +170,7 @@ def film_output(output: Path, fps: str | None) -> FilmOutput | None:
             raise UsageError(f"-o {output}: films are written as .mp4 or .mov; give one of these")
         if fps is not None:
             raise UsageError("--fps: is for -o FILE.mp4 or FILE.mov; leave it out")
+        folder_not_file(output)
         return None
     from facerf_cli.files.film import require_av
 

@@ -100,13 +100,12 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
         other = by_name.setdefault(item.name.casefold(), item)
         apart = other.name != item.name and other.input_path.parent == item.input_path.parent
         if other is not item and not apart:
-            advice = (
-                "rename one, name the folder that holds both, or give --name, such as '{dir}/{stem}_{ext}'"
+            alike = "--name names them alike; give it more fields, such as {stem} and {ext}"
+            by_path = (
+                f"would both be written as {item.name}; rename one, name the folder that holds both, or give "
+                "--name, such as '{dir}/{stem}_{ext}'"
             )
-            raise UsageError(
-                f"{other.input_path} and {item.input_path}: would both be written as {item.name}; "
-                + ("give --name more fields, such as {stem} and {ext}" if pattern else advice)
-            )
+            raise UsageError(f"{other.input_path} and {item.input_path}: {alike if pattern else by_path}")
 
 
 def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:

@@ -15,6 +15,11 @@ from facerf_cli.errors import UsageError
 from facerf_cli.workers import Workers
 
 T = TypeVar("T")
+_FILE_SUFFIX = re.compile(
+    r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
+    r"|mp4|mov|m4v|webm|avi|mkv)",
+    re.IGNORECASE,
+)
 _SHARE = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 EPILOG = (
     "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help') may stand before "
@@ -122,10 +127,24 @@ InputsArgument = Annotated[
         show_default=False,
     ),
 ]
+
+
+def folder_not_file(output: Path) -> Path:
+    """The folder that `-o` names; raises UsageError for a file's name, unless such a folder is there."""
+    if _FILE_SUFFIX.fullmatch(output.suffix) and not output.is_dir():
+        raise UsageError(f"-o {output}: is a file's name; give a folder, such as -o {output.with_suffix('')}")
+    return output
+
+
 OutputOption = Annotated[
     Path,
     typer.Option(
-        "--output", "-o", metavar="DIR", help="Write the results to this folder.", show_default=False
+        "--output",
+        "-o",
+        metavar="DIR",
+        help="Write the results to this folder.",
+        show_default=False,
+        callback=folder_not_file,
     ),
 ]
 Overwrite = Literal["never", "changed", "always"]

@@ -128,11 +128,14 @@ def refuse_unused(context: typer.Context, formats: tuple[Format, ...]) -> None:
 
 
 def config_of(path: Path | None) -> str:
-    """The configuration of `--ocio` as OpenImageIO takes it; raises UsageError for a missing file."""
+    """The configuration of `--ocio` as OpenImageIO takes it; raises UsageError for a file that is none."""
     if path is None:
         return ""
     if not path.is_file():
         raise UsageError(f"--ocio {path}: no such file; give an OpenColorIO configuration")
+    from facerf_cli import ocio
+
+    ocio.check(str(path))
     return str(path)
 
 

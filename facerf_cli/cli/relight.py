@@ -1,7 +1,9 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
+import itertools
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -10,10 +12,10 @@ import typer
 
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
-from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
+from facerf_cli.cli.batch import BatchOptions, all_finished, print_path, run_files
 from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
 from facerf_cli.cli.folder_index import FolderIndex
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
+from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
 from facerf_cli.cli.naming import NamePattern
@@ -174,8 +176,8 @@ def relight(
         str,
         typer.Option(
             metavar="KIND|FILE|COLOUR",
-            help="Show behind the person the photo, the envmap, none (alpha), an image, or a colour: "
-            "#RRGGBB or linear R,G,B.",
+            help="Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), "
+            "which keep their look; the envmap; or none (alpha).",
             rich_help_panel=IMAGE,
         ),
     ] = "photo",
@@ -261,9 +263,10 @@ def relight(
 ) -> None:
     """Relight photos, or OLAT stacks, under environment maps and single lights.
 
-    Each image is written as a scene-linear EXR with the matte as layer person.A, and as a PNG at --exposure.
+    Each image is a scene-linear EXR with the matte as layer person.A, and a PNG at --exposure.
+    A background that keeps its look has its own values in the EXR at --exposure 0, else those over 2^EV.
     A film, or images with --sequence, is one shot between cuts: one identity, and one light by which the
-    field is corrected; the frames around a frame steady its pose, expression and matte. -o FILE.mp4 or
+    field is corrected; frames steady each other's pose, expression and matte. -o FILE.mp4 or
     FILE.mov joins frames to a film, with the sound of the film that they come from.
 
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
@@ -329,7 +332,11 @@ def relight(
         refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
         _write_to_stdout(inputs, work)
         return
+    if ball and not work.maps:
+        raise UsageError("--ball: shows maps; give --envmap, or leave it out")
     items, shots = collect_frames(inputs, output, settings, sequence, pattern, not no_cuts)
+    if photo_of_stack is not None and not _holds_a_stack(items):
+        raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
     check_shots(shots, photo)
     in_a_row = FRAMES_IN_A_ROW if shots else 1
     options = BatchOptions(output, overwrite, dry_run, jobs, in_a_row, print_outputs=film is None)
@@ -351,6 +358,12 @@ def relight(
     raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))
 
 
+def _holds_a_stack(items: Sequence[Item]) -> bool:
+    from facerf_cli.files.olat_stack import is_olat_stack
+
+    return any(item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path) for item in items)
+
+
 def _write_to_stdout(inputs: list[str], work: Relight) -> None:
     """Write the one image of one photo as bytes; raises UsageError where there are several."""
     with tempfile.TemporaryDirectory() as folder:
@@ -368,10 +381,9 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
     def path_of(setup: LightSetup) -> Path:
         return options.output / "balls" / f"{setup.name}{setup.frame}.exr"
 
-    maps = [setup for setup in work.setups if setup.envmap is not None]
     missing = [
         setup
-        for setup in maps
+        for setup in work.maps
         if options.overwrite == "always"
         or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
     ]
@@ -379,4 +391,7 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
         from facerf_cli.cli.items.light_weights import readable, write_balls
 
         drawn = readable(missing)
-        write_balls(drawn, [path_of(setup) for setup in drawn], work.exposure, work.output)
+        paths = [path_of(setup) for setup in drawn]
+        write_balls(drawn, paths, work.exposure, work.output)
+        for path, suffix in itertools.product(paths, work.output.suffixes):
+            print_path(path.with_suffix(suffix))

@@ -47,6 +47,11 @@ class Relight:
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
     shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
+    @property
+    def maps(self) -> list[LightSetup]:
+        """The setups that are maps."""
+        return [setup for setup in self.setups if setup.envmap is not None]
+
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
         tag = "" if self.composite == "photo" else self.photo.first_tag

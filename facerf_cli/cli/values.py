@@ -13,6 +13,8 @@ _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 
 _MOST_DIGITS = 9  # of a count; Python refuses to read thousands
+_MOST_EV = 20.0
+_TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
 Exposure = float | Literal["auto", "face"]  # EV, or the rule that chooses it
 PoseDeg = tuple[float, float, float]
 
@@ -60,6 +62,10 @@ def parse_pose(text: str | None) -> PoseDeg | None:
     if text is None:
         return None
     yaw_deg, pitch_deg, roll_deg = numbers(text, ("YAW,PITCH,ROLL",), "--pose")
+    if max(abs(yaw_deg), abs(pitch_deg)) > _TURNED_AWAY_DEG or abs(roll_deg) > _MOST_ROLL_DEG:
+        raise UsageError(
+            f"--pose {text!r}: turns the face away; give yaw and pitch of -90 to 90, roll of -180 to 180"
+        )
     return yaw_deg, pitch_deg, roll_deg
 
 
@@ -69,7 +75,10 @@ def parse_exposure(text: str) -> Exposure:
         return "auto"
     if text == "face":
         return "face"
-    return numbers(text, ("auto or face or EV",), "--exposure")[0]
+    (ev,) = numbers(text, ("auto or face or EV",), "--exposure")
+    if abs(ev) > _MOST_EV:
+        raise UsageError(f"--exposure {text!r}: out of range; give {-_MOST_EV:g} to {_MOST_EV:g} EV")
+    return ev
 
 
 def parse_lights(text: str) -> int | list[tuple[float, float]]:

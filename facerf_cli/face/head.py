@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.crop import GIVE_LANDMARKS
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles
@@ -73,6 +74,6 @@ def unwrap_face(
     unwrapped, visible = unwrap(image, vertices, grid_triangles(), fit.camera, side)
     texture, visible = unwrapped[:3], visible * (unwrapped[3] > _INSIDE_PHOTO)
     if visible.max() < 0.5:
-        raise InputError("the fitted face lies outside the image; give its landmarks with --landmarks")
+        raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
     normals = normal_map(vertices, grid_triangles(), side)
     return FaceTexture(inpaint(texture, visible), visible, normals)

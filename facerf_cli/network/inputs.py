@@ -12,6 +12,7 @@ MEAN_RADIANCE = 0.25  # of the visible face once its exposure is divided out
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 
 _ORDINARY_CAST = 2.0  # standard deviations within which a colour cast is left to the network
+_GREY = 1e-4  # difference of the channels of a grey image, of its mean, left by resampling
 _LEAST_DEVIATION = 0.02  # of a log ratio of colours: that of grey data would be 0
 
 
@@ -80,6 +81,11 @@ def colour_cast(texture: Tensor, visible: Tensor, trained: SourceColours) -> Ten
 def without_cast(texture: Tensor, visible: Tensor, trained: SourceColours | None) -> Tensor:
     """Divide textures by their `colour_cast`, as in training; unchanged where the colours are unknown."""
     return texture if trained is None else texture / colour_cast(texture.detach(), visible, trained)
+
+
+def is_grey(image: Tensor) -> bool:
+    """True for an image [3, ...] without colours; its person is predicted without colours, too."""
+    return bool((image - image[:1]).abs().max() <= _GREY * image.mean())
 
 
 def mean_colours(texture: Tensor, visible: Tensor) -> Tensor:

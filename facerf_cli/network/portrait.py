@@ -148,6 +148,11 @@ class PortraitMaps(NamedTuple):
             strands=F.normalize(self.strands + alike * other.strands, dim=1),
         )
 
+    def without_colours(self) -> "PortraitMaps":
+        """Maps of people whose photos are grey: what has colours, without them."""
+        grey = {name: getattr(self, name).mean(1, keepdim=True) for name in ("gain", "bias", "albedo")}
+        return self._replace(**{name: values.expand(-1, 3, -1, -1) for name, values in grey.items()})
+
     def shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shading, highlights and corrected visibility [B, L, S, S] under lights [B, L, 3].
 

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Box, box_of, from_landmarks
+from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
 from facerf_cli.face.detector import detected_boxes
 from facerf_cli.face.landmarks import Face, FaceBox, check_display, choose_face, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
@@ -66,7 +66,7 @@ def find_faces(
     """
     faces = detect_faces(to_display(pixels_linear), landmarks_from, everyone=which != "largest")
     if not faces:
-        raise InputError(f"{name}: {_NO_FACE}, or give its landmarks with --landmarks FILE")
+        raise InputError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
     return choose_face(faces, which, name)
 
 

@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop
+from facerf_cli.face.crop import GIVE_LANDMARKS, Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -114,7 +114,7 @@ def proxy_maps(proxy: Proxy, camera: Camera) -> ProxyMaps:
     seen = interpolate(torch.cat([proxy.normals, proxy.vertices], 1), proxy.triangles, fragments)
     covered = fragments.covered.float()
     if not covered.any():
-        raise InputError("the fitted face lies outside the image; give its landmarks with --landmarks")
+        raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
     filled = inpaint(seen.permute(2, 0, 1), covered)
     return ProxyMaps(F.normalize(filled[:3], dim=0), filled[3:], covered)
 

@@ -5,7 +5,7 @@ sizes around the head.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,6 +43,10 @@ class Segmentation:
 
     classes: Tensor
     matte: np.ndarray
+
+    def cut(self, alpha: np.ndarray | None) -> "Segmentation":
+        """The person without what the photo's own alpha [H, W] leaves out; None leaves out nothing."""
+        return self if alpha is None else replace(self, matte=self.matte * alpha)
 
     def layer(self, name: str) -> Rows:
         """Share [H, W] float32 of a class; those of all classes but the background sum to the matte."""

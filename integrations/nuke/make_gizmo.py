@@ -24,8 +24,8 @@ def layers_of(path: Path) -> list[str]:
     parts = [oiio.ImageBuf(str(path), index, 0).spec() for index in range(first.nsubimages)]
     names = [str(spec.getattribute("oiio:subimagename") or "") for spec in parts]
     lights = [name for name in names if re.fullmatch(r"light\d+", name)]
-    coloured = [name for name, spec in zip(names, parts, strict=True) if spec.nchannels == 3]
-    return lights or [name for name in coloured[1:] if name not in _OTHERS]
+    layers = list(zip(names, parts, strict=True))[1:]  # after the image itself
+    return lights or [name for name, spec in layers if spec.nchannels == 3 and name not in _OTHERS]
 
 
 def group(layers: list[str], name: str = "facerf_stack") -> str:

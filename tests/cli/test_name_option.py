@@ -33,7 +33,7 @@ def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: pytest.Ca
     for name in ("a/me_jpg", "a/me_png", "plates/shot_png_000007"):
         assert f" -> {plates.parent / 'out' / name}{VERBS[verb]}\n" in said
     assert main([*line, "--name", "{dir}/{stem}"]) == 2
-    assert "would both be written as a/me; give --name more fields" in capsys.readouterr().err
+    assert "--name names them alike; give it more fields" in capsys.readouterr().err
     assert main([*line, "--name", "{stem}_{light}"]) == 2
     assert "{light} is no field" in capsys.readouterr().err
     assert main([*line, "--name", "../{stem}"]) == 2

@@ -11,7 +11,7 @@ import pytest
 
 from facerf_cli.composite import Relit
 from facerf_cli.field import Field
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.main import main
 from facerf_cli.pipeline import relit_by
@@ -80,7 +80,8 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert row["status"] == "done" and row["quality"] == "good" and len(row["exposure_ev"]) == 5
     assert row["exposure_ev"][names[0]] == row["exposure_ev"][names[1]]  # a turning sky does not pump
-    assert len(capsys.readouterr().out.splitlines()) == 10
+    written = capsys.readouterr().out.splitlines()  # with the balls
+    assert len(written) == 18 and all(Path(path).is_file() for path in written)
     predicted.clear()
     assert relight(given, tmp_path, *line) == 0
     assert not predicted  # finished already
@@ -278,7 +279,12 @@ def test_a_bad_map_harms_no_other(given: Path, tmp_path: Path, capsys: pytest.Ca
         ["--light", "0,0", "--rotate", "left"],
         ["--light", "0,0", "--rotate", "0:360"],
         ["--light", "0,0", "--pose", "1,2"],
+        ["--light", "0,0", "--pose", "100,20,0"],
         ["--light", "0,0", "--exposure", "bright"],
+        ["--light", "0,0", "--exposure", "1e9"],
+        ["--light", "0,0", "--ball"],
+        ["--light", "0,0", "--photo", str(PHOTO)],
+        ["--light", "0,0", "--ocio", __file__],
         ["--light", "0,0", "--lights", "0"],
         ["--light", "0,0", "--texture-size", "100"],
         ["--light", "0,0", "--envmap-sampling", "best"],
@@ -290,6 +296,37 @@ def test_wrong_usage(
     assert relight(given, tmp_path / "out", *line) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["me.png", "me.avi", "me.JSON"])
+def test_a_file_is_no_output_folder(
+    given: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for line in (["relight", "--light", "0,0"], ["segment"]):
+        assert main([line[0], str(PHOTO), "-o", str(tmp_path / name), *line[1:]]) == 2
+        assert f"{name}: is a file's name; give a folder" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+    (tmp_path / "me.png").mkdir()
+    line = ["--light", "0,0", "--composite", "face", "--format", "png"]
+    assert relight(given, tmp_path / "me.png", *line) == 0  # a folder may have any name
+
+
+def test_a_photos_own_alpha_cuts_its_person_out(given: Path, tmp_path: Path) -> None:
+    photo = read_image(PHOTO).pixels
+    alpha = np.ones(photo.shape[:2], np.float32)
+    alpha[:, : photo.shape[1] // 2] = 0.25
+    write_display(tmp_path / "astronaut.png", photo, 0.0, alpha)
+    made = {}
+    for name, path, behind in (
+        ("opaque", PHOTO, "none"),
+        ("cut", tmp_path / "astronaut.png", "none"),
+        ("green", tmp_path / "astronaut.png", "0,1,0"),
+    ):
+        line = ["--light", "0,20", "--background", behind, "--format", "exr", "--reflectance", "field"]
+        assert relight(given, tmp_path / name, *line, photo=path) == 0
+        made[name] = read_image(tmp_path / name / "astronaut_light_0_20.exr")
+    np.testing.assert_allclose(made["cut"].alpha, made["opaque"].alpha * alpha, atol=0.02)
+    assert made["green"].alpha is None and made["green"].pixels[alpha < 1].mean(0).argmax() == 1
 
 
 def test_an_output_folder_that_cannot_be(given: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import OpenImageIO as oiio
 import pytest
 
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.images import read_image
+from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.classes import CLASSES
 from tests.exr_layers import exr_layers
@@ -72,6 +72,16 @@ def test_the_landmarks_serve_as_input(cut: Path, tmp_path: Path) -> None:
     assert main(["segment", str(PHOTO), "-o", str(tmp_path), "--landmarks", given]) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert "confidence" not in row  # they are the user's
+
+
+def test_a_photos_own_alpha_cuts_its_person_out(layers: dict[str, np.ndarray], tmp_path: Path) -> None:
+    photo = read_image(PHOTO).pixels
+    alpha = np.ones(photo.shape[:2], np.float32)
+    alpha[:, : photo.shape[1] // 2] = 0.25
+    write_display(tmp_path / "astronaut.png", photo, 0.0, alpha)
+    assert main(["segment", str(tmp_path / "astronaut.png"), "-o", str(tmp_path / "out")]) == 0
+    found = exr_layers(tmp_path / "out/astronaut_segment.exr")["person.A"]
+    assert np.abs(found - layers["person.A"] * alpha).mean() < 0.01  # the photo passed through 8 bits
 
 
 def test_a_photo_without_a_face_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,10 +68,11 @@ def test_a_group_weighs_every_light_of_a_stack(tmp_path: Path) -> None:
     assert nodes_of((tmp_path / "me.nk").read_text()).count("Shuffle") == 2
 
 
-def test_named_lights_of_one_image_are_layers_too(tmp_path: Path) -> None:
+@pytest.mark.parametrize("alpha", [None, np.ones((4, 5), np.float32)])
+def test_named_lights_of_one_image_are_layers_too(tmp_path: Path, alpha: np.ndarray | None) -> None:
     image = np.ones((4, 5, 3), np.float32)
     layers = {"key": image, "fill": image, "albedo": image, "person.A": image[..., 0]}
-    write_exr(tmp_path / "me.exr", image, None, layers)
+    write_exr(tmp_path / "me.exr", image, alpha, layers)
     assert module_of("integrations/nuke/make_gizmo.py").layers_of(tmp_path / "me.exr") == ["key", "fill"]
 
 

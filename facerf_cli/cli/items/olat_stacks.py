@@ -37,7 +37,7 @@ from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.resize import shrunk_photo
+from facerf_cli.resize import resized, shrunk_photo
 from facerf_cli.strips import whole
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
@@ -113,7 +113,9 @@ def _of_person(
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
     reflectance = reflectance_of(models, head, "portrait", work.network_alone, memory.limit_bytes(), photo)
-    composition = composition_of(models, photo, head, reflectance, Target(background="none"))
+    alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
+    target = Target(alpha=alpha, background="none")
+    composition = composition_of(models, photo, head, reflectance, target)
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):

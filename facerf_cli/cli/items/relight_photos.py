@@ -235,7 +235,8 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
     if matte is None and face.steady is not None:
         matte = face.steady.segmentation.matte
     kind = work.background.kind
-    return Target(posed, work.composite, matte, kind if kind in ("photo", "none") else "given")
+    alpha = None if kind == "photo" else image.alpha
+    return Target(posed, work.composite, matte, alpha, kind if kind in ("photo", "none") else "given")
 
 
 def _relight_stack(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:

@@ -55,7 +55,7 @@ def _write(
     def path(ending: str) -> Path:
         return item.output(tag + ending)
 
-    metadata = stamp(item)
+    metadata, found = stamp(item), found.cut(image.alpha)
     colours = whole(PersonColours(image.pixels, found.matte))
     write_exr(path("_segment.exr"), colours, found.matte, found.layers(), metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)
