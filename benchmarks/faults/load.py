@@ -30,7 +30,8 @@ _INTERRUPTS, _SIDE_PX = 3, 256
 
 def main() -> None:
     parser = arguments(__doc__)
-    parser.add_argument("--verb", choices=sorted(VERBS), default="convert-light")
+    folders = sorted(verb.name for verb in VERBS.values() if not verb.in_place)
+    parser.add_argument("--verb", choices=folders, default="convert-light")
     parser.add_argument("--items", type=int, default=10_000)
     parser.add_argument("--with", dest="more", default="", help="further arguments of the verb")
     given = parser.parse_args()

@@ -29,6 +29,8 @@ def read_keys(text: str) -> dict[str, str] | None:
     keys = [key.strip() for key, _, _ in pairs]
     if not set(keys) & {"name", *KEYS}:
         return None
+    if any("=" in value for _, _, value in pairs):
+        raise UsageError(f"--light {text!r}: give ; between keys, as in 'az=60;el=10'")
     if twice := {key for key in keys if keys.count(key) > 1}:
         raise UsageError(
             f"--light {text!r}: {min(twice)} is given twice; a light has one, give --light again"

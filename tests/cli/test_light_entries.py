@@ -87,6 +87,7 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
         ("from=0,0;spot=20", "spot is of near lights"),
         ("at=0,0,1;spot=0", "spot '0': out of range"),
         ("at=0,0,1;at=0,0,2", "at is given twice"),
+        ("az=60,el=10", "give ; between keys, as in 'az=60;el=10'"),
         ("az=0:90;el=3", "az '0:90': give degrees, or FROM:TO:N"),
         ("az=0:90:0", "az '0:90:0': give degrees"),
         ("az=0:90:2;el=0:9:3", "give one N"),
