@@ -147,6 +147,7 @@ def fit_photo(
 
 
 def _checked(photo: np.ndarray) -> np.ndarray:
+    photo = np.asarray(photo)
     if photo.ndim != 3 or photo.shape[2] != 3:
         raise ValueError(f"photo has shape {list(photo.shape)}, not [H, W, 3]")
     if not np.issubdtype(photo.dtype, np.floating):
