@@ -74,7 +74,7 @@ def _aimed(verb: Verb, folder: Path, whole: dict[str, bytes], draw: random.Rando
         call, count, after = draw.choice(_CALLS), draw.randrange(1, most), draw.random() < 0.5
         ended = run(verb.line(folder / "in", out), partial(_kill_at, call, count, after))
         found += ["interrupted"] if ended.code == -signal.SIGKILL else []
-        found += faults_of(out, whole, finished=False)
+        found += faults_of(out, whole, finished=False, grows=verb.grows)
     return found + _finish(verb, folder, out, whole)
 
 
@@ -95,7 +95,7 @@ def _random(
             found.append(f"exit {ended.code} after {number.name}")
         if "Traceback" in ended.said or "unexpected" in ended.said:
             found.append(f"traceback after {number.name}: {ended.said[-300:]}")
-        found += faults_of(out, whole, finished=False)
+        found += faults_of(out, whole, finished=False, grows=verb.grows)
         if number != signal.SIGKILL and out.exists():
             found += [f"left after {number.name}" for _ in out.rglob(".*part-*")]
     return found + _finish(verb, folder, out, whole)

@@ -30,7 +30,7 @@ _INTERRUPTS, _SIDE_PX = 3, 256
 
 def main() -> None:
     parser = arguments(__doc__)
-    folders = sorted(verb.name for verb in VERBS.values() if not verb.in_place)
+    folders = sorted(verb.name for verb in VERBS.values() if verb.reads == "inputs")
     parser.add_argument("--verb", choices=folders, default="convert-light")
     parser.add_argument("--items", type=int, default=10_000)
     parser.add_argument("--with", dest="more", default="", help="further arguments of the verb")

@@ -11,6 +11,7 @@ from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
+from typing import Literal
 
 from benchmarks._common import ASTRONAUT
 from benchmarks.faults import samples
@@ -24,24 +25,26 @@ _OWN = (REPORT_NAME, ".facerf-index.jsonl")
 class Verb:
     """A verb on a folder of inputs: its arguments without inputs and output.
 
-    One that writes into the folder of its inputs (`in_place`) is given a copy of it as the output folder.
+    One that writes into the folder of its inputs is given a copy of it as the output folder.
     """
 
     name: str
     arguments: tuple[str, ...]
     fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
-    in_place: bool = False
+    reads: Literal["inputs", "output", "nothing"] = "inputs"
+    grows: tuple[str, ...] = ()  # files that it writes again as it goes on
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
-        if self.in_place:
+        if self.reads == "output":
             return [self.name, str(output), *self.arguments]
-        return [self.name, str(inputs), *self.arguments, "-o", str(output)]
+        given = [str(inputs)] if self.reads == "inputs" else []
+        return [self.name, *given, *self.arguments, "-o", str(output)]
 
     def begin(self, inputs: Path, output: Path) -> None:
         """Leave the output folder as it is before the first run."""
         shutil.rmtree(output, ignore_errors=True)
-        if self.in_place:
+        if self.reads == "output":
             shutil.copytree(inputs, output)
 
 
@@ -80,11 +83,13 @@ _ON_PHOTOS = {
     "predict-olat": ("--lights", "4", "--frame", "uv"),
     "relight": ("--light", "75,20", "--exposure", "0"),
 }
+_STAGE = ("--subjects", "1", "--lights", "4", "--size", "64")
 _PAIRS = ("--envmaps", "procedural:2", "--per-subject", "4")
 _OTHERS = (
     Verb("convert-light", ("--to", "sh"), _fill_with_lights),
     Verb("prepare-dataset", (), _fill_with_captures),
-    Verb("relight-dataset", _PAIRS, _fill_with_dataset, in_place=True),
+    Verb("relight-dataset", _PAIRS, _fill_with_dataset, reads="output"),
+    Verb("synth-stage", _STAGE, lambda *_: None, reads="nothing", grows=("stage.json",)),
 )
 VERBS = {verb.name: verb for verb in _OTHERS} | {
     name: Verb(name, given, _fill_with_photos) for name, given in _ON_PHOTOS.items()
@@ -177,10 +182,16 @@ def outputs(folder: Path) -> dict[str, bytes]:
     }
 
 
-def faults_of(folder: Path, whole: dict[str, bytes], finished: bool) -> list[str]:
-    """What is wrong in an output folder beside the outputs of an undisturbed run."""
+def faults_of(
+    folder: Path, whole: dict[str, bytes], finished: bool, grows: tuple[str, ...] = ()
+) -> list[str]:
+    """What is wrong in an output folder beside the outputs of an undisturbed run.
+
+    Files that the verb writes again as it goes on are compared when it has finished.
+    """
     found = []
     there = outputs(folder) if folder.exists() else {}
+    there = {name: content for name, content in there.items() if finished or name not in grows}
     found += [f"half or foreign: {name}" for name, content in there.items() if whole.get(name) != content]
     if not finished:
         return found
