@@ -26,7 +26,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.inputs import is_grey
-from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
+from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.own_light import OwnLight
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
@@ -41,6 +41,7 @@ _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
 _SHARE = 0.25  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
+_CLOTH = ("garment", "headwear")
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +205,20 @@ def maps_of(person: SeenPerson) -> PortraitMaps:
     rig, network = rig_directions(_SUMMARY_LIGHTS), portrait_network()
     inputs = person.inputs(rig, person.visibility(rig))
     maps = network(inputs).averaged(network(inputs.mirrored()).mirrored())
+    maps = _with_clear_cloth(maps, inputs)
     return maps.without_colours() if is_grey(inputs.image[0]) else maps
+
+
+def _with_clear_cloth(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMaps:
+    """Limit the bias of cloth to what the photo shows there.
+
+    Cloth in deep shadow needs more, and the network allows for it: dark cloth would lie in a haze.
+    """
+    cloth = inputs.classes[:, [class_index(name) for name in _CLOTH]].sum(1, keepdim=True)
+    own = inputs.image * maps.gain
+    least = torch.minimum(maps.bias, own.mean(1, keepdim=True).clamp_min(0))
+    bias = torch.lerp(maps.bias, least, cloth)
+    return maps._replace(bias=bias, albedo=own + bias)
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

@@ -1,6 +1,6 @@
 """The portrait field of a photo: its own light gives the photo back, and the whole person is relit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,6 +18,7 @@ from facerf_cli.models import Models, load_models
 from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, maps_of, portrait_network
 from facerf_cli.strips import strips, whole
@@ -82,6 +83,18 @@ def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarra
     field = reflectance_of(models, head, "portrait", photo=grey)
     image = relight(models, grey, head, lamp(60), Target(background="none"), field).pixels
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "may_be_more"), [("garment", False), ("headwear", False), ("hair", True)])
+def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more: bool) -> None:
+    """Of cloth the photo shows at least half of the albedo."""
+    rig, person = rig_directions(48), field.person
+    inputs = person.inputs(rig, person.visibility(rig))
+    classes = torch.zeros_like(inputs.classes)
+    classes[:, class_index(name)] = 1
+    maps = maps_of(cast(Any, Seen(replace(inputs, classes=classes))))
+    own = (inputs.image * maps.gain).mean(1, keepdim=True)
+    assert (maps.bias > own + 1e-6).any() == may_be_more
 
 
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
