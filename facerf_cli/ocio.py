@@ -17,12 +17,12 @@ REC709_NAMES = ("lin_rec709_scene", "lin_rec709", "Linear Rec.709 (sRGB)")
 ACES_NAMES = ("ACES2065-1", "ACES - ACES2065-1")
 
 
-@cache
 def check(config: str) -> None:
     """Raise UsageError for a file that is no configuration."""
     _opened(config)
 
 
+@cache
 def names(config: str = "") -> dict[str, str]:
     """Map case-folded names, aliases and roles of the configuration to their spelling."""
     found = _opened(config)

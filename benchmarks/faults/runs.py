@@ -185,7 +185,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
 def faults_of(
     folder: Path, whole: dict[str, bytes], finished: bool, grows: tuple[str, ...] = ()
 ) -> list[str]:
-    """What is wrong in an output folder beside the outputs of an undisturbed run.
+    """What is wrong in an output folder, compared with the outputs of an undisturbed run.
 
     Files that the verb writes again as it goes on are compared when it has finished.
     """

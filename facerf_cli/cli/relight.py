@@ -361,7 +361,7 @@ def relight(
 def _holds_a_stack(items: Sequence[Item]) -> bool:
     from facerf_cli.files.olat_stack import is_olat_stack
 
-    return any(item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path) for item in items)
+    return any(is_olat_stack(item.input_path) for item in items)
 
 
 def _write_to_stdout(inputs: list[str], work: Relight) -> None:

@@ -162,7 +162,8 @@ def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
 
 def is_olat_stack(path: Path) -> bool:
     """Return whether a file is an OLAT stack that facerf wrote; False if it cannot be opened as an image."""
-    stream = oiio.ImageInput.open(utf8_path(path)) if is_regular(path) else None
+    is_exr = path.suffix.lower() == ".exr" and is_regular(path)
+    stream = oiio.ImageInput.open(utf8_path(path)) if is_exr else None
     if stream is None:
         oiio_error()
         return False

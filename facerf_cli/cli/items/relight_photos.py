@@ -92,11 +92,7 @@ class _Shown:
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     """Relight a photo or a stack under every setup; the images written, and facts for the report."""
-    return _relight_stack(item, work) if _is_stack(item) else _relight_photo(item, work)
-
-
-def _is_stack(item: Item) -> bool:
-    return item.input_path.suffix.lower() == ".exr" and is_olat_stack(item.input_path)
+    return _relight_stack(item, work) if is_olat_stack(item.input_path) else _relight_photo(item, work)
 
 
 def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
@@ -145,7 +141,7 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     """Exposures of a photo or stack that others share."""
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
-    if _is_stack(leader):
+    if is_olat_stack(leader.input_path):
         shown = _show_stack(leader, work)[0]
     else:
         shown = _together(leader, *_seen(leader, work), work)
