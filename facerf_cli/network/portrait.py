@@ -215,8 +215,8 @@ class PortraitNetwork(nn.Module):
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
         nn.init.normal_(self.predict.weight, std=0.01)
 
-    def forward(self, inputs: PortraitInputs) -> PortraitMaps:
-        """Predict maps; sides are multiples of 32."""
+    def features(self, inputs: PortraitInputs) -> Tensor:
+        """Features [B, widths[0], S / 2, S / 2] of which the maps are made; sides are multiples of 32."""
         x = self.stem(inputs.stacked())
         skips = []
         for halving in self.encode:
@@ -224,9 +224,13 @@ class PortraitNetwork(nn.Module):
             x = halving(x)
         for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
             x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
-        fine, coarse = torch.split(
-            self.predict(self.last(x)), [4 * sum(_FINE.values()), sum(_COARSE.values())], 1
-        )
+        last: Tensor = self.last(x)
+        return last
+
+    def forward(self, inputs: PortraitInputs) -> PortraitMaps:
+        """Predict maps; sides are multiples of 32."""
+        predicted = self.predict(self.features(inputs))
+        fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
         parts = [
             *torch.split(shuffled, list(_FINE.values()), 1),

@@ -148,7 +148,7 @@ def _part(batch: PortraitSample, index: int) -> PortraitSample:
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
     """The photo under its own light [B, 3, S / 4, S / 4], as the network sees it."""
     side = batch.image.shape[-1] // SMALL
-    small = PortraitMaps(*(F.interpolate(values, size=(side, side), mode="area") for values in maps))
+    small = type(maps)(*(F.interpolate(values, size=(side, side), mode="area") for values in maps))
     visible = F.interpolate(batch.rig_visible, size=small.gain.shape[-2:], mode="area")
     shading, glow, _ = small.shaded(batch.rig, visible)
     lit = torch.einsum("blij,blc->bcij", shading, batch.weights)
