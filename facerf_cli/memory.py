@@ -4,6 +4,7 @@
 """
 
 import ctypes
+import gc
 import math
 import os
 from collections.abc import Callable, Iterator
@@ -17,6 +18,7 @@ from facerf_cli.errors import InputError
 SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by default
 _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
+_SELDOM, _USUAL = (50_000, 10, 10), gc.get_threshold()
 _set: list[int] = []  # the limit, once it was set
 _held: list[int] = []  # what is held beside that which is asked for
 
@@ -81,3 +83,14 @@ def require(what: str, needed_bytes: int, instead: str) -> None:
             f"{what}: needs {least:.2f} GB of memory, and {limit_bytes() / _GB:.2f} GB are allowed; "
             f"give --memory {least:.2f} or {instead}"
         )
+
+
+def collect_seldom() -> None:
+    """Look for garbage seldom, for imports make many objects and hardly any garbage."""
+    gc.set_threshold(*_SELDOM)
+
+
+def collect_as_usual() -> None:
+    """Look for garbage as often as Python does, but not among the modules, which stay."""
+    gc.freeze()
+    gc.set_threshold(*_USUAL)

@@ -164,6 +164,7 @@ def _run_alone(
 def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderIndex | None) -> int:
     """Process the items that are not finished, write their rows, and count failures."""
     failures = 0
+    memory.collect_as_usual()
     workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
     at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
     work = _Work(batch.process, index is not None, batch.settings.job_bytes(at_once))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import cholesky, qr, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 from torch import Tensor
 
@@ -151,15 +151,16 @@ def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: 
     """
     if not len(target):  # nothing is visible enough
         return np.zeros(lights.shape[1])
-    trust, size = np.ones(len(target)), np.linalg.norm(target)
+    trust, power = np.ones(len(target)), target @ target
     for _ in range(_ROUNDS):
-        rows = np.concatenate([lights * trust[:, None], size * hold])
-        basis, square = qr(rows, mode="economic")  # reduces N rows to L
-        weights, _ = nnls(square, basis.T @ np.concatenate([target * trust, size * held]))
+        trusted = lights.T * trust
+        weights = _non_negative(
+            trusted @ lights + power * hold.T @ hold, trusted @ target + power * hold.T @ held
+        )
         error = np.abs(lights @ weights - target)
         limit = _OUTLIER * np.median(error) + _TINY
-        trust = np.sqrt(np.minimum(1, limit / np.maximum(error, limit)))
-    return np.asarray(weights)
+        trust = np.minimum(1, limit / np.maximum(error, limit))
+    return weights
 
 
 def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:

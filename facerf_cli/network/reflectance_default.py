@@ -152,9 +152,10 @@ class DefaultReflectanceNetwork(nn.Module):
         x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
         for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
             x = up(x, skip, maps, code, count)
-        gain, bias = (resize(y, encoded.source_root.shape[-1]) for y in self.head(x).float().chunk(2, 1))
-        gain = gain + resize(base, encoded.source_root.shape[-1])
-        root = encoded.source_root.repeat_interleave(count, 0) * gain + bias
+        gain, bias = self.head(x).float().chunk(2, 1)
+        both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
+        gain, bias = both.chunk(2, 1)
+        root = torch.addcmul(bias, encoded.source_root.repeat_interleave(count, 0), gain)
         return root.view(faces, count, *root.shape[1:])
 
     def _normals_used(self, normals: Tensor) -> Tensor:
@@ -220,9 +221,9 @@ class LitUp(nn.Module):
         x = self.enter(x)
         if self.scale == 2:
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-        x = x + self.skip(skip).repeat_interleave(lights, 0) + self.light(resize(maps, side))
+        x = x + self.light(resize(maps, side))
+        x.view(-1, lights, *x.shape[1:]).add_(self.skip(skip)[:, None])
         scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
-        x = F.silu(x * (1 + scale) + shift)
-        x = x + F.silu(self.inner(x))
-        result: Tensor = x + F.silu(self.outer(x))
-        return result
+        x = F.silu(torch.addcmul(shift, x, 1 + scale))
+        x = F.silu(self.inner(x)).add_(x)
+        return F.silu(self.outer(x)).add_(x)

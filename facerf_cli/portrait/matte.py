@@ -11,7 +11,7 @@ from facerf_cli.strips import Rows, between, enlarged, strips
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
 _STRETCH = 0.2  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
-_COLOURS_PX = 1024  # longest side at which they are found
+_COLOURS_PX = 512  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
 _TINY = 1e-5
 
