@@ -61,6 +61,7 @@ VALUED = frozenset({"--device", "--checkpoint", "--memory", "--seed", "--config"
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
+_SPINS = "20000"  # of a thread of torch's before it sleeps; more starve other programs and the own threads
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(
@@ -154,6 +155,8 @@ for _verbs_of in (app, *(group for group, _ in GROUPS.values())):
 def run() -> None:
     """Run the `facerf` script."""
     end_on_signals(_PATIENCE_S)
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
     for stream in (sys.stdout, sys.stderr):  # names go out as the bytes that they are
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="surrogateescape")

@@ -73,14 +73,23 @@ class WholePerson:
         return Computed(photo.shape, of)
 
     def _change(self, lit: Tensor) -> Tensor:
-        """Smooth change of light [3, S, S] from the photo, which goes on beyond the square."""
-        return _blurred(self._filled(self._relit(lit)), _CHANGE_PX) / self.own_change
+        """Smooth change of light [3, S, S] from the photo at the square's border, which goes on beyond it."""
+        return _blurred(inpaint(self._relit(lit), self._at_border), _CHANGE_PX) / self.own_change
 
     @cached_property
     def own_change(self) -> Tensor:
         """The photo's own part [3, S, S] of that change: its blur, and a little that keeps it from 0."""
         own = self._field.person.image
-        return _blurred(self._filled(own), _CHANGE_PX) + _DARK * own.mean()
+        return _blurred(inpaint(own, self._at_border), _CHANGE_PX) + _DARK * own.mean()
+
+    @cached_property
+    def _at_border(self) -> Tensor:
+        """The person [S, S] where the square is feathered; all of it where nobody is there."""
+        side = self.own.shape[-1]
+        width = round(_FEATHER * side / 2)
+        inner = torch.zeros(side - 2 * width, side - 2 * width)
+        found = self.own * F.pad(inner, (width,) * 4, value=1.0)
+        return found if found.any() else self.own
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [9, S, S]."""

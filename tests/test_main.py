@@ -137,6 +137,30 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert (result.returncode, result.stderr) == (141, "")
 
 
+def test_a_run_ends_with_its_code_and_all_that_was_printed() -> None:
+    result = run(
+        "import atexit, sys; atexit.register(print, 'last'); sys.argv = ['facerf', '--version', '-v', '-q']\n"
+        "from facerf_cli.main import run; run()",
+        env=os.environ | {"PYTHONUNBUFFERED": ""},
+    )
+    assert (result.returncode, result.stdout) == (0, f"facerf {__version__}\nlast\n")
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "20000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, ""), ({"GOMP_SPINCOUNT": "7"}, "7")]
+)
+def test_threads_wait_asleep_unless_the_user_says_otherwise(given: dict[str, str], spins: str) -> None:
+    """A thread that waits by turning in circles takes another program's processor, or this one's own."""
+    policy = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT")
+    result = run(
+        "import atexit, os, sys; sys.argv = ['facerf', '--version']\n"
+        "atexit.register(lambda: print(os.environ.get('GOMP_SPINCOUNT', '')))\n"
+        "from facerf_cli.main import run; run()",
+        env={name: value for name, value in os.environ.items() if name not in policy} | given,
+    )
+    assert result.stdout.splitlines()[1] == spins
+
+
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_shell_completion(shell: str) -> None:
     protocol = {

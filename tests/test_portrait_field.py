@@ -22,6 +22,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, maps_of, portrait_network
 from facerf_cli.strips import strips, whole
+from facerf_cli.whole_person import WholePerson
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 
@@ -172,6 +173,17 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     assert len(list(strips(photo.shape))) > 4
     for one, other in zip(at_once, shown(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))
+
+
+def test_a_lit_shoulder_changes_nothing_beyond_the_square(photo: np.ndarray, field: PortraitField) -> None:
+    square, side = field.person.square, field.person.image.shape[-1]
+    below = slice(round(square.y0_px + square.side_px) + 1, photo.shape[0])
+    even = torch.ones(9, side, side)
+    shoulder = even.clone()
+    shoulder[:3, side - 50 : side - 20, 40:150] = 20
+    person = WholePerson(photo, field)
+    one, other = (person.over_photo(photo, lit, 0.0)[below] for lit in (even, shoulder))
+    assert one.size > 0 and np.array_equal(one, other)
 
 
 def test_without_light_all_is_black(field: PortraitField) -> None:
