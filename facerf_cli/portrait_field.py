@@ -165,13 +165,14 @@ class PortraitField:
         size = self.person.image.shape
         shading, highlights, reached, sent = torch.zeros(4, len(weights), *size).unbind(0)
         batches = (self._far(directions, weights), *(self._near(*light) for light in near))
+        albedo = self.maps.albedo[0].mean(0)
         for shade, glow, arrives, whole, some in itertools.chain(*batches):
-            shade, glow = (x[:, None].expand(-1, 3, -1, -1) for x in (shade, glow))
+            shades, glows = (x.expand(3, *x.shape) for x in (shade, glow))
             if self.correction is not None:
-                factor, added = self.correction.terms(self.maps.albedo * shade + glow)
-                shade, glow = shade * factor, glow * factor + added
-            shading = shading + torch.einsum("mlc,lcij->mcij", some, shade)
-            highlights = highlights + torch.einsum("mlc,lcij->mcij", some, glow)
+                factor, added = self.correction.terms(albedo * shade + glow)
+                shades, glows = shade * factor, torch.addcmul(added, glow, factor)
+            shading = shading + torch.einsum("mlc,clij->mcij", some, shades)
+            highlights = highlights + torch.einsum("mlc,clij->mcij", some, glows)
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
         return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6))

@@ -74,16 +74,16 @@ class WholePerson:
 
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo at the square's border, which goes on beyond it."""
-        return _blurred(inpaint(self._relit(lit), self._at_border), _CHANGE_PX) / self.own_change
+        return _blurred(inpaint(self._relit(lit), self.at_border), _CHANGE_PX) / self.own_change
 
     @cached_property
     def own_change(self) -> Tensor:
         """The photo's own part [3, S, S] of that change: its blur, and a little that keeps it from 0."""
         own = self._field.person.image
-        return _blurred(inpaint(own, self._at_border), _CHANGE_PX) + _DARK * own.mean()
+        return _blurred(inpaint(own, self.at_border), _CHANGE_PX) + _DARK * own.mean()
 
     @cached_property
-    def _at_border(self) -> Tensor:
+    def at_border(self) -> Tensor:
         """The person [S, S] where the square is feathered; all of it where nobody is there."""
         side = self.own.shape[-1]
         width = round(_FEATHER * side / 2)

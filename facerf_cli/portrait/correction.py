@@ -52,32 +52,32 @@ class Correction:
         plain = Correction(
             (ratio - 1) * person, torch.ones_like(person), floor, mean, explained.mean(0), person
         )
-        whole, likeness = plain._with_floor(olats), plain._likeness(olats)
-        shares = torch.einsum("lc,lcij->lij", weights, whole)
+        grey = olats.mean(1)
+        brightness = plain._brightness(grey)
+        likeness = plain._likeness(grey, brightness)
+        shares = torch.einsum("lc,lcij->lij", weights, olats + floor * brightness[:, None])
         mean_likeness = (likeness * shares).sum(0) / shares.sum(0).clamp_min(1e-9)
         return replace(plain, mean_likeness=mean_likeness.clamp_min(1e-3))
 
-    def terms(self, olats: Tensor) -> tuple[Tensor, Tensor]:
-        """Factors and additions [l, 3, S, S] by which images [l, 3, S, S] of single lights are corrected."""
-        power = self._likeness(olats)[:, None] / self.mean_likeness
-        change = power.clamp(max=_LARGEST) * self.excess
-        return (1 + change).clamp_min(0), change * self.floor * self._brightness(olats)
+    def terms(self, grey: Tensor) -> tuple[Tensor, Tensor]:
+        """Factors and additions [3, l, S, S] that correct images of single lights, grey ones [l, S, S]."""
+        brightness = self._brightness(grey)
+        power = self._likeness(grey, brightness) / self.mean_likeness
+        change = power.clamp(max=_LARGEST) * self.excess[:, None]
+        return (1 + change).clamp_min_(0), change * (self.floor * brightness)
 
-    def _with_floor(self, olats: Tensor) -> Tensor:
-        return olats + self.floor * self._brightness(olats)
+    def _brightness(self, grey: Tensor) -> Tensor:
+        """k_l [l, 1, 1]."""
+        means = (grey * self.person).sum((1, 2)) / self.person.sum().clamp_min(1.0)
+        return (means / max(self.mean, 1e-9))[:, None, None]
 
-    def _brightness(self, olats: Tensor) -> Tensor:
-        """k_l [l, 1, 1, 1]."""
-        means = (olats.mean(1) * self.person).sum((1, 2)) / self.person.sum().clamp_min(1.0)
-        return (means / max(self.mean, 1e-9))[:, None, None, None]
-
-    def _likeness(self, olats: Tensor) -> Tensor:
+    def _likeness(self, grey: Tensor, brightness: Tensor) -> Tensor:
         """p_l [l, S, S]."""
-        small, explained = _small(olats.mean(1), self.person), _small(self.explained, self.person)
+        small, explained = _small(grey, self.person), _small(self.explained, self.person)
         lengths = small.flatten(-2).norm(dim=-1) * explained.norm()
         cosine = (small * explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
-        allowed = self._brightness(olats)[:, 0] * (self.explained + self.floor)
-        brighter = self._with_floor(olats).mean(1) / allowed.clamp_min(1e-9)
+        allowed = brightness * (self.explained + self.floor)
+        brighter = (grey + self.floor * brightness) / allowed.clamp_min(1e-9)
         return cosine.clamp(0, 1)[:, None, None] ** SHARPNESS / brighter.clamp_min(1)
 
 

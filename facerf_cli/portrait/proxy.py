@@ -5,6 +5,7 @@ hair and head come from it; what it gets wrong, the Portrait Network corrects.
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -149,11 +150,15 @@ class Shadows:
     def _reached(self, lights: Sequence[_Light]) -> Tensor:
         """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
         found = np.zeros((len(lights), *self._inside.shape), np.float32)
-        for number, light in enumerate(lights):
+
+        def trace(number: int, light: _Light) -> None:
             axis, reach_m = light(self.origins)
             rays = (on_disc(axis, places) for places in self._places)
             blocked = [occluded(self._scene, self.origins, ray, reach_m) for ray in rays]
             found[number, self._inside] = 1 - np.mean(blocked, 0)
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
+            list(threads.map(trace, range(len(lights)), lights))
         filled = inpaint(torch.from_numpy(found), self.covered)
         return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
 

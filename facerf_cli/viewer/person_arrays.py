@@ -47,6 +47,7 @@ def add_person(pack: ArrayPack, field: PortraitField, whole: WholePerson) -> dic
     pack.add("skin", (classes[[class_index("skin")]] > 0.5).float(), "byte")
     pack.add("albedoLines", whole.albedo_maps, "half")
     pack.add("hair", whole.hair_maps, "half")
+    pack.add("atBorder", whole.at_border[None], "byte")
     pack.add("beyond", _beyond_square(whole.own_change), "half")
     return {
         "side": classes.shape[-1],

@@ -126,11 +126,11 @@ class Portrait {
 
   // The planes that the photo's pixels take: shading and shine [6, side, side], and the change beyond the square.
   wide(lit) {
-    const { own, beyond } = this.arrays;
+    const { own, atBorder, beyond } = this.arrays;
     const { pixels, side } = this;
     const filled = inpainted(lit, 6, side, own);
     filled.set(gaussian(filled.subarray(3 * pixels), 3, side, 0.8), 3 * pixels);
-    const change = beyondSquare(inpainted(this.relit(lit), 3, side, own), side);
+    const change = beyondSquare(inpainted(this.relit(lit), 3, side, atBorder), side);
     for (let i = 0; i < change.length; i++) change[i] /= beyond[i];
     return { lit: filled, change };
   }
