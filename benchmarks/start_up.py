@@ -89,7 +89,7 @@ def astronaut_person() -> SeenPerson:
 def shadows(person: SeenPerson, rig: torch.Tensor, at_once: int) -> None:
     """Cast the shadows of lights, so many with one scene."""
     for some in torch.split(rig, at_once):
-        vars(person).pop("_shadows", None)
+        vars(person).pop("shadows", None)
         person.visibility(some)
 
 

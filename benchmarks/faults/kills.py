@@ -24,6 +24,7 @@ from typing import Any
 from benchmarks._common import arguments
 from benchmarks.faults.runs import VERBS, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
 
+_PART = ".*part-*"  # of the name of a temporary file or folder
 _CALLS = ("mkdir", "fsync", "replace", "row")
 _SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
@@ -86,6 +87,7 @@ def _random(
     verb.begin(folder / "in", out)
     for _ in range(draw.choice((1, 1, 2, 3))):
         notes, number = folder / "said", draw.choice(_SIGNALS)
+        before = set(out.rglob(_PART))  # of a killed run
         process = start(verb.line(folder / "in", out), lambda: None, notes)
         time.sleep(draw.uniform(0, 1.1 * seconds))
         os.kill(process, number)
@@ -96,15 +98,15 @@ def _random(
         if "Traceback" in ended.said or "unexpected" in ended.said:
             found.append(f"traceback after {number.name}: {ended.said[-300:]}")
         found += faults_of(out, whole, finished=False, grows=verb.grows)
-        if number != signal.SIGKILL and out.exists():
-            found += [f"left after {number.name}" for _ in out.rglob(".*part-*")]
+        if number != signal.SIGKILL:
+            found += [f"left after {number.name}" for _ in set(out.rglob(_PART)) - before]
     return found + _finish(verb, folder, out, whole)
 
 
 def _finish(verb: Verb, folder: Path, out: Path, whole: dict[str, bytes]) -> list[str]:
     ended = run(verb.line(folder / "in", out), notes=folder / "said")
     found = [] if ended.code == 0 else [f"exit {ended.code} of the last run"]
-    return found + faults_of(out, whole, finished=True)
+    return found + faults_of(out, whole, finished=True, reported=verb.reports)
 
 
 def _kill_at(call: str, count: int, after: bool) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import tempfile
+import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout, suppress
@@ -33,6 +34,7 @@ class Verb:
     fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
     reads: Literal["inputs", "output", "nothing"] = "inputs"
     grows: tuple[str, ...] = ()  # files that it writes again as it goes on
+    reports: bool = True
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
@@ -66,6 +68,10 @@ def _fill_with_photos(folder: Path, count: int, side_px: int = 128) -> None:
         Image.fromarray(pixels).save(folder / f"photo_{number:05d}.png", compress_level=1)
 
 
+def _nothing(*_: object) -> None:
+    """For a verb that reads nothing."""
+
+
 def _fill_with_captures(folder: Path, count: int, _: int = 0) -> None:
     _run_here("synth-stage", "--subjects", str(count), "--lights", "12", "--size", "64", "-o", str(folder))
 
@@ -84,12 +90,15 @@ _ON_PHOTOS = {
     "relight": ("--light", "75,20", "--exposure", "0"),
 }
 _STAGE = ("--subjects", "1", "--lights", "4", "--size", "64")
+_MAPS = ("--count", "4", "--size", "64")
 _PAIRS = ("--envmaps", "procedural:2", "--per-subject", "4")
 _OTHERS = (
+    Verb("envmap", _MAPS, _nothing, reads="nothing", grows=("envmaps.png",), reports=False),
     Verb("convert-light", ("--to", "sh"), _fill_with_lights),
     Verb("prepare-dataset", (), _fill_with_captures),
     Verb("relight-dataset", _PAIRS, _fill_with_dataset, reads="output"),
-    Verb("synth-stage", _STAGE, lambda *_: None, reads="nothing", grows=("stage.json",)),
+    Verb("synth-stage", _STAGE, _nothing, reads="nothing", grows=("stage.json",)),
+    Verb("view", ("--size", "256"), _fill_with_photos, grows=("index.html",)),
 )
 VERBS = {verb.name: verb for verb in _OTHERS} | {
     name: Verb(name, given, _fill_with_photos) for name, given in _ON_PHOTOS.items()
@@ -151,14 +160,15 @@ def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -
 
         end_on_signals(2.0)
         before()
-        try:
-            code = main(line)
-        except KeyboardInterrupt:  # before or after the program itself
-            code = 128 + signal.SIGINT
-        except SystemExit as stop:
-            code = stop.code if isinstance(stop.code, int) else 1
-        atomic._remove_own()  # as at the exit of a process that is no fork
+        code = main(line)
+    except KeyboardInterrupt:  # before or after the program itself
+        code = 128 + signal.SIGINT
+    except SystemExit as stop:
+        code = stop.code if isinstance(stop.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
     finally:
+        atomic._remove_own()  # as at the exit of a process that is no fork
         os._exit(code)
 
 
@@ -183,7 +193,11 @@ def outputs(folder: Path) -> dict[str, bytes]:
 
 
 def faults_of(
-    folder: Path, whole: dict[str, bytes], finished: bool, grows: tuple[str, ...] = ()
+    folder: Path,
+    whole: dict[str, bytes],
+    finished: bool,
+    grows: tuple[str, ...] = (),
+    reported: bool = True,
 ) -> list[str]:
     """What is wrong in an output folder, compared with the outputs of an undisturbed run.
 
@@ -204,7 +218,7 @@ def faults_of(
         twice = [item for item, count in Counter(row["item"] for row in rows).items() if count > 1]
         found += [f"two rows: {item}" for item in twice]
         found += [f"row of {row['item']}: {row['status']}" for row in rows if row["status"] == "failed"]
-    return found if reports else [*found, "no report"]
+    return found if reports or not reported else [*found, "no report"]
 
 
 def fresh(folder: Path) -> Path:

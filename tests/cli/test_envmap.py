@@ -1,3 +1,4 @@
+import os
 from pathlib import Path
 
 import numpy as np
@@ -5,6 +6,7 @@ import pytest
 
 from facerf_cli.cli.items.envmap_sheet import write_sheet
 from facerf_cli.cli.lights import collect_setups
+from facerf_cli.files.atomic import _machine
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
 from facerf_cli.synth.sky.skies import draw_sky
@@ -43,6 +45,37 @@ def test_the_contact_sheet_has_a_tile_for_each_map(
     assert main(line) == 0  # only the sheet is made again
     assert capsys.readouterr().out.splitlines() == [str(sheet)]
     np.testing.assert_array_equal(read_image(sheet).pixels, pixels)
+
+
+@pytest.mark.parametrize("change", [("--size", "48"), ("--seed", "6")])
+def test_maps_of_other_options_are_made_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str]
+) -> None:
+    line = ["envmap", "-o", str(tmp_path), "--count", "2", "--size", "32", "--seed", "5", "--kind", "sun"]
+    assert main(line) == main([*line, *change, "--overwrite", "never"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert main([*line, *change]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 3
+    assert main([*line, *change]) == 0
+    assert capsys.readouterr().out == ""
+    damaged = sorted(tmp_path.glob("*.exr"))[0]
+    damaged.write_bytes(b"")
+    assert main([*line, *change]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == str(damaged)
+
+
+def test_a_run_that_was_ended_before_its_sheet_is_finished(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["envmap", "-o", str(tmp_path), "--count", "2", "--size", "32"]
+    assert main(line) == 0
+    sheet = tmp_path / "envmaps.png"
+    os.utime(sheet, (0, 0))
+    left = tmp_path / f".envmaps.part-{_machine()}-{2**22 + 1}-0123456789abcdef"  # beyond Linux's process ids
+    left.mkdir()
+    capsys.readouterr()
+    assert main(line) == 0
+    assert capsys.readouterr().out.splitlines() == [str(sheet)] and not left.exists()
 
 
 def test_a_tile_shows_the_ball_lit_from_where_the_map_is_bright(tmp_path: Path) -> None:

@@ -1,17 +1,21 @@
 """The maps of `facerf envmap`."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from facerf_cli import __version__
 from facerf_cli.cli.items.envmap_sheet import MOST_MAPS, write_sheet
 from facerf_cli.cli.options import Overwrite
 from facerf_cli.errors import UsageError
+from facerf_cli.files.atomic import sweep_leftovers
+from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import write_exr
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of
 
 SHEET = "envmaps.png"
+Facts = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -24,29 +28,47 @@ def write_envmaps(
     overwrite: Overwrite,
     dry_run: bool,
 ) -> None:
-    """Draw and write maps of some kinds (None: the usual mix), and print their paths; skip existing ones.
+    """Draw and write maps of some kinds (None: the usual mix), and print their paths; skip finished ones.
 
-    At the end the contact sheet of all of them is written, unless no map is new.
+    A map is finished if it was drawn from the same seed at the same width. At the end the contact sheet of
+    all of them is written, unless there is one since the last map.
     """
     kinds = tuple(dict.fromkeys(kind)) if kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:
         raise UsageError(f"--kind {unknown[0]}: no such kind; give one of {', '.join(KINDS)}")
-    names = [kind_of(index, seed, kinds) for index in range(count)]
-    paths = [output / f"{index:05d}_{name}.exr" for index, name in enumerate(names)]
-    new = {path for path in paths if overwrite == "always" or not path.exists()}
-    for index, (name, path) in enumerate(zip(names, paths, strict=True)):
+    maps: dict[Path, Facts] = {}
+    for index in range(count):
+        name = kind_of(index, seed, kinds)
+        path = output / f"{index:05d}_{name}.exr"
+        maps[path] = {"facerf:kind": name, "facerf:seed": seed, "facerf:index": index}
+    if not dry_run:
+        sweep_leftovers(output)
+    new = {path for path in maps if _is_to_be_made(path, maps[path], width_px, overwrite)}
+    for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
             log.info("%s: already exists (--overwrite always makes it again)", path)
             continue
         if not dry_run:
             pixels, _ = draw_sky(index, seed, width_px, kinds)
-            facts: dict[str, str | int | float] = {"facerf:kind": name, "facerf:seed": seed}
-            facts |= {"facerf:index": index, "Software": f"facerf {__version__}"}
-            write_exr(path, pixels, metadata=facts)
+            write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
         print(path, flush=True)
     sheet = output / SHEET
-    if new or not sheet.exists():
+    if new or _is_older(sheet, list(maps)):
         if not dry_run:
-            write_sheet(paths, sheet)
+            write_sheet(list(maps), sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
+
+
+def _is_to_be_made(path: Path, facts: Facts, width_px: int, overwrite: Overwrite) -> bool:
+    """Tell if a map is missing or damaged, or was drawn from another seed or at another width."""
+    if overwrite == "never":
+        return not path.exists()
+    found = read_header(path)
+    drawn_so = found and found.width_px == width_px and facts.items() <= found.metadata.items()
+    return overwrite == "always" or not drawn_so
+
+
+def _is_older(sheet: Path, maps: Sequence[Path]) -> bool:
+    """Tell if a run was ended between the last map and the sheet."""
+    return not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
