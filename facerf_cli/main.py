@@ -14,6 +14,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -61,7 +62,9 @@ VALUED = frozenset({"--device", "--checkpoint", "--memory", "--seed", "--config"
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
-_SPINS = "20000"  # of a thread of torch's before it sleeps; more starve other programs and the own threads
+_SPINS = (
+    "20000"  # turns of a waiting thread of torch's before it sleeps; with more, other programs wait for it
+)
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(
@@ -167,8 +170,9 @@ def run() -> None:
 def _leave(code: int) -> NoReturn:
     """End the process without taking torch's modules apart, which takes it half a second."""
     atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        with suppress(OSError):  # `main` has said that it cannot be written
+            stream.flush()
     os._exit(code)
 
 
@@ -181,7 +185,8 @@ def main(arguments: Sequence[str]) -> int:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
         finally:
             end_again()
-        sys.stdout.flush()
+        if sys.stdout is not None:  # it was closed from the beginning
+            sys.stdout.flush()
         if code == 130:  # typer turns Ctrl-C into this exit code
             return _fail(None, "interrupted", 130)
         return code if isinstance(code, int) else 0

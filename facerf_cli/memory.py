@@ -91,6 +91,7 @@ def collect_seldom() -> None:
 
 
 def collect_as_usual() -> None:
-    """Look for garbage as often as Python does, but not among the modules, which stay."""
-    gc.freeze()
-    gc.set_threshold(*_USUAL)
+    """Look for garbage as often as before `collect_seldom`, but not among the modules, which stay."""
+    if gc.get_threshold() == _SELDOM:
+        gc.freeze()
+        gc.set_threshold(*_USUAL)

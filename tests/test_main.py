@@ -147,6 +147,24 @@ def test_a_run_ends_with_its_code_and_all_that_was_printed() -> None:
 
 
 @pytest.mark.parametrize(
+    ("stdout", "code", "said"),
+    [
+        (">&-", 0, ""),
+        pytest.param(
+            ">/dev/full",
+            1,
+            "facerf: error: system: No space left on device\n",
+            marks=pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux"),
+        ),
+    ],
+)
+def test_a_stdout_that_takes_nothing(stdout: str, code: int, said: str) -> None:
+    line = ["sh", "-c", f'exec "$0" -m facerf_cli --version {stdout}', sys.executable]
+    result = subprocess.run(line, capture_output=True, text=True, cwd=ROOT)
+    assert (result.returncode, result.stderr) == (code, said)
+
+
+@pytest.mark.parametrize(
     ("given", "spins"), [({}, "20000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, ""), ({"GOMP_SPINCOUNT": "7"}, "7")]
 )
 def test_threads_wait_asleep_unless_the_user_says_otherwise(given: dict[str, str], spins: str) -> None:
