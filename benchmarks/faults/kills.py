@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks._common import arguments
-from benchmarks.faults.runs import VERBS, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
+from benchmarks.faults.runs import PART, VERBS, Verb, faults_of, fresh, outputs, run, start, wait, warm_up
 
-_PART = ".*part-*"  # of the name of a temporary file or folder
 _CALLS = ("mkdir", "fsync", "replace", "row")
 _SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
@@ -87,7 +86,7 @@ def _random(
     verb.begin(folder / "in", out)
     for _ in range(draw.choice((1, 1, 2, 3))):
         notes, number = folder / "said", draw.choice(_SIGNALS)
-        before = set(out.rglob(_PART))  # of a killed run
+        before = set(out.rglob(PART))  # of a killed run
         process = start(verb.line(folder / "in", out), lambda: None, notes)
         time.sleep(draw.uniform(0, 1.1 * seconds))
         os.kill(process, number)
@@ -99,7 +98,7 @@ def _random(
             found.append(f"traceback after {number.name}: {ended.said[-300:]}")
         found += faults_of(out, whole, finished=False, grows=verb.grows)
         if number != signal.SIGKILL:
-            found += [f"left after {number.name}" for _ in set(out.rglob(_PART)) - before]
+            found += [f"left after {number.name}" for _ in set(out.rglob(PART)) - before]
     return found + _finish(verb, folder, out, whole)
 
 

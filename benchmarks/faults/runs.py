@@ -19,6 +19,7 @@ from benchmarks.faults import samples
 from facerf_cli.cli.report import REPORT_NAME
 from facerf_cli.files import atomic
 
+PART = ".*part-*"  # name of a temporary folder
 _OWN = (REPORT_NAME, ".facerf-index.jsonl")
 
 
@@ -34,7 +35,7 @@ class Verb:
     fill: Callable[..., None]  # writes so many inputs into a folder, photos of a side in pixels
     reads: Literal["inputs", "output", "nothing"] = "inputs"
     grows: tuple[str, ...] = ()  # files that it writes again as it goes on
-    reports: bool = True
+    reports: bool = True  # in a row an item
 
     def line(self, inputs: Path, output: Path) -> list[str]:
         """The command line."""
@@ -210,7 +211,7 @@ def faults_of(
     if not finished:
         return found
     found += [f"missing: {name}" for name in whole if name not in there]
-    found += [f"left: {path.name}" for path in folder.rglob(".*part-*")]
+    found += [f"left: {path.name}" for path in folder.rglob(PART)]
     found += [f"left: {path.name}" for path in folder.rglob(".facerf-lock*")]
     reports = list(folder.rglob(REPORT_NAME))
     for report in reports:

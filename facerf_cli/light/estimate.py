@@ -151,12 +151,11 @@ def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: 
     """
     if not len(target):  # nothing is visible enough
         return np.zeros(lights.shape[1])
-    trust, power = np.ones(len(target)), target @ target
+    trust, holding = np.ones(len(target)), target @ target * hold.T
+    gram, moment = holding @ hold, holding @ held
     for _ in range(_ROUNDS):
         trusted = lights.T * trust
-        weights = _non_negative(
-            trusted @ lights + power * hold.T @ hold, trusted @ target + power * hold.T @ held
-        )
+        weights = _non_negative(trusted @ lights + gram, trusted @ target + moment)
         error = np.abs(lights @ weights - target)
         limit = _OUTLIER * np.median(error) + _TINY
         trust = np.minimum(1, limit / np.maximum(error, limit))

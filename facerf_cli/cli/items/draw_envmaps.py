@@ -1,7 +1,7 @@
 """The maps of `facerf envmap`."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 
 from facerf_cli import __version__
@@ -53,7 +53,7 @@ def write_envmaps(
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
         print(path, flush=True)
     sheet = output / SHEET
-    if new or _is_older(sheet, list(maps)):
+    if new or _is_older(sheet, maps):
         if not dry_run:
             write_sheet(list(maps), sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
@@ -62,13 +62,12 @@ def write_envmaps(
 
 def _is_to_be_made(path: Path, facts: Facts, width_px: int, overwrite: Overwrite) -> bool:
     """Tell if a map is missing or damaged, or was drawn from another seed or at another width."""
-    if overwrite == "never":
-        return not path.exists()
+    if overwrite != "changed":
+        return overwrite == "always" or not path.exists()
     found = read_header(path)
-    drawn_so = found and found.width_px == width_px and facts.items() <= found.metadata.items()
-    return overwrite == "always" or not drawn_so
+    return not (found and found.width_px == width_px and facts.items() <= found.metadata.items())
 
 
-def _is_older(sheet: Path, maps: Sequence[Path]) -> bool:
+def _is_older(sheet: Path, maps: Iterable[Path]) -> bool:
     """Tell if a run was ended between the last map and the sheet."""
     return not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
