@@ -6,6 +6,7 @@ view turns scene-linear values into values of a display.
 """
 
 import difflib
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -37,6 +38,7 @@ _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 AUTO_EXPOSURE_PERCENTILE = 99.0
 ExposureRule = Literal["auto", "face"]
 FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
+MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more than one that sees it all
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
@@ -308,6 +310,16 @@ def chosen_exposure_ev(
     if rule == "face":
         return auto_exposure_ev(relit, person)
     return anchored_exposure_ev(relit, plate, face, person)
+
+
+def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
+    """The most exposure in EV, by a rule, under light of a total luminance; see `light_weights.strengths`.
+
+    A face that looks into a light of strength 1 needs 0 EV to be as bright as in its photo. Under `auto`, a
+    light from behind shows a dark face, not what little reaches it hundreds of times as bright.
+    """
+    limited = rule == "auto" and strength > _BLACK
+    return MOST_OVER_FRONT_EV - math.log2(strength) if limited else math.inf
 
 
 def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> float:

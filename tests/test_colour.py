@@ -1,5 +1,6 @@
 """Colour spaces against colour-science and OpenColorIO."""
 
+import math
 import warnings
 from pathlib import Path
 
@@ -266,3 +267,10 @@ def test_rules_of_exposure() -> None:
     plate, relit, mask = np.full((8, 8, 3), 0.1), np.full((8, 8, 3), 0.2), np.ones((8, 8))
     assert ours.chosen_exposure_ev("auto", relit, plate, mask, mask) == -1.0
     assert ours.chosen_exposure_ev("face", relit, plate, mask, mask) == 2.0
+
+
+def test_a_light_that_hardly_reaches_the_face_is_not_made_hundreds_of_times_as_bright() -> None:
+    """A face that looks into a light of strength 1 needs 0 EV; twice the light, half of that."""
+    assert ours.most_exposure_ev("auto", 1.0) == 3.0
+    assert ours.most_exposure_ev("auto", 4.0) == 1.0
+    assert ours.most_exposure_ev("auto", 0.0) == math.inf == ours.most_exposure_ev("face", 1.0)

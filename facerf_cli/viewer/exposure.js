@@ -11,17 +11,23 @@ class AutoExposure {
     this.masks = [arrays.skin, arrays.own];
   }
 
-  // EV, to two decimals, of a person [3, side, side] as coarse as the maps.
-  ev(relit) {
-    const [face, most] = this.masks.map((mask, i) => percentile(luminances(relit, mask), this.about.percentiles[i]));
+  // EV, to two decimals, of a person [3, side, side] as coarse as the maps, under light of a total luminance.
+  ev(relit, strength) {
+    const [face, person] = this.masks.map((mask, i) => percentile(luminances(relit, mask), this.about.percentiles[i]));
     if (Math.min(face, this.about.wanted) <= BLACK) return 0;
-    const gain = Math.min(this.about.wanted / face, (2 * Math.max(1, this.about.own)) / Math.max(most, BLACK));
-    return Math.round(100 * Math.log2(gain)) / 100;
+    const gain = Math.min(this.about.wanted / face, (2 * Math.max(1, this.about.own)) / Math.max(person, BLACK));
+    const most = strength > BLACK ? this.about.mostOverFront - Math.log2(strength) : Infinity;
+    return Math.round(100 * Math.min(Math.log2(gain), most)) / 100;
   }
 }
 
 function luminanceOf(rgb) {
   return LUMINANCE[0] * rgb[0] + LUMINANCE[1] * rgb[1] + LUMINANCE[2] * rgb[2];
+}
+
+// Luminance of all of some lights, from wherever they come.
+function strengthOf(lights) {
+  return lights.reduce((sum, { rgb }) => sum + luminanceOf(rgb), 0);
 }
 
 function luminances(planes, mask) {

@@ -14,6 +14,7 @@ from facerf_cli import strips
 from facerf_cli.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     FACE_PERCENTILE,
+    MOST_OVER_FRONT_EV,
     linear_to_srgb,
     luminance,
 )
@@ -117,6 +118,7 @@ def _exposure(field: PortraitField, whole: WholePerson) -> dict[str, Any]:
         return float(np.percentile(plate[mask], percentile)) if mask.any() else 0.0
 
     return {
+        "mostOverFront": MOST_OVER_FRONT_EV,
         "percentiles": [FACE_PERCENTILE, AUTO_EXPOSURE_PERCENTILE],
         "wanted": brighter(skin, FACE_PERCENTILE),
         "own": brighter(whole.own.numpy() > _SURE, AUTO_EXPOSURE_PERCENTILE),

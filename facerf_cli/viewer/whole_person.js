@@ -26,7 +26,7 @@ class LightField {
     if (own) for (let i = 0; i < lit.length; i++) lit[i] += mapGain * own.lit[i];
     const texture = this.face.neural(faces, own, mapGain);
     this.face.blended(texture, lit);
-    const ev = this.auto.ev(this.portrait.relit(lit));
+    const ev = this.auto.ev(this.portrait.relit(lit), strengthOf(lights) + mapGain * (own?.strength ?? 0));
     const exact = faces.every(({ known }) => known) && (!map || Boolean(own?.exact));
     return { ...this.portrait.wide(lit), texture, ...this.face.changes(texture), ev, exact };
   }
@@ -42,7 +42,8 @@ class LightField {
     const wanted = this.strongest(lights);
     const texture = this.face.ofStage(lights, this.faces);
     const exact = wanted.every((light) => this.faces[light]);
-    this.last = { map, degrees, decoded: this.decoded, wanted, exact, lit: this.portrait.sum(lights), texture };
+    const strength = strengthOf(lights);
+    this.last = { map, degrees, decoded: this.decoded, wanted, exact, strength, lit: this.portrait.sum(lights), texture };
     return this.last;
   }
 

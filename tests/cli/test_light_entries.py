@@ -2,13 +2,15 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.light_weights import near_lights_of, weights_over_rig
+from facerf_cli.cli.items.light_weights import near_lights_of, strengths, weights_over_rig
 from facerf_cli.cli.light_entries import lit_images, preset_names
 from facerf_cli.cli.lights import collect_setups
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.images import write_exr
 from facerf_cli.light.studio import StudioLight
 
 
@@ -162,3 +164,11 @@ def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
     assert near_lights_of(setups[:0]) is None
     alone = weights_over_rig(setups[:1], "150", "cell")
     assert len(alone[0]) == 1 and alone[1].abs().max() == 0  # a dark one, since models want one
+
+
+def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
+    write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
+    entries = ["0,0,3,3,3", "180,0", "at=0,0,1;stops=1", "from=around"]
+    setups = collect_setups([str(tmp_path / "even.exr")], None, entries, Path("out"))
+    found = dict(zip([setup.name for setup in setups], strengths(setups, "150", "cell"), strict=True))
+    assert list(found.values()) == pytest.approx([2, 3, 1, 2, 4], rel=1e-3)  # an even map of 0.5 first

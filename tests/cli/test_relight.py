@@ -448,6 +448,13 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
     assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0
 
 
+def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:
+    lights = ["--light", "180,20", "--light", "180,20,4,4,4"]
+    assert relight(given, tmp_path, *lights, "--format", "png") == 0
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image
+
+
 def test_a_group_shares_the_exposure_of_its_first_photo(given: Path, tmp_path: Path) -> None:
     """A darker frame, which by itself would be made as bright as the first."""
     photo = read_image(PHOTO).pixels

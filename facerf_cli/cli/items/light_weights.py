@@ -15,6 +15,7 @@ from facerf_cli.cli.items.photo_lights import light_of_photo
 from facerf_cli.cli.items.photos import directions_of, face_model
 from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.cli.output_options import OutputOptions
+from facerf_cli.colour import luminance
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.envmap import ball, rotated_weights
@@ -69,6 +70,17 @@ def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Samplin
     every = directions_of(rig)
     of_maps = _map_weights(setups, every, sampling)
     return torch.cat([every, directions]), torch.cat([of_maps, weights], 1)
+
+
+def strengths(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> list[float]:
+    """Luminance of all light of each of M setups, from wherever it comes.
+
+    Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
+    """
+    total, near = weights_over_rig(setups, rig, sampling)[1].sum(1), near_lights_of(setups)
+    if near is not None:
+        total = total + near.weights.sum(1)
+    return [float(value) for value in luminance(total.numpy())]
 
 
 def weights_of_far_lights(setups: Sequence[LightSetup]) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,7 @@ from facerf_cli.cli.items.backdrops import Backdrops
 from facerf_cli.cli.items.companions import companion
 from facerf_cli.cli.items.light_weights import (
     near_lights_of,
+    strengths,
     weights_of_far_lights,
     weights_over_rig,
     weights_over_stack,
@@ -37,7 +38,7 @@ from facerf_cli.cli.items.stack_composers import PersonStack, RenderedStack
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight_work import Relight
 from facerf_cli.cli.shots import shot_of
-from facerf_cli.colour import ExposureRule
+from facerf_cli.colour import ExposureRule, most_exposure_ev
 from facerf_cli.composite import Composition, Relit, RelitRows, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays
@@ -418,9 +419,11 @@ def _exposures_ev(
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     found: dict[str, float] = {}
+    lights = strengths(work.setups, work.rig, work.sampling)
     for part in parts:
-        for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
-            chosen_ev = round(composer.exposure_ev(relit, work.exposure), 2)
+        for setup, light, relit in zip(work.setups[part], lights[part], relit_by_part(part), strict=True):
+            most_ev = most_exposure_ev(work.exposure, light)
+            chosen_ev = round(min(composer.exposure_ev(relit, work.exposure), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next
     return found
