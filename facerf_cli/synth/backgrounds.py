@@ -38,18 +38,25 @@ def load_backgrounds(path: Path, maps: int, heaps: int, seed: int) -> Tensor:
 
 def views_of_map(index: int, seed: int) -> Tensor:
     """Photograph a procedural environment map [4, 3, S, S] in several directions, as `load_backgrounds`."""
-    generator = torch.Generator().manual_seed(seed * 7919 + index)
+    radiance = torch.from_numpy(draw_sky(index, seed, _MAP_PX)[0])
+    return views_of(radiance, _VIEWS, torch.Generator().manual_seed(seed * 7919 + index))
+
+
+def views_of(radiance: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Photograph an environment map [H, W, 3] `count` times, [N, 3, S, S], as `load_backgrounds`."""
     uniform = Uniform(generator)
-    radiance = torch.from_numpy(draw_sky(index, seed, _MAP_PX)[0]).permute(2, 0, 1)[None]
     views = []
-    for _ in range(_VIEWS):
+    for _ in range(count):
         tangent = uniform(*_ANGLE) * (2 * (torch.arange(SIDE_PX) + PIXEL_CENTRE) / SIDE_PX - 1)
         down, right = torch.meshgrid(tangent, tangent, indexing="ij")
         azimuth = uniform(-math.pi, math.pi) + right.atan()
         elevation = uniform(-0.25, 0.2) - (down / (1 + right.square()).sqrt()).atan()
         wrapped = torch.remainder(azimuth / math.pi + 1, 2) - 1
         grid = torch.stack([wrapped, -elevation / (math.pi / 2)], -1)[None]
-        views.append(_stored(F.grid_sample(radiance, grid, padding_mode="border", align_corners=False)[0]))
+        seen = F.grid_sample(
+            radiance.permute(2, 0, 1)[None], grid, padding_mode="border", align_corners=False
+        )
+        views.append(_stored(seen[0]))
     return torch.stack(views)
 
 

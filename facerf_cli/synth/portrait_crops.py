@@ -31,9 +31,10 @@ from facerf_cli.synth.feature_warp import FeatureWarp
 from facerf_cli.synth.random_fields import Uniform
 
 # Shares of samples: without a person, of a body without its head, grey, turned far, with a second person, and
-# with something before the face; of a face whose features were moved.
+# with something before the face; of a face whose features were moved; with decoys behind the person.
 _EMPTY, _HEADLESS, _GREY, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.25, 0.15, 0.3, 0.25
-_WARPED = 0.75
+_WARPED, _DECOYED = 0.75, 0.6
+_DECOYS = 8  # behind a person at most
 _TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
 # Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
 _SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
@@ -149,6 +150,8 @@ class StoredPortraits:
             blur_px = float(4 * Uniform(generator)(0, 1) ** 2)
             shown, cover = (blurred(x, blur_px) for x in (behind.crops[0] * (behind.weight > 0), cover))
             image = shown + (1 - cover) * image
+        if torch.rand((), generator=generator) < _DECOYED:
+            image = _with_decoys(image, crop, generator)
         return crop.crops[0] + (1 - crop.alpha) * image
 
 
@@ -276,11 +279,37 @@ def _bordered(crop: PortraitCrops, generator: torch.Generator) -> PortraitCrops:
     )
 
 
-def _occluder(crop: PortraitCrops, generator: torch.Generator) -> Tensor:
-    """Draw the cover [S, S] of something before the person: an ellipse, a bar or a box, mostly aside."""
+def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator) -> Tensor:
+    """Lay shapes with the person's own colours and texture over a background [3, S, S].
+
+    Behind real people stand things as dark as their hair and as white as their collars. A decoy shows the
+    person's image, turned and scaled, so neither colour nor texture tells it from the person.
+    """
     uniform, side = Uniform(generator), crop.alpha.shape[-1]
+    person = torch.cat([crop.crops[0], crop.alpha])
+    along = 2 * (torch.arange(side) + PIXEL_CENTRE) / side - 1
+    y, x = torch.meshgrid(along, along, indexing="ij")
+    for _ in range(int(torch.randint(1, _DECOYS + 1, (), generator=generator))):
+        matrix = _turn(float(uniform(-math.pi, math.pi))) * torch.exp(uniform(-1.0, 0.3))
+        grid = torch.stack([x, y], -1) @ matrix.T + uniform(-0.8, 0.8, 2)
+        shown = F.grid_sample(person[None], grid[None], padding_mode="reflection", align_corners=False)[0]
+        cover = _shape(uniform(0, 1, 2), side, generator) * shown[3:]
+        colours = shown[:3] / shown[3:].clamp_min(1e-3) * torch.exp(uniform(-0.4, 0.4))
+        image = image + cover * (colours - image)
+    return image
+
+
+def _occluder(crop: PortraitCrops, generator: torch.Generator) -> Tensor:
+    """Draw the cover [S, S] of something before the person, mostly aside."""
+    uniform = Uniform(generator)
     angle, distance = uniform(0, 2 * math.pi), uniform(0.1, 0.6)
     centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
+    return _shape(centre, crop.alpha.shape[-1], generator)
+
+
+def _shape(centre: Tensor, side: int, generator: torch.Generator) -> Tensor:
+    """Draw the cover [S, S] of an ellipse, a bar or a box around a place [2], in sides."""
+    uniform = Uniform(generator)
     long, wide = torch.exp(uniform(-3.2, -0.9)), torch.exp(uniform(-3.5, -1.4))
     tilt = uniform(0, math.pi)
     along = (torch.arange(side) + PIXEL_CENTRE) / side

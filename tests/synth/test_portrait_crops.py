@@ -1,5 +1,6 @@
 """Training crops: landmarks and classes move with the pixels, whatever is drawn."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -142,3 +143,29 @@ def test_beyond_the_photos_border_nothing_is_known(
 def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no portraits"):
         StoredPortraits(tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
+
+
+@pytest.mark.usefixtures("plain")
+def test_decoys_have_the_persons_colours_and_lie_behind(
+    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each image over black, with decoys and without: the person stays, and shapes appear around it."""
+    monkeypatch.setattr(StoredPortraits, "_background", lambda self, side, _: torch.zeros(3, side, side))
+    monkeypatch.setattr(portrait_crops, "_as_taken", lambda image, generator: image)
+    found = {}
+    for share in (0.0, 1.0):
+        monkeypatch.setattr(portrait_crops, "_DECOYED", share)
+        found[share] = [drawn(portraits, seed) for seed in range(8)]
+    around = 0.0
+    for plain, decoyed in zip(found[0.0], found[1.0], strict=True):
+        assert torch.equal(plain.alpha, decoyed.alpha) and torch.equal(plain.label, decoyed.label)
+        person, behind = plain.alpha[0] == 1, plain.alpha[0] == 0
+        assert torch.equal(plain.crops[0][:, person], decoyed.crops[0][:, person])
+        assert (plain.crops[0][:, behind] == 0).all()
+        around += float(decoyed.crops[0][:, behind].mean()) if behind.any() else 0
+    assert around > 0.01
+    crop, colour = found[0.0][0], torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
+    tinted = replace(crop, crops=crop.alpha[:, None] * colour)
+    seen = portrait_crops._with_decoys(torch.zeros(3, SIDE, SIDE), tinted, torch.Generator().manual_seed(1))
+    assert seen[0].max() > 0.05
+    torch.testing.assert_close(seen / colour, (seen[:1] / colour[0]).expand_as(seen))

@@ -1,0 +1,26 @@
+#!/usr/bin/env python
+"""Put views of environment maps behind the synthetic people of a bank, besides the drawn backgrounds.
+
+    python examples/add_backgrounds.py BANK MAP...
+
+Run it once, before the bank is used. The last leg of the shipped Parsing Network saw six maps of Poly Haven
+(CC0): kiara_1_dawn, potsdamer_platz, rooitou_park, st_fagans_interior, studio_small_03 and venice_sunset.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+from safetensors.torch import save_file
+
+from facerf_cli.cli.items.train_people import drawn_backgrounds
+from facerf_cli.files.light_files import read_map_file
+from facerf_cli.synth.backgrounds import views_of
+
+VIEWS = 16  # of each map
+SEED = 15
+
+path = Path(sys.argv[1]) / "backgrounds.safetensors"
+generator = torch.Generator().manual_seed(SEED)
+seen = [views_of(read_map_file(name), VIEWS, generator) for name in sys.argv[2:]]
+save_file({"backgrounds": torch.cat([drawn_backgrounds(path, SEED, tiny=False), *seen])}, path)
