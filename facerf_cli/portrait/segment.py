@@ -28,13 +28,16 @@ _NEAR_SIDES, _NEAR_ABOVE = (1.6, 2.2, 3.2), 0.1
 _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
+_HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
 # Lengths in extents of the landmarks: the line from the middle of the face down to the chest, and how far
 # from it all of the person counts as joined; half the width of a bridge that joins nobody; how far around the
-# middle of the face, and around the body, what is seen of the person is kept.
+# middle of the face, and around the body, what is seen of the person is kept. How far below the middle of the
+# face, and how far beside it, the person's chest has no holes; how far around them clothes are whole.
 _CHEST_BELOW, _WITHIN, _BRIDGE, _OF_HEAD, _OF_BODY = 1.5, 0.4, 0.06, 1.2, 0.2
+_CHEST_FROM, _CHEST_BESIDE, _RIM = 1.0, 1.0, 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,7 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     classes = torch.lerp(wide[1], middle[1], _feather(chest, size, image_srgb.shape))
     classes = torch.lerp(classes, mean / weights.sum(0).clamp_min(1e-6), shares.amax(0))
     places_px = _places(size, image_srgb.shape)
-    classes = with_ears(classes, close[0][0], places_px)
+    classes = with_ears(_with_likelier_hair(classes), close[0][0], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
     return classes / classes.sum(0).clamp_min(1e-6)
 
@@ -167,15 +170,36 @@ def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> T
 
 
 def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndarray) -> Tensor:
-    """Classes without what is not joined to face and chest, or by a thin bridge alone.
+    """Classes without what is not joined to face and chest, or by a thin bridge alone, and without holes.
 
     The pixels [h, w] of the classes lie at places [h, w, 2] in the photo.
     """
     face = _around(landmarks_px, 1, 0)
     extent_px = max(face.side_px, 1e-6)
     away = (places_px - (face.x_px, face.y_px)) / extent_px
+    pixel = float(np.ptp(places_px, axis=(0, 1)).max()) / max(1, max(classes.shape[1:]) - 1) / extent_px
+    return _joined(_without_holes(classes, away, pixel), away, pixel)
+
+
+def _without_holes(classes: Tensor, away: np.ndarray, pixel: float) -> Tensor:
+    """Classes without background amid the chest, such as a badge; places `away` [h, w, 2], see `_joined`."""
+    background = classes[0].numpy() >= 0.5
+    parts, _ = label(np.pad(background, 1, constant_values=True))
+    chest = (away[..., 1] > _CHEST_FROM) & (np.abs(away[..., 0]) < _CHEST_BESIDE)
+    holes = background & (parts[1:-1, 1:-1] != parts[0, 0]) & chest
+    if not holes.any():
+        return classes
+    whole = torch.from_numpy(distance_transform_edt(~holes) * pixel < _RIM)
+    person = classes[1:] / classes[1:].sum(0).clamp_min(1e-6)
+    return torch.where(whole, torch.cat([torch.zeros_like(classes[:1]), person]), classes)
+
+
+def _joined(classes: Tensor, away: np.ndarray, pixel: float) -> Tensor:
+    """Classes without what is not joined to face and chest.
+
+    Places `away` [h, w, 2] from the middle of the face and the side of a pixel are in the landmarks' extents.
+    """
     apart = np.linalg.norm(away - [0, 1] * away.clip(0, _CHEST_BELOW), axis=-1)  # from the head's axis
-    pixel = float(np.ptp(places_px, axis=(0, 1)).max()) / max(1, max(apart.shape) - 1) / extent_px
     person, middle = classes[0].numpy() < 0.5, apart < _WITHIN
     inner = distance_transform_edt(np.pad(person, 1, "edge"))[1:-1, 1:-1] * pixel > _BRIDGE
     parts, _ = label(inner | (person & middle))
@@ -183,6 +207,14 @@ def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndar
     around = distance_transform_edt(~joined) * pixel if joined.any() else np.zeros_like(apart)
     kept = np.maximum(_falling(np.linalg.norm(away, axis=-1), _OF_HEAD), _falling(around, _OF_BODY))
     return torch.lerp(_only_background(), classes, torch.from_numpy(kept).float())
+
+
+def _with_likelier_hair(classes: Tensor) -> Tensor:
+    """Classes [C, h, w] with `_HAIR` times the hair, as a share of the same person."""
+    person, hair = classes[1:].clone(), class_index("hair") - 1
+    person[hair] *= _HAIR
+    kept = classes[1:].sum(0) / person.sum(0).clamp_min(1e-6)
+    return torch.cat([classes[:1], person * kept])
 
 
 def _falling(distance: np.ndarray, most: float) -> np.ndarray:

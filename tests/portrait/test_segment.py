@@ -123,3 +123,38 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
     at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.562, abs=0.01)  # 1.6^-2 over the sum
     assert at_face[CLASSES.index("neck")] > 0.4
+
+
+def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_stay(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+        found = []
+        for square in wanted:
+            x, y = photo_share(square)
+            person = ((x - 160).abs() < 90) & (y > 40)
+            holes = [
+                (x - at_x).square() + (y - at_y).square() < 8**2
+                for at_x, at_y in ((150, 180), (190, 80), (235, 180))
+            ]
+            found.append(seen_of(square, {"garment": person & ~torch.stack(holes).any(0)}))
+        return found
+
+    monkeypatch.setattr(module, "look", look)
+    matte = 1 - module.seen_classes(photo(), FACE)[0]
+    assert matte[180, 150] > 0.99 and matte[80, 190] < 0.5 and matte[180, 235] < 0.5
+
+
+def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+        everywhere = torch.ones_like(places()[0], dtype=torch.bool)
+        found = [seen_of(square, {"hair": everywhere}) for square in wanted]
+        for seen in found:
+            for name, share in (("hair", 0.4), ("skin", 0.4), ("background", 0.2)):
+                seen.classes[CLASSES.index(name)] = share
+        return found
+
+    monkeypatch.setattr(module, "look", look)
+    at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
+    assert at_face[0] == pytest.approx(0.2, abs=1e-3)
+    assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
