@@ -98,16 +98,17 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     chest = _around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = _small_size(height, width)
-    wide, middle, *close = (
-        (one, _over_photo(one, size, image_srgb.shape)) for one in look(image_srgb, [body, chest, *near])
-    )
+    seen = look(image_srgb, [body, chest, *near])
+    wide, middle, *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
+    beyond = _feather(body, size, image_srgb.shape) == 0
+    wide = torch.where(beyond, _only_background(), wide)
     shares = torch.stack([_feather(square, size, image_srgb.shape) for square in near])
     weights = shares * torch.tensor(_NEAR_SIDES)[:, None, None] ** -2.0
-    mean = (weights[:, None] * torch.stack([seen for _, seen in close])).sum(0)
-    classes = torch.lerp(wide[1], middle[1], _feather(chest, size, image_srgb.shape))
+    mean = (weights[:, None] * torch.stack(close)).sum(0)
+    classes = torch.lerp(wide, middle, _feather(chest, size, image_srgb.shape))
     classes = torch.lerp(classes, mean / weights.sum(0).clamp_min(1e-6), shares.amax(0))
     places_px = _places(size, image_srgb.shape)
-    classes = with_ears(_with_likelier_hair(classes), close[0][0], places_px)
+    classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
     return classes / classes.sum(0).clamp_min(1e-6)
 
@@ -155,18 +156,25 @@ def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _over_photo(seen: Seen, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
-    """Classes [C, h, w] of a square, over the whole photo; the background lies around it."""
-    grid = torch.from_numpy(2 * seen.square.to_share(_places(size, shape)) - 1).float()[None]
-    found = F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
-    outside = (grid[0].abs() > 1).any(-1)
-    return torch.where(outside, _only_background(), found)
+    """Classes [C, h, w] of a square, over the whole photo; around it those of its border go on."""
+    down, right = _shares(seen.square, size, shape)
+    grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
+    return F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
 
 
 def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
     """Weight [h, w] of a square over the photo: 1 well inside it, 0 outside."""
-    share = square.to_share(_places(size, shape))
-    inside = np.minimum(share, 1 - share).min(-1) / _FEATHER
-    return torch.from_numpy(inside.clip(0, 1)).float()
+    down, right = ((torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in _shares(square, size, shape))
+    return torch.minimum(down[:, None], right)
+
+
+def _shares(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Where rows [h] and columns [w] of a small image lie in an upright square, in its sides."""
+    down, right = (
+        ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle) / square.side_px + 0.5
+        for count, length, middle in zip(size, shape, (square.y_px, square.x_px), strict=False)
+    )
+    return down, right
 
 
 def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndarray) -> Tensor:
