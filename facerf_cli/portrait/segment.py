@@ -169,7 +169,7 @@ def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> T
 
 
 def _shares(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Where rows [h] and columns [w] of a small image lie in an upright square, in its sides."""
+    """Rows [h] and columns [w] of a small image as places in an upright square, in its sides."""
     down, right = (
         ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle) / square.side_px + 0.5
         for count, length, middle in zip(size, shape, (square.y_px, square.x_px), strict=False)
