@@ -29,6 +29,7 @@ _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
+_CLOTH = 0.3, 0.7  # shares of the person below which cloth is background, and above which it is whole
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
@@ -110,7 +111,7 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
-    return classes / classes.sum(0).clamp_min(1e-6)
+    return _with_solid_cloth(classes / classes.sum(0).clamp_min(1e-6))
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:
@@ -223,6 +224,15 @@ def _with_likelier_hair(classes: Tensor) -> Tensor:
     person[hair] *= _HAIR
     kept = classes[1:].sum(0) / person.sum(0).clamp_min(1e-6)
     return torch.cat([classes[:1], person * kept])
+
+
+def _with_solid_cloth(classes: Tensor) -> Tensor:
+    """Classes [C, h, w] with less of half a person where it wears clothes, which are no veil."""
+    person = 1 - classes[0]
+    low, high = _CLOTH
+    cloth = classes[class_index("garment")] / person.clamp_min(1e-6)
+    firm = torch.lerp(person, ((person - low) / (high - low)).clamp(0, 1), cloth)
+    return torch.cat([1 - firm[None], classes[1:] * (firm / person.clamp_min(1e-6))])
 
 
 def _falling(distance: np.ndarray, most: float) -> np.ndarray:

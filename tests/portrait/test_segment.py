@@ -158,3 +158,22 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
     at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
     assert at_face[0] == pytest.approx(0.2, abs=1e-3)
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
+
+
+@pytest.mark.parametrize("share, matte", [(0.2, 0.0), (0.5, 0.5), (0.8, 1.0)])
+def test_cloth_is_whole_or_absent_and_hair_may_be_half(
+    monkeypatch: pytest.MonkeyPatch, share: float, matte: float
+) -> None:
+    for name, expected in (("garment", matte), ("hair", share)):
+
+        def look(image: np.ndarray, wanted: Sequence[Square], name: str = name) -> list[Seen]:
+            found = [seen_of(square, {}) for square in wanted]
+            for seen in found:
+                seen.classes[0], seen.classes[CLASSES.index(name)] = 1 - share, share
+            return found
+
+        monkeypatch.setattr(module, "look", look)
+        monkeypatch.setattr(module, "_of_one_person", lambda classes, *_: classes)
+        at_chest = module.seen_classes(photo(), FACE)[:, 150, 160]
+        assert 1 - at_chest[0] == pytest.approx(expected, abs=1e-3)
+        assert at_chest[CLASSES.index(name)] == pytest.approx(expected, abs=1e-3)
