@@ -14,13 +14,16 @@ import torch
 from safetensors.torch import save_file
 
 from facerf_cli.cli.items.train_people import drawn_backgrounds
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.synth.backgrounds import views_of
 
 VIEWS = 16  # of each map
 SEED = 15
 
-path = Path(sys.argv[1]) / "backgrounds.safetensors"
+bank = Path(sys.argv[1])
 generator = torch.Generator().manual_seed(SEED)
 seen = [views_of(read_map_file(name), VIEWS, generator) for name in sys.argv[2:]]
-save_file({"backgrounds": torch.cat([drawn_backgrounds(path, SEED, tiny=False), *seen])}, path)
+drawn = drawn_backgrounds(bank / "drawn_backgrounds.safetensors", SEED, tiny=False)
+with atomic_path(bank / "backgrounds.safetensors") as path:
+    save_file({"backgrounds": torch.cat([drawn, *seen])}, path)
