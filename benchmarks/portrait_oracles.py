@@ -3,9 +3,9 @@
     python benchmarks/portrait_oracles.py --pred PRED [--bench DIR]
 
 PRED holds the images that the benchmark's `facerf_all.py` makes. Relative error by region (squared error over
-the truth's, under one scale of the head): of the images as they are; with the right scale of each region; and
-times the ratio to the truth, blurred by a Gaussian of some pixels, which leaves only finer errors. *room*: so
-much of the light replaced by the photo's own, as a room sends it back.
+the truth's, under one scale of the head) and the head's SSIM: of the images as they are; with the right scale
+of each region; and times the ratio to the truth, blurred by a Gaussian of some pixels, which leaves only
+finer errors. *room*: so much of the light replaced by the photo's own, as a room sends it back.
 """
 
 import importlib.util
@@ -17,8 +17,9 @@ from types import ModuleType
 import numpy as np
 from _common import SHARED, arguments, required
 from scipy.ndimage import gaussian_filter
+from skimage.metrics import structural_similarity
 
-BLURS_PX = (40, 20, 10)
+BLURS_PX = (40, 20, 10, 5)
 ROOMS = (0.03, 0.06, 0.1, 0.15)
 DARK = 1e-4
 
@@ -36,6 +37,9 @@ def main() -> None:
     sums: dict[tuple[str, str, str], np.ndarray] = defaultdict(lambda: np.zeros(2))
     for subject, photo, relit, truth, regions in pairs(bench, pred):
         images = list(candidates(photo, relit, truth, regions["head"]))
+        for name, image in images:
+            for group in ("all", subject):
+                sums[group, name, "SSIM"] += similarity(image, truth, regions["head"]), 1
         for region, mask in regions.items():
             for name, image in (*images, ("region's scale known", scaled(relit, truth, mask))):
                 error = np.square(image - truth)[mask].mean(), np.square(truth)[mask].mean()
@@ -43,7 +47,9 @@ def main() -> None:
                     sums[group, name, region] += error
     for group in sorted({key[0] for key in sums}):
         for name in dict.fromkeys(key[1] for key in sums):
-            cells = {r: sums[group, name, r] for r in (*bench.REGIONS, "head") if (group, name, r) in sums}
+            cells = {
+                r: sums[group, name, r] for r in (*bench.REGIONS, "head", "SSIM") if (group, name, r) in sums
+            }
             shown = "  ".join(f"{region} {error / total:.3f}" for region, (error, total) in cells.items())
             print(f"{group:8} {name:22} {shown}")
 
@@ -88,6 +94,20 @@ def candidates(
     for room in ROOMS:
         own = photo * (relit[head].mean() / photo[head].mean())
         yield f"room of {room:.0%}", scaled((1 - room) * relit + room * own, truth, head)
+
+
+def similarity(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """SSIM inside a mask, as the benchmark measures it."""
+    local = structural_similarity(
+        np.clip(image, 0, 1) * mask,
+        truth * mask,
+        data_range=1,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )[1]
+    return float(local[mask].mean())
 
 
 def scaled(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -58,6 +58,16 @@ def whole(rows: Rows) -> np.ndarray:
     return found
 
 
+def block_means(image: np.ndarray, block: int) -> np.ndarray:
+    """Means [H / block, W / block, C] float32 of blocks of an image [H, W, C], with no float copy of it."""
+    height, width = (length // block for length in image.shape[:2])
+    total = np.zeros((height, width, *image.shape[2:]), np.float32)
+    for row in range(block):
+        for column in range(block):
+            total += image[row::block, column::block][:height, :width]
+    return total / np.float32(block**2)
+
+
 def enlarged(maps: np.ndarray, size: tuple[int, ...], rows: slice = slice(None)) -> np.ndarray:
     """Maps [C, h, w] at another size [C, H, W], or some rows of that."""
     above, below, share = between(np.arange(size[0])[rows], maps.shape[1], size[0])

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from facerf_cli.face.crop import Box
+from facerf_cli.strips import block_means
 
 DETECTOR_LICENCE = "dlib HOG frontal face detector: Boost Software License 1.0"
 _ENLARGE = 2.0  # largest enlargement of a small image
@@ -35,14 +36,8 @@ def detected_boxes(image_srgb: np.ndarray, side_px: int) -> list[Box]:
 def reduced(image: np.ndarray, scale: float) -> np.ndarray:
     """Resize to uint8 by averaging (or smoothly enlarging) without a float copy of the whole image."""
     block = max(1, min(int(1 / scale), *image.shape[:2]))  # an image may be one pixel wide
-    height, width = (length // block for length in image.shape[:2])
-    small = np.zeros((height, width, 3), np.float32)
-    for row in range(block):
-        for column in range(block):
-            small += image[row::block, column::block][:height, :width]
-    small /= block * block
     size = [max(1, round(length * scale)) for length in image.shape[:2]]
-    tensor = torch.from_numpy(small).permute(2, 0, 1)[None]
+    tensor = torch.from_numpy(block_means(image, block)).permute(2, 0, 1)[None]
     resized = torch.nn.functional.interpolate(tensor, size, mode="bilinear", antialias=True)[0]
     return resized.permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
 

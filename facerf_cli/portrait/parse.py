@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import STRIP_PX, strips
+from facerf_cli.strips import block_means
 
 SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -57,7 +57,8 @@ class Square:
         low = np.maximum(0, np.minimum(low, high - step))
         count = np.maximum(1, (high - low) // step)
         region = image_srgb[low[1] : low[1] + count[1] * step, low[0] : low[0] + count[0] * step]
-        small = torch.from_numpy(_averaged(region, step)).permute(2, 0, 1)[None] / 255
+        means = block_means(region, step if min(region.shape[:2]) >= step else 1)
+        small = torch.from_numpy(means).permute(2, 0, 1)[None] / 255
         at = (np.arange(size_px) + PIXEL_CENTRE) / size_px
         place = self.to_photo(np.stack(np.meshgrid(at, at), -1))
         size = np.array(small.shape[:1:-1])
@@ -65,33 +66,25 @@ class Square:
         return F.grid_sample(small, grid, padding_mode="border", align_corners=False)[0]
 
 
-def _averaged(region: np.ndarray, step: int) -> np.ndarray:
-    """Means [H / step, W / step, 3] float32 of blocks of a uint8 image; less than a block stays as it is."""
-    height, width = (max(1, length // step) for length in region.shape[:2])
-    if step == 1 or min(region.shape[:2]) < step:
-        return region.astype(np.float32)
-    blocks = np.empty((height, width, 3), np.float32)
-    for rows in strips((height, region.shape[1]), STRIP_PX // step):
-        part = region[rows.start * step : rows.stop * step if rows.stop < height else None]
-        tall = np.add.reduceat(part, np.arange(rows.stop - rows.start) * step, axis=0, dtype=np.float32)
-        blocks[rows] = np.add.reduceat(tall, np.arange(width) * step, axis=1)
-    return blocks / np.float32(step**2)
-
-
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """View of a square by the network: shares [C, S, S] of the classes; landmarks [N, 2] in the photo.
+    """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
 
-    error_px [N] are the landmarks' expected errors; presence, in 0..1, says how surely a head is there;
-    sharpness: see `sharpness_of`.
+    The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
+    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`.
     """
 
     square: Square
-    classes: Tensor
+    logits: Tensor
     landmarks_px: np.ndarray
     error_px: np.ndarray
     presence: float
     sharpness: float = 1.0
+
+    @cached_property
+    def classes(self) -> Tensor:
+        """Shares [C, S, S] of the classes, which sum to 1; the mean of all looks."""
+        return self.logits.softmax(1).mean(0)
 
     @property
     def extent_px(self) -> float:
@@ -141,16 +134,17 @@ def look(image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = Fal
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
     sharpness = sharpness_of(crops)
     found: Parsing = network(crops)
-    classes, places, log_error = found.classes, found.landmarks.double(), found.log_error.double()
+    logits, places, log_error = found.logits[:, None], found.landmarks.double(), found.log_error.double()
     if mirrored:
         other: Parsing = network(crops.flip(-1))
+        logits = torch.cat([logits, other.logits.flip(-1)[:, None]], 1)
         flipped = other.landmarks.double()[:, MIRROR] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
-        classes, places = (classes + other.classes.flip(-1)) / 2, (places + flipped) / 2
+        places = (places + flipped) / 2
         log_error = (log_error + other.log_error.double()[:, MIRROR]) / 2
     return [
         Seen(
             square,
-            classes[index],
+            logits[index].float(),
             square.to_photo(places[index].numpy()),
             log_error[index].exp().numpy() * square.side_px,
             float(found.presence[index].sigmoid()),

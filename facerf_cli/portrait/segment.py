@@ -101,13 +101,16 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     size = _small_size(height, width)
     seen = look(image_srgb, [body, chest, *near])
     wide, middle, *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
-    beyond = _feather(body, size, image_srgb.shape) == 0
-    wide = torch.where(beyond, _only_background(), wide)
-    shares = torch.stack([_feather(square, size, image_srgb.shape) for square in near])
-    weights = shares * torch.tensor(_NEAR_SIDES)[:, None, None] ** -2.0
-    mean = (weights[:, None] * torch.stack(close)).sum(0)
-    classes = torch.lerp(wide, middle, _feather(chest, size, image_srgb.shape))
-    classes = torch.lerp(classes, mean / weights.sum(0).clamp_min(1e-6), shares.amax(0))
+    classes = _only_background().repeat(1, *size)
+    wide.part_of(classes).copy_(wide.classes)
+    middle.part_of(classes).lerp_(middle.classes, middle.feather)
+    mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
+    for one, sides in zip(close, _NEAR_SIDES, strict=True):
+        weighed = one.feather * sides**-2.0
+        one.part_of(mean).addcmul_(one.classes, weighed)
+        one.part_of(weight).add_(weighed)
+        one.part_of(share).copy_(torch.maximum(one.part_of(share), one.feather))
+    classes.lerp_(mean.div_(weight.clamp_min_(1e-6)), share)
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
@@ -156,17 +159,32 @@ def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def _over_photo(seen: Seen, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
-    """Classes [C, h, w] of a square, over the whole photo; around it those of its border go on."""
-    down, right = _shares(seen.square, size, shape)
+@dataclass(frozen=True, eq=False)
+class _Laid:
+    """Classes [C, h', w'] of a square over the part of a small image that it covers.
+
+    Their weight [h', w'], `feather`, is 1 well inside the square and falls to 0 at its border.
+    """
+
+    rows: slice
+    columns: slice
+    classes: Tensor
+    feather: Tensor
+
+    def part_of(self, image: Tensor) -> Tensor:
+        """The part of an image [..., h, w] that the square covers."""
+        return image[..., self.rows, self.columns]
+
+
+def _over_photo(seen: Seen, size: tuple[int, int], shape: tuple[int, ...]) -> _Laid:
+    """The classes of an upright square, over a small image of the whole photo."""
+    places = _shares(seen.square, size, shape)
+    rows, columns = (slice(int((at <= 0).sum()), int((at < 1).sum())) for at in places)
+    down, right = places[0][rows], places[1][columns]
     grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
-    return F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
-
-
-def _feather(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> Tensor:
-    """Weight [h, w] of a square over the photo: 1 well inside it, 0 outside."""
-    down, right = ((torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in _shares(square, size, shape))
-    return torch.minimum(down[:, None], right)
+    classes = F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
+    fall = [(torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in (down, right)]
+    return _Laid(rows, columns, classes, torch.minimum(fall[0][:, None], fall[1]))
 
 
 def _shares(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:

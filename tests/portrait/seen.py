@@ -23,4 +23,10 @@ def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 
         label[inside] = class_index(name)
     classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
     landmarks = square.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (LANDMARKS, 2)))
-    return Seen(square, classes, landmarks, np.full(LANDMARKS, 0.01 * square.side_px), presence)
+    return Seen(
+        square,
+        classes.clamp_min(1e-30).log()[None],
+        landmarks,
+        np.full(LANDMARKS, 0.01 * square.side_px),
+        presence,
+    )
