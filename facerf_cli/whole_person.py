@@ -74,13 +74,17 @@ class WholePerson:
 
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo at the square's border, which goes on beyond it."""
-        return _blurred(inpaint(self._relit(lit), self.at_border), _CHANGE_PX) / self.own_change
+        return self._of_border(self._relit(lit)) / self.own_change
 
     @cached_property
     def own_change(self) -> Tensor:
         """The photo's own part [3, S, S] of that change: its blur, and a little that keeps it from 0."""
         own = self._field.person.image
-        return _blurred(inpaint(own, self.at_border), _CHANGE_PX) + _DARK * own.mean()
+        return self._of_border(own) + _DARK * own.mean()
+
+    def _of_border(self, maps: Tensor) -> Tensor:
+        """What goes on beyond the square: maps [C, S, S] of the person at its border alone, blurred."""
+        return _blurred(inpaint(maps, self.at_border), _CHANGE_PX)
 
     @cached_property
     def at_border(self) -> Tensor:
@@ -107,7 +111,7 @@ class WholePerson:
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
         shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
-        shares. All are 0 off the person.
+        shares. All are 0 off the person. Beyond the square what is at its border goes on, as the light does.
         """
         if name == "classes":
             layers = self._field.person.segmentation.layers()
@@ -123,14 +127,18 @@ class WholePerson:
             "depth": -person.maps.positions_m[2:],
         }[name]
         filled = self._filled(maps)
+        beyond = filled if name in ("position", "depth") else self._of_border(maps)
+        both = torch.cat([beyond, filled])
 
         def of(rows: slice) -> np.ndarray:
-            wide: np.ndarray = self._enlarged(filled, rows)[0].permute(1, 2, 0).numpy()
+            pair, inside = self._enlarged(both, rows)
+            outer, inner = pair.chunk(2)
+            wide: np.ndarray = torch.lerp(outer, inner, inside).permute(1, 2, 0).numpy()
             if name == "normal":
                 wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
             return wide
 
-        return {name: self._masked(of, len(filled))}
+        return {name: self._masked(of, len(maps))}
 
     def _masked(self, of: Callable[[slice], np.ndarray], channels: int = 3) -> Rows:
         """A layer [H, W, C] whose rows a function gives, without what lies off the person."""
@@ -138,9 +146,12 @@ class WholePerson:
         return Computed(shape, lambda rows: of(rows) * (self.matte[rows] > 0)[..., None])
 
     def _albedo_map(self, rows: slice) -> np.ndarray:
-        wide, _ = self._enlarged(self.albedo_maps, rows)
-        albedo = self._albedo(self._photo[rows], wide, self._display_ev) * self._field.exposure
-        return albedo.permute(1, 2, 0).numpy()
+        unlit = torch.zeros(6, *self.own.shape).index_fill_(0, torch.arange(3), 1.0)
+        stacked, pixels = torch.cat([self.albedo_maps, self._change(unlit)]), self._photo[rows]
+        wide, inside = self._enlarged(stacked, rows)
+        found = self._albedo(pixels, wide, self._display_ev) * self._field.exposure
+        beyond = torch.from_numpy(pixels.clip(min=0)).permute(2, 0, 1) * wide[_ALBEDO_MAPS:]
+        return torch.lerp(beyond, found, inside).permute(1, 2, 0).numpy()
 
     def _albedo(self, photo: np.ndarray, wide: Tensor, exposure_ev: float) -> Tensor:
         """The photo without its light [3, h, W] in some rows [h, W, 3], from the maps over them."""

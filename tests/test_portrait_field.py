@@ -186,6 +186,24 @@ def test_a_lit_shoulder_changes_nothing_beyond_the_square(photo: np.ndarray, fie
     assert one.size > 0 and np.array_equal(one, other)
 
 
+def test_a_streak_at_the_border_is_none_in_the_layers_beyond_the_square(
+    photo: np.ndarray, field: PortraitField
+) -> None:
+    square, side = field.person.square, field.person.image.shape[-1]
+    below = slice(round(square.y0_px + square.side_px) + 1, photo.shape[0])
+    streak = torch.ones(side, side)
+    streak[-20:, 92:96] = 10
+    maps = field.maps._replace(gain=field.maps.gain * streak, albedo=field.maps.albedo * streak)
+    even = torch.ones(9, side, side)
+    for name in ("albedo", "shadow"):
+        streaked, plain = (
+            whole(WholePerson(photo, one).layer(name, lit)[name])[below].mean(-1)
+            for one, lit in ((replace(field, maps=maps), even * streak), (field, even))
+        )
+        change = np.where(plain > 1e-3, streaked / np.maximum(plain, 1e-3), np.nan)
+        assert np.nanmax(np.abs(np.diff(change, axis=1))) < 0.5  # 3 where the streak goes on
+
+
 def test_without_light_all_is_black(field: PortraitField) -> None:
     lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
     assert lit.stacked.shape == (2, 9, *field.person.image.shape[1:]) and lit.stacked.abs().max() == 0
