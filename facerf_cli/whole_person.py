@@ -83,7 +83,7 @@ class WholePerson:
         return self._of_border(own) + _DARK * own.mean()
 
     def _of_border(self, maps: Tensor) -> Tensor:
-        """What goes on beyond the square: maps [C, S, S] of the person at its border alone, blurred."""
+        """Maps [C, S, S] of the person at the square's border alone, blurred, as they go on beyond it."""
         return _blurred(inpaint(maps, self.at_border), _CHANGE_PX)
 
     @cached_property
