@@ -74,8 +74,8 @@ class PortraitInputs:
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""
         seen = {name: getattr(self, name).flip(-1) for name in self.__dataclass_fields__}
-        seen["normals"] = _mirrored_x(seen["normals"])
-        seen["reached"] = _mirrored_harmonics(seen["reached"])
+        seen["normals"] = mirrored_x(seen["normals"])
+        seen["reached"] = mirrored_harmonics(seen["reached"])
         return PortraitInputs(**seen)
 
     def stacked(self) -> Tensor:
@@ -86,12 +86,12 @@ class PortraitInputs:
         return torch.cat(layers, 1)
 
 
-def _mirrored_x(vectors: Tensor) -> Tensor:
+def mirrored_x(vectors: Tensor) -> Tensor:
     """Vectors [B, 3, S, S], x to the other side."""
     return torch.cat([-vectors[:, :1], vectors[:, 1:]], 1)
 
 
-def _mirrored_harmonics(coefficients: Tensor) -> Tensor:
+def mirrored_harmonics(coefficients: Tensor) -> Tensor:
     """Coefficients [B, K, S, S] of the function of (-x, y, z)."""
     signs = mirror_signs(coefficients.shape[1]).to(coefficients)
     return coefficients * signs.view(-1, 1, 1)
@@ -132,11 +132,11 @@ class PortraitMaps(NamedTuple):
         """Maps of the people as a mirror shows them: under mirrored lights their images are mirrored."""
         maps = PortraitMaps(*(values.flip(-1) for values in self))
         return maps._replace(
-            normals=_mirrored_x(maps.normals),
-            strands=_mirrored_x(maps.strands),
-            lit=_mirrored_harmonics(maps.lit),
-            around=_mirrored_harmonics(maps.around),
-            shadow=_mirrored_harmonics(maps.shadow),
+            normals=mirrored_x(maps.normals),
+            strands=mirrored_x(maps.strands),
+            lit=mirrored_harmonics(maps.lit),
+            around=mirrored_harmonics(maps.around),
+            shadow=mirrored_harmonics(maps.shadow),
         )
 
     def averaged(self, other: "PortraitMaps") -> "PortraitMaps":

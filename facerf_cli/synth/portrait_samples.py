@@ -10,9 +10,14 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.sh import mirror_signs
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.network.portrait import SKIN, PortraitInputs, reached_by
+from facerf_cli.network.portrait import (
+    SKIN,
+    PortraitInputs,
+    mirrored_harmonics,
+    mirrored_x,
+    reached_by,
+)
 from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.synth.backgrounds import background_of
 from facerf_cli.synth.face_crops import blurred
@@ -234,9 +239,8 @@ def mirrored(sample: PortraitSample) -> PortraitSample:
         value = getattr(sample, field.name)
         values[field.name] = value.flip(-1) if value.dim() > 3 else value
     for name in ("normals", "true_normals"):
-        values[name] = values[name] * torch.tensor([-1.0, 1, 1]).view(1, 3, 1, 1)
+        values[name] = mirrored_x(values[name])
     for name in ("lights", "rig"):
         values[name] = values[name] * torch.tensor([-1.0, 1, 1])
-    signs = mirror_signs(values["reached"].shape[1])
-    values["reached"] = values["reached"] * signs.view(1, -1, 1, 1)
+    values["reached"] = mirrored_harmonics(values["reached"])
     return PortraitSample(**values)
