@@ -21,8 +21,8 @@ from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.models import Models
 
-_AROUND = 50  # lights of the rig from around
-_RINGS_DEG = (12.0, 5.0)  # of the search for the lamp, each around the best place so far
+_AROUND = 32  # lights of the rig from around
+_RINGS_DEG = (14.0, 6.0)  # of the search for the lamp, each around the best place so far
 _RING = 6  # places on a ring
 
 
