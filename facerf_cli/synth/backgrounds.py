@@ -123,9 +123,9 @@ def background_of(stored: Tensor, side: int, generator: torch.Generator) -> Tens
     y, x = torch.meshgrid(at + centre[1], at + centre[0], indexing="ij")
     grid = torch.stack([x, y], -1)[None]
     seen = F.grid_sample((stored.float() / 255).square()[None], grid, align_corners=False)[0]
-    if torch.rand((), generator=generator) < 0.25:  # a plain wall
+    if torch.rand((), generator=generator) < 0.2:  # a plain wall
         seen = blurred(seen, side / 6)
-    elif torch.rand((), generator=generator) < 0.6:
+    elif torch.rand((), generator=generator) < 0.5:
         seen = blurred(seen, float(uniform(0, 8)))
     exposure = torch.exp(uniform(-3.0, 1.0)) / 6 / seen.mean().clamp_min(1e-4)
     return seen * exposure * torch.exp(uniform(-0.2, 0.2, 3, 1, 1))

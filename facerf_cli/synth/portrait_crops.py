@@ -34,7 +34,7 @@ from facerf_cli.synth.random_fields import Uniform
 # with something before the face; of a face whose features were moved; with decoys behind the person.
 _EMPTY, _HEADLESS, _GREY, _TURNED_FAR, _SECOND, _OCCLUDED = 0.06, 0.05, 0.25, 0.15, 0.3, 0.25
 _WARPED, _DECOYED = 0.75, 0.6
-_DECOYS = 8  # behind a person at most
+_DECOYS, _TOUCHING = 8, 0.5  # behind a person at most; share of them that touch the person's outline
 _TURN_DEG, _FAR_TURN_DEG = 12.0, 50.0  # standard deviation of the turn; largest of the far ones
 # Sides of the crop in extents of the landmarks: of the face, of the portrait, of a whole photo; their shares.
 _SIDES, _SIDE_SHARES = ((1.25, 2.2), (2.4, 4.6), (4.6, 10.0)), (0.4, 0.4, 0.2)
@@ -283,20 +283,32 @@ def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator)
     """Lay shapes with the person's own colours and texture over a background [3, S, S].
 
     Behind real people stand things as dark as their hair and as white as their collars. A decoy shows the
-    person's image, turned and scaled, so neither colour nor texture tells it from the person.
+    person's image, turned and scaled, so neither colour nor texture tells it from the person. Half of them
+    touch the person's outline, where they are most easily taken for hair.
     """
     uniform, side = Uniform(generator), crop.alpha.shape[-1]
     person = torch.cat([crop.crops[0], crop.alpha])
     along = 2 * (torch.arange(side) + PIXEL_CENTRE) / side - 1
     y, x = torch.meshgrid(along, along, indexing="ij")
+    outline = _outline(crop.alpha[0])
     for _ in range(int(torch.randint(1, _DECOYS + 1, (), generator=generator))):
         matrix = _turn(float(uniform(-math.pi, math.pi))) * torch.exp(uniform(-1.0, 0.3))
         grid = torch.stack([x, y], -1) @ matrix.T + uniform(-0.8, 0.8, 2)
         shown = F.grid_sample(person[None], grid[None], padding_mode="reflection", align_corners=False)[0]
-        cover = _shape(uniform(0, 1, 2), side, generator) * shown[3:]
+        place = uniform(0, 1, 2)
+        if len(outline) and torch.rand((), generator=generator) < _TOUCHING:
+            place = outline[int(torch.randint(len(outline), (), generator=generator))]
+        cover = _shape(place, side, generator) * shown[3:]
         colours = shown[:3] / shown[3:].clamp_min(1e-3) * torch.exp(uniform(-0.4, 0.4))
         image = image + cover * (colours - image)
     return image
+
+
+def _outline(alpha: Tensor) -> Tensor:
+    """Places [N, 2] in sides, (x, y), of the pixels just off a person of `alpha` [S, S]."""
+    person = (alpha > 0.5).float()[None, None]
+    around = F.max_pool2d(person, 5, 1, 2) - person
+    return (around[0, 0].nonzero().flip(-1) + PIXEL_CENTRE) / alpha.shape[-1]
 
 
 def _occluder(crop: PortraitCrops, generator: torch.Generator) -> Tensor:

@@ -169,3 +169,13 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
     seen = portrait_crops._with_decoys(torch.zeros(3, SIDE, SIDE), tinted, torch.Generator().manual_seed(1))
     assert seen[0].max() > 0.05
     torch.testing.assert_close(seen / colour, (seen[:1] / colour[0]).expand_as(seen))
+
+
+def test_the_outline_lies_just_off_the_person() -> None:
+    """Around a rectangle of an image that is not mirrored by chance: places are (x, y), within two pixels."""
+    alpha = torch.zeros(SIDE, SIDE)
+    alpha[10:20, 30:50] = 1
+    x, y = (portrait_crops._outline(alpha) * SIDE - 0.5).T
+    assert x.min() == 28 and x.max() == 51 and y.min() == 8 and y.max() == 21
+    assert not alpha[y.long(), x.long()].any()
+    assert not len(portrait_crops._outline(torch.zeros(SIDE, SIDE)))
