@@ -14,6 +14,7 @@ from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.models import Models
 from facerf_cli.network.inputs import is_grey, without_cast
+from facerf_cli.network.precision import mixed_precision
 from facerf_cli.network.reflectance import ReflectanceNetwork
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
@@ -49,11 +50,11 @@ class Field:
         visible = face.visible[None, None]
         texture = without_cast(face.texture[None], visible, self.models.source_colours)
         source, grey = (texture, face.normals[None], visible), is_grey(face.texture)
-        with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
+        with mixed_precision(device, self.bf16):
             encoded = network.encode(*(tensor.to(device) for tensor in source))
         for chunk in torch.split(lights, self._batch(len(lights))):
             # autocast does not enclose the yield, or it would stay on in the caller
-            with torch.autocast(device.type, torch.bfloat16, enabled=self.bf16):
+            with mixed_precision(device, self.bf16):
                 olats = network.decode(encoded, normals, chunk[None].to(device))[0]
             olats = olats.float().cpu()
             olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats

@@ -116,7 +116,11 @@ def predict_olat(
     network_alone: NetworkAloneOption = False,
     texture_size: TextureSizeOption = None,
     precision: Annotated[
-        Precision, typer.Option(help="Compute the network in this precision.", rich_help_panel=METHOD)
+        Precision,
+        typer.Option(
+            help="Compute the network in this precision; bf16 where the device has instructions for it.",
+            rich_help_panel=METHOD,
+        ),
     ] = "float32",
     format_: Annotated[
         StackFormat,

@@ -254,7 +254,7 @@ def train(
         bool | None,
         _speed(
             "--bf16/--no-bf16",
-            help="Train in mixed precision.",
+            help="Train in mixed precision (bfloat16), where the device has instructions for it.",
             show_default="on; presets paper and tiny, and --form paper, off",
         ),
     ] = None,

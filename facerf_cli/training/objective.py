@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.network.inputs import SourceColours
+from facerf_cli.network.precision import mixed_precision
 
 # Entries of a checkpoint's metadata that say what its networks expect at test time (`models.py`).
 INPUTS = ("source_colours", "geometry", "texture_side", "crop_px")
@@ -67,7 +68,7 @@ class Objective(nn.Module):
     def mixed_precision(self) -> torch.autocast:
         """Context for the networks in `forward`; geometry and losses need single precision."""
         device = next(self.networks.parameters()).device
-        return torch.autocast(device.type, torch.bfloat16, enabled=self.bf16)
+        return mixed_precision(device, self.bf16)
 
 
 def seeded(*numbers: int) -> torch.Generator:
