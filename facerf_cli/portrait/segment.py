@@ -23,13 +23,14 @@ from facerf_cli.strips import Computed, Rows, enlarged
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
-# more, weigh more, by the inverse square of their sides.
+# more, weigh more, by an inverse power of their sides.
 _NEAR_SIDES, _NEAR_ABOVE = (1.6, 2.2, 3.2), 0.1
 _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
+_STEEPNESS = 4.0  # the power
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
-_CLOTH = 0.3, 0.7  # shares of the person below which cloth is background, and above which it is whole
+_PERSON = 0.5, 0.8  # shares of the person below which a pixel is background, and above which it is whole
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
@@ -106,7 +107,7 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     middle.part_of(classes).lerp_(middle.classes, middle.feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
     for one, sides in zip(close, _NEAR_SIDES, strict=True):
-        weighed = one.feather * sides**-2.0
+        weighed = one.feather * sides**-_STEEPNESS
         one.part_of(mean).addcmul_(one.classes, weighed)
         one.part_of(weight).add_(weighed)
         one.part_of(share).copy_(torch.maximum(one.part_of(share), one.feather))
@@ -114,7 +115,7 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
-    return _with_solid_cloth(classes / classes.sum(0).clamp_min(1e-6))
+    return _decided(classes / classes.sum(0).clamp_min(1e-6))
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:
@@ -244,12 +245,13 @@ def _with_likelier_hair(classes: Tensor) -> Tensor:
     return torch.cat([classes[:1], person * kept])
 
 
-def _with_solid_cloth(classes: Tensor) -> Tensor:
-    """Classes [C, h, w] with less of half a person where it wears clothes, which are no veil."""
-    person = 1 - classes[0]
-    low, high = _CLOTH
-    cloth = classes[class_index("garment")] / person.clamp_min(1e-6)
-    firm = torch.lerp(person, ((person - low) / (high - low)).clamp(0, 1), cloth)
+def _decided(classes: Tensor) -> Tensor:
+    """Classes [C, h, w] with less doubt about the person; a haze of background around it is none of it.
+
+    The network sees the person a little too wide. Edges of hair are softened again by those of the photo.
+    """
+    person, (low, high) = 1 - classes[0], _PERSON
+    firm = ((person - low) / (high - low)).clamp(0, 1)
     return torch.cat([1 - firm[None], classes[1:] * (firm / person.clamp_min(1e-6))])
 
 
