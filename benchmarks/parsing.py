@@ -11,7 +11,8 @@ a mesh; *others*: the same on the other subjects. Regions: share of each outline
 class, and the shares of other classes. Held-out people (--bank, a folder of portraits that `facerf train
 --stage parsing` made of another seed): IoU and F1 by class, and of the matte the sum of absolute differences
 and the gradient error in thousands, as Rhemann et al., *A perceptually motivated online benchmark for image
-matting*, 2009. Speed: seconds of one core at 1024 x 1024, and of dlib.
+matting*, 2009, of the network alone on crops, and of the whole of `segment` on photos. Speed: seconds of one
+core at 1024 x 1024, and of dlib.
 """
 
 import json
@@ -45,6 +46,7 @@ from facerf_cli.synth.portrait_crops import StoredPortraits
 from facerf_cli.training.objective import seeded
 
 SEED = 7
+SEGMENT_PX = 384  # side of the photos in which the whole of `segment` is measured
 ANGLES_DEG = (0, 20, 40, 60, 80, 180)
 REGIONS = {  # classes that count as each region
     "face": ("skin", "brows", "eyes", "lips", "mouth", "beard", "glasses"),
@@ -69,6 +71,7 @@ def main() -> None:
         measure_regions(options.portraits, json.loads(options.regions.read_text()))
     if options.bank:
         measure_held_out(options.bank)
+        measure_segment(options.bank)
     measure_speed()
     if options.photos.is_dir():
         measure_photos(options.photos)
@@ -230,6 +233,25 @@ def measure_held_out(folder: Path) -> None:
     everything, inner = np.median(error_percent, 0)
     count = len(error_percent)
     print(f"held-out landmarks, median: all {everything:.2f} %, inner {inner:.2f} % ({count} crops)")
+
+
+def measure_segment(folder: Path) -> None:
+    """Print errors of the matte of `segment` on photos of held-out synthetic people whose faces are whole."""
+    backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
+    portraits = StoredPortraits(folder, backgrounds, {})
+    errors = []
+    for person in range(len(portraits.paths)):
+        for draw in range(5):
+            crop = portraits.draw([person], SEGMENT_PX, seeded(SEED, person, draw))
+            if not (crop.present[0] and crop.known[0, :68].all()):
+                continue
+            image = (255 * crop.crops[0].permute(1, 2, 0)).round().byte().numpy()
+            found = segment(image, SEGMENT_PX * crop.landmarks[0, :68].numpy()).matte
+            matte, alpha = (x * crop.weight[0].numpy() for x in (found, crop.alpha[0].numpy()))
+            slopes = [gaussian_gradient_magnitude(x, 1.4) for x in (matte, alpha)]
+            errors.append((np.abs(matte - alpha).sum() / 1000, ((slopes[0] - slopes[1]) ** 2).sum() / 1000))
+    sad, gradient = np.mean(errors, 0) * (256 / SEGMENT_PX) ** 2
+    print(f"held-out matte of segment: SAD {sad:.3f}, gradient {gradient:.4f} ({len(errors)} photos)")
 
 
 def measure_speed() -> None:
