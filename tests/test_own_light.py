@@ -17,7 +17,7 @@ from facerf_cli.portrait.find import find_faces
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
-OFF_DEG = 7.0  # the last ring of the search has 5; the nearest light of the rig is 10 to 16 away
+OFF_DEG = 7.0  # the last ring of the search has 6; the nearest light of the rig is 16 to 18 away
 RIG_DEG = 10.0
 COLOUR = 0.25  # relative error of the lamp's colour: the photo shows it only times that of the skin
 
@@ -49,7 +49,7 @@ def test_a_lamp_is_found_where_it_is(
     models: Models, face: FaceTexture, azel_deg: tuple[float, float]
 ) -> None:
     lamp = azel_to_direction(*azel_deg)
-    assert min(degrees_between(one, lamp) for one in rig_directions(50)) > RIG_DEG
+    assert min(degrees_between(one, lamp) for one in rig_directions(32)) > RIG_DEG
     colour = torch.tensor([[1.0, 0.8, 0.6]])
     shown = lit(models, face, RigLight(lamp[None], colour))
     for light in (own_light(models, shown).light, light_of_frames(models, [shown, shown])):
