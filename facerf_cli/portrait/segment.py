@@ -30,7 +30,8 @@ _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _STEEPNESS = 4.0  # the power
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
-_PERSON = 0.5, 0.8  # shares of the person below which a pixel is background, and above which it is whole
+# Shares of the person below which a pixel is background, and above which it is whole; of clothes, too.
+_PERSON, _CLOTH = (0.5, 0.8), (0.3, 0.7)
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
@@ -248,9 +249,15 @@ def _with_likelier_hair(classes: Tensor) -> Tensor:
 def _decided(classes: Tensor) -> Tensor:
     """Classes [C, h, w] with less doubt about the person; a haze of background around it is none of it.
 
-    The network sees the person a little too wide. Edges of hair are softened again by those of the photo.
+    The network sees heads a little too wide, and is less sure of clothes far below them. Edges of hair are
+    softened again by those of the photo.
     """
-    person, (low, high) = 1 - classes[0], _PERSON
+    person = 1 - classes[0]
+    cloth = classes[class_index("garment")] / person.clamp_min(1e-6)
+    low, high = (
+        of_person + (of_cloth - of_person) * cloth
+        for of_person, of_cloth in zip(_PERSON, _CLOTH, strict=True)
+    )
     firm = ((person - low) / (high - low)).clamp(0, 1)
     return torch.cat([1 - firm[None], classes[1:] * (firm / person.clamp_min(1e-6))])
 

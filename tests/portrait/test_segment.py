@@ -160,8 +160,13 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
 
 
-@pytest.mark.parametrize("share, matte", [(0.4, 0.0), (0.65, 0.5), (0.9, 1.0)])
-@pytest.mark.parametrize("name", ["garment", "hair"])
+@pytest.mark.parametrize(
+    "name, share, matte",
+    [
+        ("hair", 0.4, 0.0), ("hair", 0.65, 0.5), ("hair", 0.9, 1.0),
+        ("garment", 0.2, 0.0), ("garment", 0.5, 0.5), ("garment", 0.75, 1.0),
+    ],
+)  # fmt: skip
 def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
     monkeypatch: pytest.MonkeyPatch, name: str, share: float, matte: float
 ) -> None:
