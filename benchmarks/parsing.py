@@ -42,7 +42,7 @@ from facerf_cli.portrait.parse import parsing_network
 from facerf_cli.portrait.segment import segment
 from facerf_cli.strips import whole
 from facerf_cli.synth.backgrounds import heaps_of, views_of_map
-from facerf_cli.synth.portrait_crops import StoredPortraits
+from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
 from facerf_cli.training.objective import seeded
 
 SEED = 7
@@ -191,12 +191,24 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
                 print(f"{subject} {name}: {got[name]:.3f} (matte {matte:.3f}; {others})")
 
 
+def _held_out(folder: Path) -> StoredPortraits:
+    """The people of a bank, before backgrounds that no training drew."""
+    backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
+    return StoredPortraits(folder, backgrounds, {})
+
+
+def _matte_errors(found: np.ndarray, crop: PortraitCrops) -> tuple[float, float]:
+    """Sum of absolute differences and gradient error of a matte [S, S], in thousands."""
+    matte, alpha = (x * crop.weight[0].numpy() for x in (found, crop.alpha[0].numpy()))
+    slopes = [gaussian_gradient_magnitude(x, 1.4) for x in (matte, alpha)]
+    return np.abs(matte - alpha).sum() / 1000, ((slopes[0] - slopes[1]) ** 2).sum() / 1000
+
+
 def measure_held_out(folder: Path) -> None:
     """Print IoU and F1 by class and errors of the matte on crops of held-out synthetic people."""
-    backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
-    portraits = StoredPortraits(folder, backgrounds, {})
+    portraits = _held_out(folder)
     network, counts = parsing_network(), np.zeros((len(CLASSES), 3))
-    differences, gradients, error_percent = [], [], []
+    matte_errors, error_percent = [], []
     for person in range(len(portraits.paths)):
         for draw in range(8):
             crop = portraits.draw([person], network.side, seeded(SEED, person, draw))
@@ -208,10 +220,7 @@ def measure_held_out(folder: Path) -> None:
             for index in range(len(CLASSES)):
                 is_true, is_chosen = (true == index)[known], (chosen == index)[known]
                 counts[index] += [int(x.sum()) for x in (is_true & is_chosen, is_true, is_chosen)]
-            matte, alpha = (x * crop.weight[0] for x in (1 - found.classes[0, 0], crop.alpha[0]))
-            differences.append(float((matte - alpha).abs().sum()) / 1000)
-            slopes = [gaussian_gradient_magnitude(x.numpy(), 1.4) for x in (matte, alpha)]
-            gradients.append(float(((slopes[0] - slopes[1]) ** 2).sum()) / 1000)
+            matte_errors.append(_matte_errors(1 - found.classes[0, 0].numpy(), crop))
             if crop.present[0] and crop.known[0, :68].all():
                 error_percent.append(
                     distances(apart_percent(found.landmarks[0, :68].numpy(), crop.landmarks[0, :68].numpy()))
@@ -228,8 +237,8 @@ def measure_held_out(folder: Path) -> None:
     for name, (overlap, f1) in scores.items():
         print(f"held-out {name}: IoU {overlap:.3f}, F1 {f1:.3f}")
     print("held-out mean: IoU {:.3f}, F1 {:.3f}".format(*np.mean(list(scores.values()), 0)))
-    sad, gradient = np.mean(differences), np.mean(gradients)
-    print(f"held-out matte: SAD {sad:.2f}, gradient {gradient:.3f} ({len(gradients)} crops)")
+    sad, gradient = np.mean(matte_errors, 0)
+    print(f"held-out matte: SAD {sad:.2f}, gradient {gradient:.3f} ({len(matte_errors)} crops)")
     everything, inner = np.median(error_percent, 0)
     count = len(error_percent)
     print(f"held-out landmarks, median: all {everything:.2f} %, inner {inner:.2f} % ({count} crops)")
@@ -237,8 +246,7 @@ def measure_held_out(folder: Path) -> None:
 
 def measure_segment(folder: Path) -> None:
     """Print errors of the matte of `segment` on photos of held-out synthetic people whose faces are whole."""
-    backgrounds = torch.cat([*(views_of_map(index, SEED) for index in range(8)), heaps_of(32, SEED)])
-    portraits = StoredPortraits(folder, backgrounds, {})
+    portraits = _held_out(folder)
     errors = []
     for person in range(len(portraits.paths)):
         for draw in range(5):
@@ -247,9 +255,7 @@ def measure_segment(folder: Path) -> None:
                 continue
             image = (255 * crop.crops[0].permute(1, 2, 0)).round().byte().numpy()
             found = segment(image, SEGMENT_PX * crop.landmarks[0, :68].numpy()).matte
-            matte, alpha = (x * crop.weight[0].numpy() for x in (found, crop.alpha[0].numpy()))
-            slopes = [gaussian_gradient_magnitude(x, 1.4) for x in (matte, alpha)]
-            errors.append((np.abs(matte - alpha).sum() / 1000, ((slopes[0] - slopes[1]) ** 2).sum() / 1000))
+            errors.append(_matte_errors(found, crop))
     sad, gradient = np.mean(errors, 0) * (256 / SEGMENT_PX) ** 2
     print(f"held-out matte of segment: SAD {sad:.3f}, gradient {gradient:.4f} ({len(errors)} photos)")
 

@@ -30,7 +30,7 @@ _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _STEEPNESS = 4.0  # the power
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
-# Shares of the person below which a pixel is background, and above which it is whole; of clothes, too.
+# Shares of the person below which a pixel is background, and above which it is whole; of all, and of clothes.
 _PERSON, _CLOTH = (0.5, 0.8), (0.3, 0.7)
 _MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
