@@ -42,6 +42,7 @@ MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
+_WHITENING = 0.3  # of colours that the soft view bends, by how much it does
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -329,7 +330,7 @@ def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> f
 
 @dataclass(frozen=True)
 class View:
-    """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `shoulder` before it.
+    """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `softened` before it.
 
     Others are views of a display of an OpenColorIO configuration; '' is its default one.
     """
@@ -380,6 +381,22 @@ def shoulder(linear: np.ndarray) -> np.ndarray:
     return np.where(above > 0, 1 - (1 - start) * np.exp(-above), linear)
 
 
+def softened(linear: np.ndarray) -> np.ndarray:
+    """Bend colours [..., 3] whose brightest channel is above the shoulder's start; their hue stays.
+
+    All channels follow the brightest one, and the more it was bent the more white is mixed in, as in Khronos'
+    PBR Neutral tone mapper (2024). Bent one by one, the channels of bright skin and leaves turn yellow.
+    """
+    brightest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
+    found = brightest > SHOULDER_START_LINEAR
+    brightest = brightest[found][:, None]
+    bent = shoulder(brightest)
+    colour = linear[found] * (bent / brightest)
+    result = linear.copy()
+    result[found] = bent + (colour - bent) / (1 + _WHITENING * (brightest - bent))
+    return result
+
+
 def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = None) -> np.ndarray:
     """Encode exposed linear Rec.709 [H, W, 3] for a display, 0..1.
 
@@ -389,7 +406,7 @@ def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = No
     if view.name == "none":
         return in_blocks(lambda block: linear_to_srgb(np.clip(block, 0, 1)), linear)
     if view.name == "soft":
-        soft = in_blocks(shoulder, linear)
+        soft = in_blocks(softened, linear)
         mixed = soft if share is None else linear + share[..., None] * (soft - linear)
         return encode_display(mixed, PLAIN_VIEW)
     for name, matrix in _ocio_bridges():

@@ -99,6 +99,27 @@ def test_the_shoulder_meets_the_plain_curve_with_its_slope_and_never_reaches_1()
     assert (np.diff(above) > 0).all() and above.max() < 1
 
 
+def test_the_soft_view_keeps_hues_and_mixes_white_into_what_it_bends() -> None:
+    colours = np.float32(
+        [[0.8, 0.5, 0.1], [1.2, 0.6, 0.3], [0.3, 2.4, 1.2], [0.5, 0.5, 3.0], [-0.1, 4.0, 2.0]]
+    )
+    found = ours.softened(colours)
+    np.testing.assert_array_equal(found[0], colours[0])
+    brightest = colours.max(-1)
+    np.testing.assert_allclose(found.max(-1), ours.shoulder(brightest), rtol=1e-6)
+    for before, after, bent in zip(colours[1:], found[1:], ours.shoulder(brightest)[1:], strict=True):
+        # the hue: how the middle channel lies between the others
+        low, middle, high = np.sort(before)
+        seen = np.sort(after)
+        assert (seen[1] - seen[0]) / (seen[2] - seen[0]) == pytest.approx(
+            (middle - low) / (high - low), abs=1e-5
+        )
+        kept = (seen[2] - seen[0]) / ((high - low) * bent / high)
+        assert kept == pytest.approx(1 / (1 + 0.3 * (high - bent)), rel=1e-5)
+    grey = np.linspace(0, 5, 60, dtype=np.float32)[:, None].repeat(3, 1)
+    np.testing.assert_allclose(ours.softened(grey), ours.shoulder(grey), rtol=1e-6)
+
+
 def test_views_by_name() -> None:
     grey = np.full((2, 3, 3), 0.18, np.float32)
     plain = ours.linear_to_srgb(grey)

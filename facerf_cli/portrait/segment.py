@@ -17,6 +17,7 @@ from torch import Tensor
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.ears import with_ears
 from facerf_cli.portrait.matte import refine_matte, shrunk
+from facerf_cli.portrait.outline import with_outline
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.strips import Computed, Rows, enlarged
@@ -116,7 +117,9 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
-    return _decided(classes / classes.sum(0).clamp_min(1e-6))
+    extent_px = max(1.0, float(np.ptp(landmarks_px, axis=0).max()) * size[1] / width)
+    classes = with_outline(classes / classes.sum(0).clamp_min(1e-6), small_image(image_srgb), extent_px)
+    return _decided(_of_one_person(classes, landmarks_px, places_px))
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:

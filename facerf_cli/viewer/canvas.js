@@ -37,11 +37,10 @@ class CanvasView {
     const plate = [0, 1, 2].map((c) => DECODED[photo[from + c]]);
     const own = share > 0 && share < 1 ? [0, 1, 2].map((c) => DECODED[fringe[from + c]]) : plate;
     const person = this.withFace(this.person(own, x + 0.5, y + 0.5), own, x, y);
-    const bytes = plate.map((value, c) => {
-      const mixed = value - share * own[c] + share * person[c];
-      const seen = withBackground ? mixed + share * (softened(mixed) - mixed) : softened(person[c]);
-      return 255 * encoded(seen);
-    });
+    const mixed = withBackground ? plate.map((value, c) => value + share * (person[c] - own[c])) : person;
+    const soft = softened(mixed);
+    const bends = withBackground ? share : 1;
+    const bytes = mixed.map((value, c) => 255 * encoded(value + bends * (soft[c] - value)));
     return [...bytes, withBackground ? 255 : 255 * share];
   }
 

@@ -3,7 +3,8 @@
 const LUMINANCE = [0.2126, 0.7152, 0.0722];
 const NOISY = 2; // times the floor of the detail: the luminance below which colours are noise (composite.py)
 const BLACK = 1e-9;
-const SHOULDER = 0.8; // luminance from which on the soft view bends
+const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour
+const WHITENING = 0.3;
 
 class AutoExposure {
   constructor(data, arrays) {
@@ -48,8 +49,12 @@ function percentile(values, percent) {
   return sorted[low] + (at - low) * (sorted[high] - sorted[low]);
 }
 
-function softened(linear) {
-  return linear <= SHOULDER ? linear : 1 - (1 - SHOULDER) * Math.exp((SHOULDER - linear) / (1 - SHOULDER));
+function softened(colour) {
+  const brightest = Math.max(...colour);
+  if (brightest <= SHOULDER) return colour;
+  const bent = 1 - (1 - SHOULDER) * Math.exp((SHOULDER - brightest) / (1 - SHOULDER));
+  const kept = 1 / (1 + WHITENING * (brightest - bent));
+  return colour.map((value) => bent + kept * ((value * bent) / brightest - bent));
 }
 
 function encoded(linear) {

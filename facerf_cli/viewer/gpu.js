@@ -24,7 +24,12 @@ vec3 encoded(vec3 x) {
   x = clamp(x, 0.0, 1.0);
   return mix(12.92 * x, 1.055 * pow(x, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
 }
-vec3 softened(vec3 x) { return mix(x, 1.0 - ${1 - SHOULDER} * exp((${SHOULDER} - x) / ${1 - SHOULDER}), step(${SHOULDER}, x)); }
+vec3 softened(vec3 x) {
+  float brightest = max(max(x.r, x.g), x.b);
+  if (brightest <= ${SHOULDER}) return x;
+  float bent = 1.0 - ${1 - SHOULDER} * exp((${SHOULDER} - brightest) / ${1 - SHOULDER});
+  return mix(vec3(bent), x * (bent / brightest), 1.0 / (1.0 + ${WHITENING} * (brightest - bent)));
+}
 vec3 wholePerson(vec3 own, vec2 at) {
   vec3 guide = floor(encoded(own * guideGain) * 255.0 + 0.5) / 255.0;
   vec4 r = texture(lines, vec3(at, 0)), g = texture(lines, vec3(at, 1)), b = texture(lines, vec3(at, 2));
