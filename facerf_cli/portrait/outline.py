@@ -6,7 +6,7 @@ network. Their colours are like those of the background around, which tips the b
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 from torch import Tensor
@@ -27,6 +27,7 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
 
     `extent_px` is the extent of the landmarks in its pixels. The network's logit of the person is added to
     that of the colours, whose distances to sure colours of both sides are taken as normally distributed.
+    Colours add no islands.
     """
     person = 1 - classes[0].numpy()
     inside_px = distance_transform_edt(np.pad(person > _SURE, 1, "edge"))[1:-1, 1:-1]
@@ -48,4 +49,12 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
     logit = share.clamp(_LEAST_SHARE, 1 - _LEAST_SHARE).logit()
     logit[unsure] += torch.from_numpy(colours.clip(-_MOST, _MOST)).float()
     changed = torch.where(torch.from_numpy(unsure), logit.sigmoid(), share)
+    alone = torch.from_numpy(_islands(changed.numpy() > 0.5, sure))
+    changed = torch.where(alone, torch.minimum(changed, share), changed)
     return torch.cat([1 - changed[None], classes[1:] * (changed / share.clamp_min(1e-6))])
+
+
+def _islands(found: np.ndarray, sure: np.ndarray) -> np.ndarray:
+    """Where found pixels [h, w] are not joined to sure ones [h, w]."""
+    parts, _ = label(found)
+    return found & ~np.isin(parts, parts[sure])

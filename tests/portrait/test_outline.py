@@ -60,3 +60,16 @@ def test_without_sure_pixels_of_both_sides_nothing_changes() -> None:
     for share in (0.0, 0.5, 1.0):
         classes = _classes(torch.full((_SIDE, _SIDE), share))
         torch.testing.assert_close(with_outline(classes, _image(), _EXTENT_PX), classes)
+
+
+def test_colours_add_no_islands() -> None:
+    classes, image = _seen(0.3), _image()
+    island = slice(28, 32), slice(56, 60)
+    image[:, *island] = image[:, 0, 0].view(3, 1, 1)
+    classes[:, *island] = _classes(torch.full((_SIDE, _SIDE), 0.3))[:, *island]
+    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
+    assert found[island].max() <= 0.3
+    image[:, 28:32, :60] = image[:, 0, 0].view(3, 1, 1)
+    classes[:, 28:32, _BORDER:60] = _classes(torch.full((_SIDE, _SIDE), 0.3))[:, 28:32, _BORDER:60]
+    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
+    assert found[island].min() > 0.85  # a strand of hair
