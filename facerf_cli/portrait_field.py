@@ -39,7 +39,7 @@ from facerf_cli.raster.texture import bake_attributes
 SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
-_SHARE = 0.25  # of the portrait field in the face, where the other one is finer
+_SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
 _CLOTH = ("garment", "headwear")
 

@@ -1,6 +1,6 @@
 // Textures of the face: of single lights by the decoder, of maps by factors; mixed with the portrait's.
 
-const PORTRAIT_SHARE = 0.25; // in the face, where the decoder's texture is finer
+const PORTRAIT_SHARE = 0.4; // in the face, where the decoder's texture is finer
 const FACTOR_ERROR = 4; // of the factors' texels, in steps of their bytes; where it drowns the light, none of it is seen
 
 class Face {
