@@ -11,10 +11,8 @@ from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 from torch import Tensor
 
-_SURE, _BACKGROUND = (
-    0.9,
-    0.1,
-)  # shares of the person from which on, well inside, and up to which a pixel is sure
+# Shares of the person from which on, well inside it, a pixel is sure, and up to which it is background.
+_SURE, _BACKGROUND = 0.9, 0.1
 _INSIDE = 0.1  # how far inside the person, in extents of the landmarks
 _NEAREST, _APART = 4, 4  # sure pixels that a pixel is compared with, of every fourth one
 _EXTENT = 0.1  # difference of colour, in Lab / 100, as large as one of places by an extent of the landmarks
