@@ -53,6 +53,6 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
 
 
 def _islands(found: np.ndarray, sure: np.ndarray) -> np.ndarray:
-    """Where found pixels [h, w] are not joined to sure ones [h, w]."""
+    """Find the pixels [h, w] among found ones that are not joined to sure ones."""
     parts, _ = label(found)
     return found & ~np.isin(parts, parts[sure])
