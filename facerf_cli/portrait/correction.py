@@ -10,17 +10,20 @@ where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l i
 lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
 lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does, its
 likeness falls in proportion: a shadow's error, which is a large share of little light, stays as small there.
-Where the photo is nearly black its colours are noise, and Q is of one value in all channels.
+Where the photo is nearly black its colours are noise, and Q is of one value in all channels. Q is blurred by
+a pixel: enlarged to the photo's resolution its edges would be stairs.
 """
 
 from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 _FLOOR = 0.05  # f, as a share of the mean of the photo's person
 _RANGE = (0.2, 5.0)  # of Q
+_BLUR_PX = 1.0  # standard deviation of its blur
 _DARK = 4.0  # floors: the radiance below which a photo's colours are noise
 SHARPNESS = 20.0  # exponent of the likeness
 _LARGEST = 1.5  # of p_l / p
@@ -49,9 +52,8 @@ class Correction:
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
         ratio = _ratio(photo, explained, floor)
         mean = float((explained.mean(0) * person).sum() / total)
-        plain = Correction(
-            (ratio - 1) * person, torch.ones_like(person), floor, mean, explained.mean(0), person
-        )
+        excess = _blurred(ratio - 1, person)
+        plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
         grey = olats.mean(1)
         brightness = plain._brightness(grey)
         likeness = plain._likeness(grey, brightness)
@@ -88,6 +90,13 @@ def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
     grey = (shown + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
     coloured = shown**2 / (shown**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
     return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
+
+
+def _blurred(maps: Tensor, person: Tensor) -> Tensor:
+    """Maps [C, S, S] on a person [S, S], blurred without what is off the person."""
+    stacked = torch.cat([maps * person, person[None]]).numpy()
+    blurred = torch.from_numpy(gaussian_filter(stacked, (0, _BLUR_PX, _BLUR_PX), mode="nearest"))
+    return blurred[:-1] / blurred[-1:].clamp_min(1e-6) * person
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:

@@ -40,7 +40,9 @@ def test_the_photos_light_gives_the_photo_back() -> None:
     photo = photo_under(WEIGHTS)
     correction = Correction.of(photo, olats(), WEIGHTS, PERSON)
     found = torch.einsum("lc,lcij->cij", WEIGHTS, corrected(correction))
-    torch.testing.assert_close(found, photo, rtol=2e-3, atol=1e-4)
+    away = torch.ones(SIDE, SIDE, dtype=torch.bool)
+    away[15:35, 15:45], away[25, 25:35] = False, True  # of the mark's edges, which are blurred
+    torch.testing.assert_close(found[:, away], photo[:, away], rtol=2e-3, atol=1e-4)
     plain = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
     assert (plain - photo).abs().max() > 0.1
 
@@ -62,8 +64,18 @@ def test_an_explanation_that_is_right_changes_nothing() -> None:
 def test_off_the_person_nothing_is_changed() -> None:
     person = PERSON.clone()
     person[:, :32] = 0
-    correction = Correction.of(photo_under(WEIGHTS), olats(), WEIGHTS, person)
+    photo = photo_under(WEIGHTS)
+    correction = Correction.of(photo, olats(), WEIGHTS, person)
     torch.testing.assert_close(corrected(correction)[..., :32], olats()[..., :32])
+    photo[..., :32] = 3  # a bright background
+    other = Correction.of(photo, olats(), WEIGHTS, person)
+    torch.testing.assert_close(other.excess[..., 32:], correction.excess[..., 32:])
+
+
+def test_the_correction_has_no_stairs() -> None:
+    """Near a sharp edge of the photo that the model does not know."""
+    excess = Correction.of(photo_under(WEIGHTS), olats(), WEIGHTS, PERSON).excess[1, 25, 10:50]
+    assert excess.diff().abs().max() < 0.5 * float(excess.max() - excess.min())
 
 
 def test_no_light_becomes_negative() -> None:
