@@ -10,7 +10,6 @@ from functools import cached_property
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.colour import ExposureRule, chosen_exposure_ev
@@ -20,7 +19,7 @@ from facerf_cli.portrait.matte import local_lines
 from facerf_cli.portrait.occluders import uncovered_rows
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.raster.texture import inpaint
+from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.strips import Computed, Rows
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
@@ -56,7 +55,7 @@ class WholePerson:
 
         `display_ev` is the exposure at which the photo is shown to the guided filter.
         """
-        highlights = _blurred(self._filled(lit[3:6]), _GLOSS_PX)
+        highlights = blurred(self._filled(lit[3:6]), _GLOSS_PX)
         maps = [self.albedo_maps, self._filled(lit[:3]), highlights, self._change(lit), self.hair_maps]
         stacked = torch.cat(maps)
 
@@ -84,7 +83,7 @@ class WholePerson:
 
     def _of_border(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] of the person at the square's border alone, blurred, as they go on beyond it."""
-        return _blurred(inpaint(maps, self.at_border), _CHANGE_PX)
+        return blurred(inpaint(maps, self.at_border), _CHANGE_PX)
 
     @cached_property
     def at_border(self) -> Tensor:
@@ -185,7 +184,3 @@ class WholePerson:
         wide = F.grid_sample(maps[None], grid.float(), padding_mode="border", align_corners=False)
         inside = ((1 - grid[0].abs().amax(-1)) / _FEATHER).clamp(0, 1)
         return wide[0], inside.float()
-
-
-def _blurred(maps: Tensor, sigma_px: float) -> Tensor:
-    return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma_px, sigma_px), mode="nearest"))

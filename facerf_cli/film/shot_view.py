@@ -131,13 +131,15 @@ class ShotView:
     def _look(self, frame: int) -> tuple[Tensor, Tensor]:
         """Classes of a frame alone, and the small image that they were seen in."""
         image = self._display(frame)
-        return seen_classes(image, self.landmarks_px(frame)), small_image(image)
+        small = small_image(image)
+        return seen_classes(image, self.landmarks_px(frame), small), small
 
     def _segmentation(self, frame: int) -> Segmentation:
         around = self._around(frame)
         classes, images = zip(*(self._classes(one) for one in around), strict=True)
-        mean = steadied(classes, images, around.index(frame))
-        return segmentation_of(mean / mean.sum(0).clamp_min(1e-6), self._display(frame))
+        own = around.index(frame)
+        mean = steadied(classes, images, own)
+        return segmentation_of(mean / mean.sum(0).clamp_min(1e-6), self._display(frame), images[own])
 
     def _seen_person(self, frame: int) -> SeenPerson:
         fit, segmentation = self._fit(frame), self.segmentation(frame)

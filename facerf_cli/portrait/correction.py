@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import gaussian_filter
 from torch import Tensor
+
+from facerf_cli.raster.texture import blurred
 
 _FLOOR = 0.05  # f, as a share of the mean of the photo's person
 _RANGE = (0.2, 5.0)  # of Q
@@ -52,7 +53,7 @@ class Correction:
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
         ratio = _ratio(photo, explained, floor)
         mean = float((explained.mean(0) * person).sum() / total)
-        excess = _blurred(ratio - 1, person)
+        excess = _smooth(ratio - 1, person)
         plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
         grey = olats.mean(1)
         brightness = plain._brightness(grey)
@@ -92,11 +93,10 @@ def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
     return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
 
 
-def _blurred(maps: Tensor, person: Tensor) -> Tensor:
+def _smooth(maps: Tensor, person: Tensor) -> Tensor:
     """Maps [C, S, S] on a person [S, S], blurred without what is off the person."""
-    stacked = torch.cat([maps * person, person[None]]).numpy()
-    blurred = torch.from_numpy(gaussian_filter(stacked, (0, _BLUR_PX, _BLUR_PX), mode="nearest"))
-    return blurred[:-1] / blurred[-1:].clamp_min(1e-6) * person
+    both = blurred(torch.cat([maps * person, person[None]]), _BLUR_PX)
+    return both[:-1] / both[-1:].clamp_min(1e-6) * person
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:

@@ -1,15 +1,16 @@
 """The outline of a person where the network is unsure of it, by the colours that are sure on its two sides.
 
-A tree's trunk beside a cheek, or the sky between hair and ear, may look like a part of the person to the
+A tree's trunk next to a cheek, or the sky between hair and ear, may look like a part of the person to the
 network. Their colours are like those of the background around, which tips the balance.
 """
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt, label
 from scipy.spatial import cKDTree
 from skimage.color import rgb2lab
 from torch import Tensor
+
+from facerf_cli.portrait.regions import depth_px, joined_to
 
 # Shares of the person from which on, well inside it, a pixel is sure, and up to which it is background.
 _SURE, _BACKGROUND = 0.9, 0.1
@@ -28,8 +29,7 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
     Colours add no islands.
     """
     person = 1 - classes[0].numpy()
-    inside_px = distance_transform_edt(np.pad(person > _SURE, 1, "edge"))[1:-1, 1:-1]
-    sure, background = inside_px > _INSIDE * extent_px, person < _BACKGROUND
+    sure, background = depth_px(person > _SURE) > _INSIDE * extent_px, person < _BACKGROUND
     unsure = ~(sure | background)
     y, x = np.mgrid[: person.shape[0], : person.shape[1]]
     compared = (x + y) % _APART == 0
@@ -47,12 +47,7 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
     logit = share.clamp(_LEAST_SHARE, 1 - _LEAST_SHARE).logit()
     logit[unsure] += torch.from_numpy(colours.clip(-_MOST, _MOST)).float()
     changed = torch.where(torch.from_numpy(unsure), logit.sigmoid(), share)
-    alone = torch.from_numpy(_islands(changed.numpy() > 0.5, sure))
-    changed = torch.where(alone, torch.minimum(changed, share), changed)
+    found = changed.numpy() > 0.5
+    islands = torch.from_numpy(found & ~joined_to(found, sure))
+    changed = torch.where(islands, torch.minimum(changed, share), changed)
     return torch.cat([1 - changed[None], classes[1:] * (changed / share.clamp_min(1e-6))])
-
-
-def _islands(found: np.ndarray, sure: np.ndarray) -> np.ndarray:
-    """Find the pixels [h, w] among found ones that are not joined to sure ones."""
-    parts, _ = label(found)
-    return found & ~np.isin(parts, parts[sure])

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy.ndimage import gaussian_filter, gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -27,7 +27,7 @@ from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import inpaint, vertex_normals
+from facerf_cli.raster.texture import blurred, inpaint, vertex_normals
 
 ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
 _HAIR_M = 0.07  # most that the scalp is pushed out by
@@ -160,7 +160,7 @@ class Shadows:
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
             list(threads.map(trace, range(len(lights)), lights))
         filled = inpaint(torch.from_numpy(found), self.covered)
-        return torch.from_numpy(gaussian_filter(filled.numpy(), (0, _SOFT_PX, _SOFT_PX), mode="nearest"))
+        return blurred(filled, _SOFT_PX)
 
 
 def _along(direction: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, None]:

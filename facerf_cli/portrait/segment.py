@@ -19,6 +19,7 @@ from facerf_cli.portrait.ears import with_ears
 from facerf_cli.portrait.matte import refine_matte, shrunk
 from facerf_cli.portrait.outline import with_outline
 from facerf_cli.portrait.parse import Seen, Square, look
+from facerf_cli.portrait.regions import depth_px, joined_to
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.strips import Computed, Rows, enlarged
 
@@ -92,16 +93,17 @@ class _Layers(Mapping[str, Rows]):
 
 def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3]."""
-    return segmentation_of(seen_classes(image_srgb, landmarks_px), image_srgb)
+    small = small_image(image_srgb)
+    return segmentation_of(seen_classes(image_srgb, landmarks_px, small), image_srgb, small)
 
 
-def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
-    """Shares [C, h, w] of the classes at a small size, which sum to 1; see `segment`."""
+def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor) -> Tensor:
+    """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
     height, width = image_srgb.shape[:2]
     body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
     chest = _around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
-    size = _small_size(height, width)
+    size = (small.shape[1], small.shape[2])
     seen = look(image_srgb, [body, chest, *near])
     wide, middle, *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
     classes = _only_background().repeat(1, *size)
@@ -117,14 +119,18 @@ def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Tensor:
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
-    extent_px = max(1.0, float(np.ptp(landmarks_px, axis=0).max()) * size[1] / width)
-    classes = with_outline(classes / classes.sum(0).clamp_min(1e-6), small_image(image_srgb), extent_px)
+    extent_px = max(1.0, _around(landmarks_px, 1, 0).side_px * size[1] / width)
+    classes = with_outline(classes / classes.sum(0).clamp_min(1e-6), small, extent_px)
+    # again, since colours may cut off what was joined
     return _decided(_of_one_person(classes, landmarks_px, places_px))
 
 
-def segmentation_of(classes: Tensor, image_srgb: np.ndarray) -> Segmentation:
-    """The segmentation of an image [H, W, 3] by its classes [C, h, w], whose matte follows its edges."""
-    guide = small_image(image_srgb).permute(1, 2, 0).numpy()
+def segmentation_of(classes: Tensor, image_srgb: np.ndarray, small: Tensor) -> Segmentation:
+    """The segmentation of an image [H, W, 3] by its classes [C, h, w], whose matte follows its edges.
+
+    `small` is its `small_image`.
+    """
+    guide = small.permute(1, 2, 0).numpy()
     return Segmentation(classes, refine_matte(1 - classes[0].numpy(), guide, image_srgb))
 
 
@@ -233,9 +239,8 @@ def _joined(classes: Tensor, away: np.ndarray, pixel: float) -> Tensor:
     """
     apart = np.linalg.norm(away - [0, 1] * away.clip(0, _CHEST_BELOW), axis=-1)  # from the head's axis
     person, middle = classes[0].numpy() < 0.5, apart < _WITHIN
-    inner = distance_transform_edt(np.pad(person, 1, "edge"))[1:-1, 1:-1] * pixel > _BRIDGE
-    parts, _ = label(inner | (person & middle))
-    joined = np.isin(parts, np.setdiff1d(np.unique(parts[middle]), [0]))
+    inner = depth_px(person) * pixel > _BRIDGE
+    joined = joined_to(inner | (person & middle), middle)
     around = distance_transform_edt(~joined) * pixel if joined.any() else np.zeros_like(apart)
     kept = np.maximum(_falling(np.linalg.norm(away, axis=-1), _OF_HEAD), _falling(around, _OF_BODY))
     return torch.lerp(_only_background(), classes, torch.from_numpy(kept).float())

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
@@ -198,3 +199,8 @@ def inpaint(texture: Tensor, visible: Tensor) -> Tensor:
     filled = inpaint(coarse, (4 * weight[0]).clamp(max=1))  # one visible texel of four is enough
     fill = F.interpolate(filled[None], size=visible.shape, mode="bilinear", align_corners=False)[0]
     return visible * texture + (1 - visible) * fill
+
+
+def blurred(maps: Tensor, sigma_px: float) -> Tensor:
+    """Blur maps [C, H, W] by a Gaussian; beyond their border they go on as there."""
+    return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma_px, sigma_px), mode="nearest"))

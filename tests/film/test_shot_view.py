@@ -29,7 +29,7 @@ class Watched:
         monkeypatch.setattr(shot_view, "small_image", lambda photo: torch.full((3, 6, 8), 0.5))
         monkeypatch.setattr(shot_view, "seen_classes", self.look)
         monkeypatch.setattr(
-            shot_view, "segmentation_of", lambda classes, photo: SimpleNamespace(classes=classes)
+            shot_view, "segmentation_of", lambda classes, photo, small: SimpleNamespace(classes=classes)
         )
 
     def read(self, number: int) -> np.ndarray:
@@ -37,7 +37,7 @@ class Watched:
         self.held.append(weakref.ref(photo))
         return photo
 
-    def look(self, photo: np.ndarray, landmarks_px: np.ndarray) -> torch.Tensor:
+    def look(self, photo: np.ndarray, landmarks_px: np.ndarray, small: torch.Tensor) -> torch.Tensor:
         number = int(photo[0, 0, 0])
         self.looked.append(number)
         classes = torch.stack([torch.full((6, 8), float(number)), torch.full((6, 8), 1000.0 - number)])

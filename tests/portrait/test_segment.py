@@ -104,7 +104,7 @@ def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
         return found
 
     monkeypatch.setattr(module, "look", look)
-    classes = module.seen_classes(photo(), FACE)
+    classes = module.seen_classes(photo(), FACE, module.small_image(photo()))
     matte = 1 - classes[0]
     assert matte[200, 30] < 0.05 and matte[70, 160] > 0.9 and matte[220, 160] > 0.9
     assert matte[70, 209] > 0.5
@@ -120,7 +120,7 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
         ]
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
+    at_face = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
     assert at_face[CLASSES.index("neck")] > 0.2
 
@@ -141,7 +141,7 @@ def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_sta
         return found
 
     monkeypatch.setattr(module, "look", look)
-    matte = 1 - module.seen_classes(photo(), FACE)[0]
+    matte = 1 - module.seen_classes(photo(), FACE, module.small_image(photo()))[0]
     assert matte[180, 150] > 0.99 and matte[80, 190] < 0.5 and matte[180, 235] < 0.5
 
 
@@ -155,7 +155,7 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
         return found
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(photo(), FACE)[:, 70, 160]
+    at_face = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[0] == pytest.approx(0.5, abs=1e-3)
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
 
@@ -178,6 +178,6 @@ def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
 
     monkeypatch.setattr(module, "look", look)
     monkeypatch.setattr(module, "_of_one_person", lambda classes, *_: classes)
-    at_chest = module.seen_classes(photo(), FACE)[:, 150, 160]
+    at_chest = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 150, 160]
     assert 1 - at_chest[0] == pytest.approx(matte, abs=1e-3)
     assert at_chest[CLASSES.index(name)] == pytest.approx(matte, abs=1e-3)
