@@ -29,7 +29,15 @@ from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, DeviceName, Settings, unwrapped, with_machines
+from facerf_cli.cli.options import (
+    EPILOG,
+    HELP_NAMES,
+    DeviceName,
+    Settings,
+    unwrapped,
+    with_groups,
+    with_machines,
+)
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
@@ -147,7 +155,7 @@ def _global_options(
 for _panel, _verbs in VERBS.items():
     for _verb in _verbs:
         _add = app.command(epilog=EPILOG, context_settings=HELP_NAMES, rich_help_panel=_panel)
-        _add(with_machines(_verb))
+        _add(with_machines(with_groups(_verb)))
 for _name, (_group, _panel) in GROUPS.items():
     app.add_typer(_group, name=_name, rich_help_panel=_panel)
 for _verbs_of in (app, *(group for group, _ in GROUPS.values())):

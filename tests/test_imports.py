@@ -28,7 +28,7 @@ LEVELS = (
     ("models", "portrait"),
     ("network", "face"),
     ("raster", "light", "files", "metrics"),
-    ("workers", "ray_workers", "colour", "memory", "ocio", "logs", "stopping", "strips", "errors"),
+    ("workers", "ray_workers", "colour", "memory", "ocio", "logs", "stopping", "strips", "errors", "option"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}
 STRANGERS = (("network", "face"), ("raster", "light"))  # what one needs of the other is handed in

@@ -1,17 +1,19 @@
 """The options that verbs share, each named, explained and read once; and the choice of workers."""
 
+import dataclasses
 import inspect
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import typer
 
 from facerf_cli import memory
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
+from facerf_cli.option import Only, Option, option_fields
 from facerf_cli.workers import Workers
 
 T = TypeVar("T")
@@ -232,14 +234,80 @@ def unwrapped(docstring: str) -> str:
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
 
 
+def with_groups(verb: Callable[..., Any]) -> Callable[..., Any]:
+    """Replace each parameter of a verb that is a group of options (`option.py`) by the options themselves.
+
+    A group's field `settings` is filled with the global options of the call.
+    """
+    hints = get_type_hints(verb, include_extras=True)
+    groups = {name: chosen for name, hint in hints.items() if (chosen := _group_of(hint)) is not None}
+    parameters: list[inspect.Parameter] = []
+    for parameter in inspect.signature(verb).parameters.values():
+        if parameter.name in groups:
+            parameters += map(_parameter, *zip(*groups[parameter.name][1].items(), strict=True))
+        else:
+            parameters.append(parameter.replace(annotation=hints[parameter.name]))
+
+    def run(**values: Any) -> Any:
+        for name, (group, fields) in groups.items():
+            given = {field: values.pop(field) for field in fields}
+            if "settings" in group.__dataclass_fields__:
+                given["settings"] = settings_of(values["context"])
+            values[name] = group(**given)
+        return verb(**values)
+
+    return _with_signature(run, parameters, verb) if groups else verb
+
+
+def _group_of(hint: Any) -> tuple[Any, dict[str, Any]] | None:
+    """The dataclass of a parameter and its options by name; None where the parameter is no group."""
+    group, *notes = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
+    fields = option_fields(group)
+    for note in notes:
+        if isinstance(note, Only):
+            fields = {name: fields[name] for name in note.names}
+    types = get_type_hints(group, include_extras=True) if fields else {}
+    return (group, {name: (field, types[name]) for name, field in fields.items()}) if fields else None
+
+
+def _parameter(name: str, typed: tuple[Any, Any]) -> inspect.Parameter:
+    """A field of a group as typer reads it."""
+    field, kind = typed
+    about: Option = field.metadata["option"]
+    declared = typer.Option(
+        *(about.flags or (flag(name),)),
+        metavar=about.metavar,
+        help=about.help,
+        show_default=about.shown_default,
+        rich_help_panel=about.panel,
+        min=about.least,
+        max=about.most,
+        callback=about.check,
+    )
+    default = inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, keyword, default=default, annotation=Annotated[kind, declared])
+
+
+def _with_signature(
+    run: Callable[..., Any], parameters: Sequence[inspect.Parameter], verb: Callable[..., Any]
+) -> Callable[..., Any]:
+    """`run` under a verb's name, with a signature for typer, which reads those; all parameters by keyword."""
+    listed = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    as_typer_reads_it: Any = run
+    as_typer_reads_it.__signature__ = inspect.Signature(listed)
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in listed}
+    run.__name__, run.__doc__ = verb.__name__, verb.__doc__
+    return run
+
+
 _AFTER, _ALSO = "jobs", "dry_run"  # by these a verb that walks folders is known
 
 
 def with_machines(verb: Callable[..., Any]) -> Callable[..., Any]:
     """Add `--shard` and `--ray` after a verb's `--jobs`; a verb that walks no folders stays as it is.
 
-    Their values go into the verb's `Settings`, where `run_items` finds them. typer reads signatures, so the
-    returned function has one that lists them.
+    Their values go into the verb's `Settings`, where `run_items` finds them.
     """
     own = inspect.signature(verb).parameters
     if not {_AFTER, _ALSO} <= own.keys():
@@ -253,16 +321,10 @@ def with_machines(verb: Callable[..., Any]) -> Callable[..., Any]:
             values[_AFTER] = 0  # as many as Ray has processors
         return verb(**values)
 
-    kind = inspect.Parameter.KEYWORD_ONLY
     added = [
-        inspect.Parameter(name, kind, default=None, annotation=option)
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option)
         for name, option in (("shard", ShardOption), ("ray", RayOption))
     ]
-    parameters = [parameter.replace(kind=kind) for parameter in own.values()]
+    parameters = list(own.values())
     place = list(own).index(_AFTER) + 1
-    parameters[place:place] = added
-    as_typer_reads_it: Any = run
-    as_typer_reads_it.__signature__ = inspect.Signature(parameters)
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__name__, run.__doc__ = verb.__name__, verb.__doc__
-    return run
+    return _with_signature(run, parameters[:place] + added + parameters[place:], verb)

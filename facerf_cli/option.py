@@ -1,0 +1,57 @@
+"""Options of the command line as fields of frozen dataclasses, in the files of the functions that take them.
+
+A field made by `option` holds its help and limits; `cli/options.py` turns the fields of the groups that a
+verb names into the verb's options. Nothing here knows the library of the command line.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Option:
+    """The command line's side of a field; the field's annotation says what values it takes."""
+
+    help: str
+    metavar: str | None = None
+    flags: tuple[str, ...] = ()  # --field-name where there are none
+    panel: str | None = None  # of the help
+    shown_default: bool | str = True  # shown in the help: the default, a text in its place, or nothing
+    least: float | None = None
+    most: float | None = None
+    check: Callable[[Any], Any] | None = None  # returns the value, or raises UsageError
+
+
+@dataclass(frozen=True)
+class Only:
+    """The options of a group that a verb has: `Annotated[Group, Only("face")]`; others keep defaults."""
+
+    names: tuple[str, ...]
+
+    def __init__(self, *names: str) -> None:
+        object.__setattr__(self, "names", names)
+
+
+def option(default: Any, help: str, metavar: str | None = None, in_recipe: bool = True, **more: Any) -> Any:
+    """Make a dataclass field that is an option.
+
+    Args:
+        default: The value without the option; `...` where the option must be given.
+        help: A sentence: verb, object, unit.
+        metavar: The placeholder of the value in the help.
+        in_recipe: False for a field that shapes no output.
+        more: Further fields of `Option`.
+    """
+    metadata = {"option": Option(help, metavar, **more), "in_recipe": in_recipe}
+    if default is ...:
+        return dataclasses.field(metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def option_fields(group: Any) -> dict[str, "dataclasses.Field[Any]"]:
+    """The fields of a dataclass that are options, by name; empty for anything else."""
+    if not (isinstance(group, type) and dataclasses.is_dataclass(group)):
+        return {}
+    return {field.name: field for field in dataclasses.fields(group) if "option" in field.metadata}

@@ -1,0 +1,68 @@
+"""Groups of options: fields of dataclasses become a verb's options, and come back as the dataclass."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from facerf_cli.cli.options import Settings, with_groups
+from facerf_cli.option import Only, option
+
+
+@dataclass(frozen=True)
+class Paint:
+    settings: Settings
+    side_px: int = option(8, "Side of the image, in pixels.", "N", least=1, flags=("--size", "-s"))
+    kind: Literal["oil", "ink"] = option("oil", "Kind of paint.")
+    secret: int = 3
+
+
+@dataclass(frozen=True)
+class Frame:
+    width_px: int = option(..., "Width of the frame, in pixels.")
+    gold: bool = option(False, "Gild it.")
+
+
+def run(verb: object, *arguments: str) -> object:
+    app = typer.Typer()
+
+    @app.callback()
+    def _root(context: typer.Context) -> None:
+        context.obj = Settings(seed=5)
+
+    app.command("verb")(with_groups(verb))  # type: ignore[arg-type]
+    return CliRunner().invoke(app, ["verb", *arguments])
+
+
+def test_values_come_back_as_the_groups() -> None:
+    made = []
+
+    def verb(context: typer.Context, name: str, paint: Paint, frame: Frame) -> None:
+        made.append((name, paint, frame))
+
+    assert run(verb, "a", "-s", "4", "--width-px", "2", "--gold").exit_code == 0
+    name, paint, frame = made[0]
+    assert (name, paint.side_px, paint.kind, paint.secret, paint.settings.seed) == ("a", 4, "oil", 3, 5)
+    assert frame == Frame(2, True)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [["--kind", "wax"], ["--size", "0"], ["--secret", "1"], []],
+    ids=lambda w: " ".join(w) or "missing",
+)
+def test_limits_hold(wrong: list[str]) -> None:
+    def verb(context: typer.Context, paint: Paint, frame: Frame) -> None: ...
+
+    width = ["--width-px", "2"] if wrong else []
+    assert run(verb, *wrong, *width).exit_code == 2
+
+
+def test_a_verb_may_have_some_of_a_group() -> None:
+    def verb(context: typer.Context, paint: Annotated[Paint, Only("kind")]) -> None:
+        assert paint.side_px == 8
+
+    assert run(verb, "--kind", "ink").exit_code == 0
+    assert run(verb, "--size", "4").exit_code == 2
