@@ -26,7 +26,7 @@ from facerf_cli.cli.options import Overwrite, Settings, Shard, workers_of
 from facerf_cli.cli.recipe import RecipesOf
 from facerf_cli.cli.report import ItemResult, Outcome, add_row, open_report, report_name, unusable
 from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.files.atomic import sweep_leftovers
+from facerf_cli.files.atomic import all_or_none, sweep_leftovers
 from facerf_cli.files.folder_lock import alone_in
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.logs import LOGGER_NAME, STDERR, escaped, unexpected
@@ -232,7 +232,8 @@ class _OfFile:
 
     def __call__(self, item: Item) -> Outcome:
         require_regular(item.input_path)
-        return self.process(item)
+        with all_or_none():
+            return self.process(item)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ _LONGEST_STEM = (
     40  # characters of a name, of up to 4 bytes, that its temporary folder repeats; names end at 255
 )
 _open: set[Path] = set()  # temporary folders of this process
+_watched: list[list[Path]] = []  # what was written since each `all_or_none` began
 _swept: set[Path] = set()  # folders whose leftovers this process has removed
 
 
@@ -56,12 +57,29 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if temporary.is_dir() and path.is_dir() and not path.is_symlink():
             os.replace(path, room / f"{path.name}.old")
         os.replace(temporary, path)
+        for written in _watched:
+            written.append(path)
         _sync_folder(path.parent)
     except OSError as error:
         raise FacerfError(f"{path}: cannot write: {error.strerror or error}") from error
     finally:
         shutil.rmtree(room, ignore_errors=True)
         _open.discard(room)
+
+
+@contextmanager
+def all_or_none() -> Iterator[None]:
+    """Remove what was written in the block, in any thread, where the block fails; an interrupt keeps it."""
+    written: list[Path] = []
+    _watched.append(written)
+    try:
+        yield
+    except Exception:
+        for path in written:
+            _remove(path)
+        raise
+    finally:
+        _watched.pop()
 
 
 def sweep_leftovers(folder: Path) -> None:

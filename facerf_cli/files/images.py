@@ -243,9 +243,13 @@ def _exr_data(path: Path, part: _ExrPart, rows: slice) -> tuple[np.ndarray, int]
         data = values.astype(np.float16 if part.kind == "half" else np.float32, copy=False)
     if np.isfinite(data).all():
         return data, 0
-    if bad := int(np.sum(~np.isfinite(values))):
-        raise ValueError(f"{path}: {bad} values are NaN or infinite")
+    _require_finite(path, values)
     return values.clip(-HALF_MAX, HALF_MAX).astype(np.float16), int(np.sum(np.abs(values) > HALF_MAX))
+
+
+def _require_finite(path: Path, values: np.ndarray) -> None:
+    if bad := values.size - int(np.isfinite(values).sum()):
+        raise InputError(f"{path}: not written: {bad} values are NaN or infinite; check its input")
 
 
 def write_tiff(
@@ -262,6 +266,7 @@ def write_tiff(
 
     def values(_: int, rows: slice) -> np.ndarray:
         colour = from_linear_rec709(pixels[rows], space)
+        _require_finite(path, colour)
         return np.dstack([colour] if alpha is None else [colour, alpha[rows]]).astype(np.float32, copy=False)
 
     spec = _spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
@@ -298,6 +303,7 @@ def write_display(
 
     def values(_: int, rows: slice) -> np.ndarray:
         seen = pixels[rows]
+        _require_finite(path, seen)
         if alpha is not None and jpeg:
             seen = seen * alpha[rows][..., None]
         exposed = np.nan_to_num(seen * np.float32(2.0**chosen_ev))

@@ -156,7 +156,7 @@ def _part(
 
 def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
     if not np.isfinite(image).all():
-        raise ValueError(f"{path}: some values are NaN or infinite")
+        raise InputError(f"{path}: not written: some values are NaN or infinite; check its photo")
     return np.ascontiguousarray(image.clip(-HALF_MAX, HALF_MAX), np.float16)
 
 

@@ -8,11 +8,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.portrait.proxy import (
     Proxy,
@@ -85,11 +87,14 @@ def look_at_person(
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
 
     All is seen in the square around the landmarks, or in a given one; a `segmentation` may be given.
+    Raises InputError where no skin is seen, by which the person is exposed.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = square or portrait_square(landmarks_px)
     segmentation = segmentation or segment(to_display(photo), landmarks_px)
     classes = _classes_in(segmentation, square)
+    if classes[class_index("skin")].sum() < 1:
+        raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
     image = torch.from_numpy(square.apply(photo)).permute(2, 0, 1)
     maps = proxy_maps(proxy, square_camera(fit, square))

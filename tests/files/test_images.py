@@ -303,7 +303,7 @@ def test_exr_keeps_values_beyond_1_and_counts_those_beyond_half(tmp_path: Path) 
     assert write_exr(tmp_path / "a.exr", values) == 2
     expected = np.array([[[-3, 1e-4, 6e4], [HALF_MAX, -HALF_MAX, 0]]])
     np.testing.assert_allclose(read_image(tmp_path / "a.exr").pixels, expected, rtol=1e-3)
-    with pytest.raises(ValueError, match="1 values are NaN"):
+    with pytest.raises(InputError, match="1 values are NaN"):
         write_exr(tmp_path / "b.exr", np.full((1, 1, 3), [0, np.nan, 0], np.float32))
 
 

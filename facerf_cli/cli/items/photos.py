@@ -35,6 +35,7 @@ from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 
 _PHOTO_BYTES = 12  # of a pixel of the photo that is held
 _KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
+_MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
 LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
@@ -85,7 +86,13 @@ def face_model(options: PhotoOptions) -> MorphableModel:
 def read_photo(item: Item, options: PhotoOptions, kept_px: int = _KEPT_PX) -> LinearImage:
     """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
-    return read_image(item.input_path, space, kept_px=kept_px)
+    image = read_image(item.input_path, space, kept_px=kept_px)
+    if (most := float(image.pixels.max())) > _MOST_RADIANCE:
+        raise InputError(
+            f"{item.input_path}: its brightest value is {most:.3g}, and {_MOST_RADIANCE:.0e} is the most; "
+            "clip it"
+        )
+    return image
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:

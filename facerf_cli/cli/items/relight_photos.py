@@ -185,16 +185,16 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
 def _show_face(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> _Shown:
     models, head = load_models_once(work.photo), face.head
     target = _target(item, face, image, work)
-    reflectance = reflectance_of(
-        models,
-        head,
-        work.reflectance,
-        work.network_alone,
-        memory.limit_bytes(),
-        image.pixels,
-        face.steady,
-    )
     try:
+        reflectance = reflectance_of(
+            models,
+            head,
+            work.reflectance,
+            work.network_alone,
+            memory.limit_bytes(),
+            image.pixels,
+            face.steady,
+        )
         composition = composition_of(models, image.pixels, head, reflectance, target)
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
@@ -345,6 +345,7 @@ def _write_setups(
         _of_leaders[item, work] = dict(exposures_ev)
     for part in parts:
         for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
+            _require_finite(item, setup, relit)
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
             image, layers = shown.composer.rows(relit, ev, behind), shown.composer.layers(work.aov, relit)
@@ -356,6 +357,17 @@ def _write_setups(
                 log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
             del relit, image, layers, written  # a view of one holds all of its part, beside the next
+
+
+def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
+    """Raise InputError, before anything is written, where a light gives values that are no numbers."""
+    for one in relit if isinstance(relit, Sequence) else [relit]:
+        tensors = [one.texture] if one.surround is None else [one.texture, one.surround]
+        if not all(tensor.isfinite().all() for tensor in tensors):
+            raise InputError(
+                f"{item.input_path}: relit by {setup.name} it has values that are NaN or infinite; check the "
+                "photo, its landmarks and the light"
+            )
 
 
 def _parts(shown: _Shown, work: Relight) -> list[slice]:
