@@ -24,7 +24,7 @@ def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray
         raise ValueError(f"{width} x {height} pixels; {most}, so make it smaller")
     if width * height > most_px:
         return {SIZE: np.array([width, height])}
-    pixels = np.asarray(image)
+    pixels = np.array(image)  # a copy: the memory of pi-heif ends with its image
     arrays = {PIXELS: pixels.reshape(height, width, -1)}
     if profile := image.info.get("icc_profile"):
         arrays[PROFILE] = np.frombuffer(profile, np.uint8)

@@ -20,6 +20,7 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_display
 from tests import icc_profiles
 
+QUADS = Path(__file__).with_name("quads.heic")  # 600 x 400: its pixels outgrow what a small allocation keeps
 HEIC = Path(__file__).with_name("phone.heic")  # upright: green above red on the left, blue below right
 LEVELS = np.random.default_rng(2).integers(0, 256, (24, 40, 3), np.uint8)
 BLOCKS = np.repeat(np.repeat(LEVELS[::8, ::8], 8, 0), 8, 1)  # which lossy formats keep roughly
@@ -97,6 +98,16 @@ def test_a_photo_of_a_phone() -> None:
     assert image.colourspace_name == "Display P3" and image.pixels.shape == (64, 48, 3)
     stored = 255 * linear_to_srgb(read_image(HEIC, "sRGB").pixels)
     for at, level in {(5, 5): (40, 200, 60), (-5, 5): (50, 60, 210), (5, -5): (220, 60, 40)}.items():
+        np.testing.assert_allclose(stored[at], level, atol=4)
+
+
+def test_a_heic_of_the_size_of_a_photo() -> None:
+    """Pixels outlive the memory of pi-heif's image."""
+    stored = 255 * linear_to_srgb(read_image(QUADS).pixels)
+    assert stored.shape == (400, 600, 3)
+    for at, level in {
+        (9, 9): (200, 60, 40), (9, -9): (40, 180, 60), (-9, 9): (50, 70, 200), (-9, -9): (128, 128, 128),
+    }.items():  # fmt: skip
         np.testing.assert_allclose(stored[at], level, atol=4)
 
 
