@@ -11,7 +11,7 @@ import OpenImageIO as oiio
 from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.heif import HEIF_BYTES, decode_heif, is_heif
-from facerf_cli.files.image_metadata import oiio_error, require_whole_png, utf8_path
+from facerf_cli.files.image_metadata import is_ultra_hdr, oiio_error, require_whole_png, utf8_path
 from facerf_cli.files.regular import require_regular
 from facerf_cli.logs import LOGGER_NAME, one_line
 
@@ -65,6 +65,7 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
         if stream.format_name() == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5:
             raise InputError(f"{path}: a DPX file that lies on its side is not read; save it upright")
         colour, alpha = pick_channels(list(spec.channelnames), spec.alpha_channel)
+        alpha = None if is_ultra_hdr(path, spec) else alpha  # the library adds one, which is opaque
         used = colour if alpha is None else [*colour, alpha]
         first, past = min(used), max(used) + 1
         kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)

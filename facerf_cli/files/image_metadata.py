@@ -9,7 +9,7 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +43,7 @@ _HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
 OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
 _SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+_GAIN_MAP_NAMES = (b"urn:iso:std:iso:ts:21496:-1", b"hdr-gain-map")  # ISO's metadata, or Adobe's XMP
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
 _JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
 _XMP_NAMESPACES = {
@@ -131,6 +132,8 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
 
 def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     """Return the colour space that the file states; by default floats are linear Rec.709, integers sRGB."""
+    if is_ultra_hdr(path, spec):
+        return _space_of_ultra_hdr(path, spec)
     default = LINEAR if is_floating(spec) else SRGB
     description = spec.get_string_attribute("ICCProfile:profile_description")
     profile = spec.getattribute("ICCProfile")
@@ -163,6 +166,39 @@ def _space_of_icc(path: Path, profile: bytes, description: str, default: ColourS
         kind = f"embedded profile '{one_line(description)}' is not understood"
         log.warning("%s: the %s; taken for %s", path, kind, default.name)
     return found or default
+
+
+def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
+    """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: its values are linear."""
+    with path.open("rb") as stream:
+        return is_floating(spec) and stream.read(2) == _JPEG_START
+
+
+def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
+    """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image."""
+    stored = spec.getattribute("ICCProfile")
+    profile = _gain_map_profile(path.read_bytes()) or (b"" if stored is None else bytes(stored))
+    space = space_of_profile(profile, "") or SRGB
+    return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR
+
+
+def _gain_map_profile(content: bytes) -> bytes:
+    """Return the ICC profile of the gain map (ISO 21496-1), a JPEG after the first one; empty without one."""
+    start = 0
+    while (start := content.find(_JPEG_START + b"\xff", start + 1)) > 0:
+        segments = list(_jpeg_segments(content, start))
+        if any(name in segment for segment in segments for name in _GAIN_MAP_NAMES):
+            return b"".join(part[14:] for part in segments if part.startswith(b"ICC_PROFILE\0"))
+    return b""
+
+
+def _jpeg_segments(content: bytes, start: int) -> Iterator[bytes]:
+    """Yield the segments of a JPEG's header, without their markers."""
+    at = start + len(_JPEG_START)
+    while content[at : at + 1] == b"\xff" and content[at + 1 : at + 2] not in (b"\xda", b"\xd9", b""):
+        length = int.from_bytes(content[at + 2 : at + 4], "big")
+        yield content[at + 4 : at + 2 + length]
+        at += 2 + max(length, 2)
 
 
 def states_space(spec: oiio.ImageSpec) -> bool:

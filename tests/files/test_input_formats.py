@@ -14,12 +14,13 @@ from PIL import Image
 
 from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES
-from facerf_cli.colour import linear_to_srgb
+from facerf_cli.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_display
 from tests import icc_profiles
 
+ULTRA_HDR = Path(__file__).with_name("ultra_hdr.jpg")  # examples/astronaut.jpg, with a gain map
 QUADS = Path(__file__).with_name("quads.heic")  # 600 x 400: its pixels outgrow what a small allocation keeps
 HEIC = Path(__file__).with_name("phone.heic")  # upright: green above red on the left, blue below right
 LEVELS = np.random.default_rng(2).integers(0, 256, (24, 40, 3), np.uint8)
@@ -248,3 +249,15 @@ def test_the_header_of_a_heic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert read_header(tmp_path / "cut.heic") is None
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     assert read_header(HEIC) is None
+
+
+def test_an_ultra_hdr_jpeg_is_decoded_once() -> None:
+    """Linear with the gain map applied, in the map's primaries: Rec.709, while the base is Display P3."""
+    image = read_image(ULTRA_HDR)
+    with Image.open(ULTRA_HDR.parents[2] / "examples" / "astronaut.jpg") as photo:
+        expected = srgb_to_linear(np.asarray(photo.resize((256, 256))) / np.float32(255))
+    assert image.alpha is None and image.colourspace_name == "linear Rec.709"
+    np.testing.assert_allclose(image.pixels.mean((0, 1)), expected.mean((0, 1)), rtol=0.02)
+    assert np.abs(image.pixels - expected).mean() < 0.01
+    header = read_header(ULTRA_HDR)
+    assert header is not None and header.space.name == "linear Rec.709"
