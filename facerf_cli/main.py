@@ -165,6 +165,7 @@ for _verbs_of in (app, *(group for group, _ in GROUPS.values())):
 
 def run() -> None:
     """Run the `facerf` script."""
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child imports what lies in the working directory
     end_on_signals(_PATIENCE_S)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)

@@ -13,6 +13,7 @@ import socket
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
+from contextlib import chdir
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ from facerf_cli.logs import LOGGER_NAME, log_to_queue, one_line
 T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
+_NO_MODULES = Path(__file__).parent / "assets"
 _ATTEMPTS = 3  # at an item whose workers are lost
 _PATIENCE_S = 10
 _STORE_BYTES = 256 << 20  # of shared memory; what goes through it is settings
@@ -105,14 +107,19 @@ def connect(address: str, jobs: int = 0) -> Any:
 
 def _initialise(ray: Any, address: str, jobs: int) -> None:
     logging.getLogger("ray").setLevel(logging.ERROR)
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+    options: dict[str, Any] = {
+        "log_to_driver": False,
+        "logging_level": logging.ERROR,
+        "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
+    }
     if address == LOCAL:
         options |= {"num_cpus": jobs or None, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
     else:
         _require_listener(address)
     ours = signal.getsignal(signal.SIGTERM)
     try:
-        ray.init(address=address, **options)
+        with chdir(_NO_MODULES):  # Ray lets workers import from the folder where it is started
+            ray.init(address=address, **options)
     except (OSError, RuntimeError, ValueError, AssertionError, ray.exceptions.RayError) as error:
         raise UsageError(f"--ray {address}: {_first_sentence(error)}") from error
     finally:

@@ -30,7 +30,9 @@ ITEMS = [f"x/{letter}" for letter in "abcdefgh"]
 
 @pytest.fixture(scope="module")
 def two_workers() -> Iterator[None]:
-    ray = connect("local", 2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))  # workers import tests.cli.toy_batch
+        ray = connect("local", 2)
     yield
     ray.shutdown()
 

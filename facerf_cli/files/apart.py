@@ -21,6 +21,7 @@ from facerf_cli.logs import shown
 _MEMORY_BYTES = 6 << 30
 _TIME_S = 300
 _REFUSED = 3  # exit code of a child that says why on stderr
+# -P, for the working directory may hold a json.py; the search path is then that of the parent.
 _CHILD = "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
 _CHILD += "from facerf_cli.files.apart import serve; serve()"
 
@@ -32,7 +33,7 @@ def arrays_apart(
 
     Raises ValueError with what the reader raised there, or how its process ended.
     """
-    command = [sys.executable, "-c", _CHILD, json.dumps(sys.path), module, reader, os.fspath(path)]
+    command = [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), module, reader, os.fspath(path)]
     command += map(str, limits)
     with tempfile.TemporaryFile() as file:
         try:

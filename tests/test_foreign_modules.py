@@ -1,0 +1,71 @@
+"""Modules that lie in the working directory, perhaps somebody else's, are never imported."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.files.apart import arrays_apart
+
+STRANGERS = ("json", "numpy", "torch", "multiprocessing", "signal")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with modules that leave a mark when they are imported."""
+    for name in STRANGERS:
+        mark = f"open({str(tmp_path / f'{name}.imported')!r}, 'w')\nraise SystemExit('a stranger')\n"
+        (tmp_path / f"{name}.py").write_text(mark)
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.png").write_bytes(b"no image")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(script: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line by a script, as pip installs it: its own folder is first on the path."""
+    script.write_text('from facerf_cli.main import run\nif __name__ == "__main__":\n    run()\n')
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    return subprocess.run(
+        [sys.executable, str(script), *arguments], env=environment, capture_output=True, text=True
+    )
+
+
+def imported(folder: Path) -> list[str]:
+    return [path.name for path in folder.glob("*.imported")]
+
+
+def send_pi(path: Path) -> dict[str, np.ndarray]:
+    return {"pi": np.array(3.14)}
+
+
+def test_a_reader_in_its_own_process_imports_none(folder: Path) -> None:
+    assert arrays_apart(__name__, "send_pi", folder / "a.png")["pi"] == 3.14
+    assert not imported(folder)
+
+
+@pytest.mark.parametrize(
+    "workers",
+    [
+        ("--jobs", "2"),
+        pytest.param(
+            ("--ray", "local"),
+            marks=[
+                pytest.mark.slow,
+                pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed"),
+            ],
+        ),
+    ],
+    ids=" ".join,
+)
+def test_workers_import_none(
+    folder: Path, workers: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    script = tmp_path_factory.mktemp("bin") / "facerf"
+    ended = run(script, "segment", "a.png", "b.png", "-o", "out", *workers)
+    assert ended.returncode == 1 and ended.stderr.count("a.png") and ended.stderr.count("b.png"), ended.stderr
+    assert not imported(folder)
