@@ -20,6 +20,7 @@ Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's
 _PER_BOX, _ABOVE_BOX = 1.48, 0.02
 MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
 GIVE_LANDMARKS = "give its landmarks (--landmarks FILE; in Python landmarks_px)"
+_LARGEST = 16  # sides of a crop over the photo's longer side; more would resample beyond all bounds
 _SMALLEST_FACE_PX = 4.0  # landmarks within fewer pixels cannot be a face
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)
 # The hairline lies this far above the eyes, in units of the distance from the eyes to the mouth.
@@ -62,10 +63,16 @@ class Crop:
         """Resample an image [H, W, C] to float32 [size, size, C]; beyond its border the edge pixels repeat.
 
         The filter is Catmull-Rom, widened where a crop pixel is larger than a photo pixel. The result is
-        clipped to the range of the image region, so that radiance stays non-negative.
+        clipped to the range of the image region, so that radiance stays non-negative. Raises InputError for a
+        crop that is larger than `_LARGEST` photos.
         """
         if image.ndim != 3:
             raise ValueError(f"image: its shape is {image.shape}, not [H, W, C]")
+        longer_px = max(image.shape[:2])
+        if not self.side_px <= _LARGEST * longer_px:
+            raise InputError(
+                f"crop: it is {self.side_px:.0f} pixels wide and the photo {longer_px}; {GIVE_LANDMARKS}"
+            )
         rows = _resampler(image.shape[0], self.y0_px, self.side_px, self.size_px)
         columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)
         top, bottom = _used(rows)
@@ -134,6 +141,21 @@ def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:
     eyes_to_mouth_px = np.linalg.norm(landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0))
     if min(np.ptp(landmarks_px, axis=0).min(), eyes_to_mouth_px) < _SMALLEST_FACE_PX:
         raise InputError("landmarks: they lie on one spot or one line; give a face of at least a few pixels")
+    return landmarks_px
+
+
+def check_in_photo(landmarks_px: np.ndarray, height_px: int, width_px: int) -> np.ndarray:
+    """The landmarks [68, 2]; raises InputError unless their middle lies in the photo and they fit into two.
+
+    The border may cut a face; a file of another photo or in another unit is refused.
+    """
+    middle_px, extent_px = np.median(landmarks_px, 0), np.ptp(landmarks_px, axis=0).max()
+    inside = (middle_px >= 0).all() and (middle_px <= (width_px, height_px)).all()
+    if not inside or extent_px > 2 * max(height_px, width_px):
+        raise InputError(
+            f"landmarks: around ({middle_px[0]:.0f}, {middle_px[1]:.0f}), {extent_px:.0f} pixels wide, and "
+            f"the photo has {width_px} x {height_px}; give those of this photo, in its pixels"
+        )
     return landmarks_px
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_landmarks, from_box, from_landmarks
+from facerf_cli.face.crop import Crop, check_in_photo, check_landmarks, from_box, from_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
 
 
@@ -127,3 +127,18 @@ def test_what_is_no_face_is_refused(landmarks):
 def test_torch_is_not_what_apply_takes():
     with pytest.raises(ValueError, match=r"\[H, W, C\]"):
         Crop(0, 0, 8, 8).apply(torch.zeros(8, 8).numpy())
+
+
+def test_a_crop_of_another_world_is_refused_before_it_is_resampled():
+    """Points far outside the photo once took 23 GB: the weights grow with the crop's side."""
+    with pytest.raises(InputError, match="pixels wide and the photo 12"):
+        Crop(0, 0, 1e8, 8).apply(np.ones((12, 9, 3), np.float32))
+
+
+@pytest.mark.parametrize("place", [lambda px: px + 1e6, lambda px: px * 1e6, lambda px: px - 2000])
+def test_landmarks_of_another_photo_are_refused(place):
+    height, width = 500, 620
+    landmarks = frontal_landmarks()
+    assert check_in_photo(landmarks, height, width) is landmarks
+    with pytest.raises(InputError, match="620 x 500; give those of this photo"):
+        check_in_photo(place(landmarks), height, width)

@@ -19,6 +19,7 @@ from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.crop import check_in_photo
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks
@@ -110,7 +111,7 @@ def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[Fit
 def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
     """Find the faces that the options choose, from left to right, with the tags of their outputs."""
     if options.landmarks is not None:
-        faces = [_given(item, options.landmarks)]
+        faces = [_given(item, image, options.landmarks)]
     else:
         faces = find_faces(image.pixels, str(item.input_path), options.face, options.landmarks_from)
     for face, name in zip(faces, _names(item, faces), strict=True):
@@ -179,7 +180,7 @@ def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> 
 def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FaceBox]:
     """Find the faces that the options choose; with their landmarks where the fit needs them."""
     if options.landmarks is not None:
-        yield _given(item, options.landmarks)
+        yield _given(item, image, options.landmarks)
     else:
         geometry = options.geometry or load_models_once(options).default_geometry
         yield from find_for(
@@ -187,9 +188,14 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
         )
 
 
-def _given(item: Item, landmarks: Path) -> Face:
+def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
-    return face_at(read_landmarks(companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")))
+    path = companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")
+    try:
+        return face_at(check_in_photo(read_landmarks(path), *image.pixels.shape[:2]))
+    except InputError as error:
+        named = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{named}{error}") from None
 
 
 def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
