@@ -22,6 +22,7 @@ ASTRONAUT = ROOT / "examples" / "astronaut.jpg"
 PHOTOS, YALE_B, MAPS = (SHARED / "data" / name for name in ("photos", "extended_yale_b", "hdri"))
 SHIFTS = SHARED / "bench" / "yale_b" / "shifts.csv"
 ICT_FACEKIT = SHARED / "data" / "ict_facekit" / "ICT-FaceKit-master.tar.xz"
+sys.path.append(str(ROOT))  # benchmarks import from tools/
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 
 T = TypeVar("T")

@@ -33,7 +33,6 @@ import numpy as np
 import torch
 from _common import arguments, print_header, print_row
 from _film_of_photo import frames_of
-from _talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from skimage.registration import optical_flow_ilk
@@ -48,6 +47,7 @@ from facerf_cli.film.shot_view import ShotView
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models, load_models
 from facerf_cli.portrait_field import SteadyFrame
+from tools.talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 
 PATCH = 1 / 64  # of the side
 FLOOR = 0.02  # radiance added to results and truth before their ratio

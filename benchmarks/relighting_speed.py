@@ -76,7 +76,7 @@ def mean_face(models: Models, side: int) -> FaceTexture:
 def report_second_map(models: Models, rig: Tensor, side: int) -> None:
     """Print what one more envmap costs once one is shown, and what a new prediction costs."""
     photo = read_image(ASTRONAUT).pixels
-    head = fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px, side)
+    head = fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px, models.sides(side))
     reflectance, composition = reflectance_of(models, head), Composition(models.face, photo, head)
     maps = [
         torch.from_numpy(read_image(path).pixels)

@@ -84,8 +84,8 @@ def test_the_metadata_describe_it(metadata: Message, wheel: zipfile.ZipFile) -> 
 def test_the_source_distribution_has_what_the_tests_read_and_no_cache(built: Path) -> None:
     with tarfile.open(built / f"facerf-{__version__}.tar.gz") as archive:
         names = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
-    for pattern in ("tests/**/*", "docs/*", "examples/**/*", "man/*", "completions/*", "benchmarks/*"):
-        assert {name for name in tracked(pattern) if "__pycache__" not in name} <= names
+    for folder in ("tests/**", "docs", "examples/**", "man", "completions", "benchmarks", "tools"):
+        assert {name for name in tracked(f"{folder}/*") if "__pycache__" not in name} <= names
     assert {"Makefile", "constraints.txt", "CHANGELOG.md", "MODEL_CARD.md", ".ci/run"} <= names
     assert not [name for name in names if name.endswith((".pyc", ".pyo")) or "_cache" in name]
 

@@ -3,7 +3,7 @@
 The methods with which the paper compares use a morphable model of albedo (Blanz and Vetter, *A Morphable
 Model for the Synthesis of 3D Faces*, 1999; with specular albedo: Smith et al., *A Morphable Face Albedo
 Model*, 2020). Here it is replaced by the principal components of logarithms of albedo and gloss in UV space:
-albedo stays positive, and the colour and strength of a light only add to it. `synth/baseline_priors.py`
+albedo stays positive, and the colour and strength of a light only add to it. `tools/baseline_priors.py`
 learns the priors; they ship as an asset, so that every machine has the same.
 """
 

@@ -4,8 +4,8 @@ import torch
 
 from facerf_cli.baselines.priors import ASSET, SIDE, light_prior, skin_prior
 from facerf_cli.face.topology import region_mask
-from facerf_cli.synth import baseline_priors
-from facerf_cli.synth.baseline_priors import LIGHT_ORDER, learn_light, learn_skin
+from tools import baseline_priors
+from tools.baseline_priors import LIGHT_ORDER, learn_light, learn_skin
 
 
 def test_drawn_again_they_are_much_the_same() -> None:

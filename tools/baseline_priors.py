@@ -1,6 +1,6 @@
 """Learn the priors of the baselines from procedural skins and envmaps.
 
-`python -m facerf_cli.synth.baseline_priors FILE` writes the asset that `baselines/priors.py` loads. Its seeds
+`python -m tools.baseline_priors FILE` writes the asset that `baselines/priors.py` loads. Its seeds
 are used by no dataset. The prior of light is the mean and covariance of procedural maps of mean radiance 1,
 rotated about the vertical: more light comes from above, and the colours of directions are correlated.
 """
@@ -89,7 +89,7 @@ def main(path: Path) -> None:
         f"{name}.{field}": getattr(part, field) for name, part in parts.items() for field in ("mean", "modes")
     }
     made = {"skins": SKINS, "maps": MAPS, "turns": _TURNS, "seed": SEED, "side": SIDE, "order": LIGHT_ORDER}
-    save_checkpoint(path, tensors, {"made_by": "facerf_cli.synth.baseline_priors", **made})
+    save_checkpoint(path, tensors, {"made_by": "tools.baseline_priors", **made})
 
 
 if __name__ == "__main__":

@@ -5,9 +5,9 @@ import torch
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import rotation_to_pose
-from facerf_cli.synth.animation import Actor, seen_from, turned
 from facerf_cli.synth.stage_cameras import stage_cameras
 from facerf_cli.synth.subjects import draw_subject, subject_model
+from tools.talking_head import Actor, seen_from, turned
 
 
 def test_the_jaw_opens_and_the_hair_stays() -> None:

@@ -1,6 +1,6 @@
 """Make the person whose mesh is fitted to photos as a proxy (`portrait/proxy.py`): head, ears, neck and bust.
 
-`python -m facerf_cli.synth.proxy_person FILE` writes the asset: the mean head of the built-in face model on a
+`python -m tools.proxy_person FILE` writes the asset: the mean head of the built-in face model on a
 body with a shirt, coarse, and for each vertex the vertices of the face that carry it along.
 """
 
@@ -83,7 +83,7 @@ def _hair(vertices: np.ndarray, label: np.ndarray, face: np.ndarray, chin_m: flo
 def main(path: Path) -> None:
     """Write the asset to `path`."""
     made = {
-        "made_by": "facerf_cli.synth.proxy_person",
+        "made_by": "tools.proxy_person",
         "layout_version": LAYOUT_VERSION,
         "licence": "MIT; CC0",
     }

@@ -1,6 +1,6 @@
 """The built-in morphable model: mean, identities and expressions made from tables of measures, not scans.
 
-`python -m facerf_cli.face.builtin` writes it to `assets/builtin_face.npz`.
+`python -m tools.builtin_face` writes it to `assets/builtin_face.npz`.
 
 The identity basis is a Gaussian process on the mean face (Lüthi et al., 'Gaussian Process Morphable Models'):
 smooth deformations at three length scales, mostly mirror symmetric, without rigid motion and with little
@@ -17,7 +17,6 @@ import torch
 from scipy.interpolate import CubicSpline, RBFInterpolator
 from scipy.linalg import eigh
 
-from facerf_cli.face.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM, mean_vertices
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, save_face_model
 from facerf_cli.face.topology import (
     BOTTOM_M,
@@ -30,6 +29,7 @@ from facerf_cli.face.topology import (
     inside_mm,
     locate,
 )
+from tools.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM, mean_vertices
 
 IDENTITIES = 80  # modes kept
 _SCALES_MM = ((80.0, 2.8), (35.0, 1.75))  # length scale, standard deviation along each axis

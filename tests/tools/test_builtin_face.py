@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM
-from facerf_cli.face.builtin import EXPRESSION_STD, IDENTITIES, build
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, grid_uv, region_mask
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
+from tools.anatomy import EYE_CENTRE_MM, EYE_RADIUS_MM
+from tools.builtin_face import EXPRESSION_STD, IDENTITIES, build
 
 MIRROR = torch.tensor([-1.0, 1, 1])
 FULL = 1 / EXPRESSION_STD
