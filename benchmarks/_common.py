@@ -13,8 +13,8 @@ from typing import NoReturn, TypeVar
 from safetensors.torch import load_file
 
 from facerf_cli.metrics import Interval
-from facerf_cli.synth.head_fields import head_fields
-from facerf_cli.synth.heads_bank import Bank
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.synth.bank.texture_samples import head_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("FACERF_SHARED", ROOT.parent / "shared"))  # test data, not in the repository

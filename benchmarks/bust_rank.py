@@ -19,12 +19,11 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.raster.camera import Camera, pose_to_rotation
-from facerf_cli.synth import bake_renderer
+from facerf_cli.synth import renderer
+from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.head.mesh import PARTS
-from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import draw_subject, subject_model
-from facerf_cli.synth.texture_samples import draw_light
-from facerf_cli.synth.truth import truth_of
+from facerf_cli.synth.views import StageCamera, truth_of
 
 SIDE_PX, LIGHTS, MAPS = 128, 150, 100
 SHARES = (0.99, 0.999)
@@ -41,7 +40,7 @@ def rendered(model_name: str, index: int, directions: np.ndarray) -> tuple[np.nd
     yaw = float(np.random.default_rng(index).uniform(-40, 40))
     lens = Camera(SIDE_PX * 2 / 0.5, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
     camera = StageCamera(lens, pose_to_rotation(yaw, 0, 0), torch.tensor([0.0, 0.05, -2.0]))
-    images, _ = bake_renderer.photograph(mesh, subject.appearance, transport, camera)
+    images, _ = renderer.photograph(mesh, subject.appearance, transport, camera)
     truth = truth_of(mesh, subject.appearance, camera)
     whole = truth.alpha.ravel() > 0.99
     pixels = images.permute(2, 3, 1, 0).reshape(-1, 3, len(directions)).numpy()[whole]

@@ -32,8 +32,8 @@ from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.strips import whole
 from facerf_cli.synth.portraits import bake_portrait, photograph
-from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.views import StageCamera
 
 SEED, SIDE_PX, LIGHTS = 41, 288, 150
 RACES = ("african", "asian", "caucasian")

@@ -32,7 +32,7 @@ from facerf_cli.models import load_models
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.synth.face_crops import RenderedFaces
+from facerf_cli.synth.bank.face_crops import RenderedFaces
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 
 CROP_PX = 256

@@ -31,10 +31,10 @@ from torch import Tensor
 from facerf_cli.face.topology import region_mask
 from facerf_cli.metrics import TONES, ita_deg, mean_interval, tone_drift_deg, tone_of
 from facerf_cli.models import load_models
-from facerf_cli.synth.appearance import skin as appearance
+from facerf_cli.synth.appearance import skin
 from facerf_cli.synth.appearance.people import People, draw_people
-from facerf_cli.synth.heads_bank import Bank
-from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.losses import clipped_si_mse, si_mse
 from facerf_cli.training.objective import seeded
 
@@ -93,7 +93,7 @@ def _recorded() -> Iterator[list[People]]:
         seen.append(draw_people(count, generator))
         return seen[-1]
 
-    with patch.object(appearance, "draw_people", recording):
+    with patch.object(skin, "draw_people", recording):
         yield seen
 
 
@@ -107,7 +107,7 @@ def _errors(head: int, sample: Sample, predicted: Tensor, person: People) -> Ite
     )
     errors = torch.cat(measured).T.tolist()  # [L, 3]
     same = bool((sample.normals_source - sample.normals_target).abs().amax() < 1e-3)
-    albedo = None if person.random_texture[0] else appearance.bare_skin(person)[0].numpy()
+    albedo = None if person.random_texture[0] else skin.bare_skin(person)[0].numpy()
     tone = None if albedo is None else tone_of(float(ita_deg(albedo)))
     for light, direction in enumerate(sample.lights[0]):
         drift_deg = None

@@ -41,8 +41,8 @@ from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.parse import parsing_network
 from facerf_cli.portrait.segment import segment
 from facerf_cli.strips import whole
-from facerf_cli.synth.backgrounds import heaps_of, views_of_map
-from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
 from facerf_cli.training.objective import seeded
 
 SEED = 7

@@ -28,9 +28,9 @@ from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField, portrait_network
+from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
+from facerf_cli.synth.bank.transport import load_view
 from facerf_cli.synth.portraits import images_under
-from facerf_cli.synth.texture_samples import draw_light, draw_target_lights
-from facerf_cli.synth.transport_bank import load_view
 from facerf_cli.training.objective import seeded
 
 SEED = 16

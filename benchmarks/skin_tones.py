@@ -24,9 +24,9 @@ from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
+from facerf_cli.synth.bank.texture_samples import draw_light
+from facerf_cli.synth.bank.transport import StoredView, load_view
 from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
-from facerf_cli.synth.texture_samples import draw_light
-from facerf_cli.synth.transport_bank import StoredView, load_view
 from facerf_cli.training.objective import seeded
 
 SEED, SKINS, LOOK_PX = 17, 6, 128

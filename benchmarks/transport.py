@@ -28,13 +28,13 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
-from facerf_cli.synth import bake_renderer, path_tracer
+from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
-from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.renderer import RenderSettings
+from facerf_cli.synth.views import StageCamera
 
 DISTANCE_M, FIELD_M = 1.5, 0.24  # of the cameras, and the width that an image shows
 TEXTURE_SIDE = 128  # texels
@@ -134,14 +134,12 @@ def render_both(
     times["bake"].append(time.perf_counter() - started)
     plain = RenderSettings(bounces=settings.bounces, scattering=False, gloss=False, relief=False)
     started = time.perf_counter()
-    irradiance = bake_renderer.scattered_irradiance(head, appearance, transport, plain)
+    irradiance = renderer.scattered_irradiance(head, appearance, transport, plain)
     times["irradiance"].append(time.perf_counter() - started)
     ours, theirs = [], []
     for camera in cameras:
         started = time.perf_counter()
-        ours.append(
-            bake_renderer.photograph(head, appearance, transport, camera, plain, irradiance=irradiance)[0]
-        )
+        ours.append(renderer.photograph(head, appearance, transport, camera, plain, irradiance=irradiance)[0])
         times["photograph"].append((time.perf_counter() - started) / len(directions))
         started = time.perf_counter()
         theirs.append(path_tracer.photograph(head, appearance, directions, camera, settings, seed)[0])

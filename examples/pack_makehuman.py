@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from facerf_cli.synth.head.makehuman import STEP_M
+from facerf_cli.synth.head.mesh import STEP_M
 
 MESHES = {
     "body": "base/3dobjs/base.obj",

@@ -17,10 +17,9 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.facets import surface_samples
 from facerf_cli.synth.portraits import bake_portrait, photograph
-from facerf_cli.synth.stage_cameras import StageCamera, stage_cameras
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.views import StageCamera, stage_cameras, surface_samples
 
 _NEAR = 4  # vertices of the face that carry a vertex of the mesh
 _REACH_M = 0.012  # from the face, at which the mesh follows it by 1 / e

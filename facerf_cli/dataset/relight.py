@@ -23,7 +23,7 @@ from facerf_cli.files.documents import checked
 from facerf_cli.files.images import HALF_MAX, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.logs import attributes_of_sum
-from facerf_cli.synth.threads import one_thread
+from facerf_cli.workers import one_thread
 
 TILE_IMAGES = 128
 DEFAULT_MEMORY_BYTES = 2 << 30

@@ -1,6 +1,6 @@
 """Training samples of the texture stages, drawn from a prepared dataset.
 
-They take the place of the synthetic samples of `synth/texture_samples.py`, with photographed instead of
+They take the place of the synthetic samples of `synth/bank/texture_samples.py`, with photographed instead of
 rendered lights. A source is an unwrapped image of `relight-dataset`; for lazy pairs it is the weighted sum of
 the stack's textures, which is the same, for unwrapping is linear. Without pairs a random light is drawn, as
 for synthetic heads.
@@ -24,8 +24,8 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map
-from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_head
-from facerf_cli.synth.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
+from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
+from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
 
 _SAME_POSE_SHARE = 0.5  # of samples without pairs
 _MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network

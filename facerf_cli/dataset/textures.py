@@ -32,8 +32,7 @@ from facerf_cli.files.images import HALF_MAX, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
 from facerf_cli.logs import LOGGER_NAME, json_line
 from facerf_cli.raster.texture import normal_map, unwrap
-from facerf_cli.synth.threads import one_thread
-from facerf_cli.workers import in_shards
+from facerf_cli.workers import in_shards, one_thread
 
 # Images unwrapped together: so many, but no more samples in memory than _VALUES_AT_ONCE.
 _IMAGES_AT_ONCE = 16

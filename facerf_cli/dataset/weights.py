@@ -37,7 +37,7 @@ from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.light.envmap import rotated_weights, texel_integrals
 from facerf_cli.logs import LOGGER_NAME, json_line
 from facerf_cli.synth.sky.skies import ProceduralMaps, draw_sky
-from facerf_cli.synth.threads import one_thread
+from facerf_cli.workers import one_thread
 
 _MOST_MAPS = 1_000_000
 _HEADS_AVERAGED = 16  # enough to find the vertical

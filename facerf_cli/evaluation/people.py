@@ -25,7 +25,7 @@ from facerf_cli.metrics import tone_of
 from facerf_cli.models import Models, Sides
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
-from facerf_cli.synth.appearance.pigments import skin_albedo
+from facerf_cli.synth.appearance.people import skin_albedo
 
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)

@@ -19,7 +19,7 @@ from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.random_fields import CANVAS_SPAN
 from facerf_cli.synth.shading import LOBES
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.views import StageCamera
 
 _LIGHT = "light.to_world"  # parameter that turns the light
 

@@ -25,15 +25,12 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.raster.camera import project
 from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sample
-from facerf_cli.synth.bake_renderer import irradiance_factors
-from facerf_cli.synth.facets import facets_of
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS
-from facerf_cli.synth.lenses import Lenses, lenses_in, reflections
-from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, unit, widened_lobes
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.renderer import Lenses, irradiance_factors, lenses_in, reflections
+from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, unit_along, widened_lobes
 from facerf_cli.synth.subjects import Subject
-from facerf_cli.synth.truth import truth_of
+from facerf_cli.synth.views import StageCamera, facets_of, truth_of
 
 _BOUNCE_ORDER = 3  # of the spherical harmonics that hold bounced light
 _HIGHLIGHTS = 12  # only the brightest lights have highlights
@@ -86,7 +83,7 @@ class PortraitPhoto:
     alpha: Tensor
     classes: Tensor
     albedo: Tensor  # [3, S, S] times alpha
-    normals: Tensor  # [3, S, S] unit, camera space; 0 off the person
+    normals: Tensor  # [3, S, S] unit_along, camera space; 0 off the person
     specular: Tensor  # [S, S] share of the person's radiance that highlights make, without those of lenses
 
 
@@ -190,7 +187,7 @@ def photograph(portrait: BakedPortrait, appearance: Appearance, weights: Tensor)
     albedo, normal = summed[:, 3:9].T.view(2, 3, side, side)
     classes = portrait.classes.permute(2, 0, 1).float() / 255
     alpha = lit.summed(torch.ones(len(portrait.pixel), 1)).view(side, side)
-    return PortraitPhoto(image, alpha, classes, albedo, unit(normal, 0), specular.view(side, side))
+    return PortraitPhoto(image, alpha, classes, albedo, unit_along(normal, 0), specular.view(side, side))
 
 
 def images_under(portrait: BakedPortrait, surface: MaterialPoints, weights: Tensor) -> Tensor:
@@ -223,7 +220,7 @@ class _Lit:
 
     @classmethod
     def of(cls, portrait: BakedPortrait, surface: MaterialPoints) -> "_Lit":
-        views = unit(-portrait.positions_m, 1)
+        views = unit_along(-portrait.positions_m, 1)
         hair = portrait.part == _HAIR
         strands = Strands(
             portrait.tangents.float()[hair], views[hair], surface.specular[hair], surface.roughness[hair]

@@ -57,7 +57,7 @@ def highlights(normals: Tensor, views: Tensor, lights: Tensor, skin: Skin) -> Te
     normals and views are unit fields [B, 3, T, T] in the frame of the lights.
     """
     n_dot_v = (normals * views).sum(1, keepdim=True).clamp_min(0.05)
-    half = unit(lights[..., None, None] + views[:, None], 2)  # [B, L, 3, T, T]
+    half = unit_along(lights[..., None, None] + views[:, None], 2)  # [B, L, 3, T, T]
     n_dot_h = (half * normals[:, None]).sum(2).clamp(0, 1)
     v_dot_h = (half * views[:, None]).sum(2).clamp(0, 1)
     n_dot_l = torch.einsum("blc,bcij->blij", lights, normals).clamp_min(0)
@@ -168,9 +168,9 @@ def _gaussian(angle: Tensor, sigma: Tensor) -> Tensor:
 
 def tilt_normals(normals: Tensor, tangents_u: Tensor, tangents_v: Tensor, relief: Tensor) -> Tensor:
     """Tilt unit normals [B, 3, T, T] by slopes [B, 2, T, T] along unit tangents [B, 3, T, T]."""
-    return unit(normals - relief[:, :1] * tangents_u - relief[:, 1:] * tangents_v, 1)
+    return unit_along(normals - relief[:, :1] * tangents_u - relief[:, 1:] * tangents_v, 1)
 
 
-def unit(vectors: Tensor, dim: int) -> Tensor:
+def unit_along(vectors: Tensor, dim: int) -> Tensor:
     """Scale vectors to length 1 along `dim`; much faster than `F.normalize` along a strided dimension."""
     return vectors * (vectors * vectors).sum(dim, keepdim=True).clamp_min(1e-12).rsqrt()

@@ -24,13 +24,12 @@ from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.raster.texture import bake_attributes
-from facerf_cli.synth import bake_renderer, path_tracer
+from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.lenses import lenses_in, over_lenses
-from facerf_cli.synth.stage_cameras import CAMERA_DISTANCE_M, Frame, StageCamera, stage_cameras
+from facerf_cli.synth.renderer import lenses_in, over_lenses
 from facerf_cli.synth.subjects import Subject, subject_model
-from facerf_cli.synth.truth import truth_of
+from facerf_cli.synth.views import CAMERA_DISTANCE_M, Frame, StageCamera, stage_cameras, truth_of
 
 Renderer = Literal["bake", "mitsuba"]
 _TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
@@ -137,10 +136,10 @@ def photograph_subject(
         two_sided=mesh.part == PARTS.index("hair"),
         clearance_m=clearance_m(mesh),
     )
-    irradiance = bake_renderer.scattered_irradiance(mesh, appearance, transport)
+    irradiance = renderer.scattered_irradiance(mesh, appearance, transport)
     images = (
         _with_lenses(
-            bake_renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)[0],
+            renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)[0],
             subject,
             camera,
             directions,

@@ -12,17 +12,15 @@ from facerf_cli.face.importers.source import EXPRESSION_STD
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
-from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
+from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.body import chin_height_m, draw_body
-from facerf_cli.synth.head.facial_strands import grow_beard, grow_lashes
 from facerf_cli.synth.head.glasses import draw_glasses
-from facerf_cli.synth.head.hair import draw_hair
+from facerf_cli.synth.head.hair import draw_hair, grow_beard, grow_lashes
 from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
-from facerf_cli.synth.head.headwear import Headwear, draw_headwear
-from facerf_cli.synth.head.held import draw_earrings, draw_hand, draw_microphone
 from facerf_cli.synth.head.mesh import HeadMesh, joined
-from facerf_cli.synth.truth import more_landmarks
+from facerf_cli.synth.head.worn import Headwear, draw_earrings, draw_hand, draw_headwear, draw_microphone
+from facerf_cli.synth.views import more_landmarks
 
 _SMALL_PX = 96  # images up to this side show coarse meshes
 _BODY_EDGE_M = 0.008  # mean length of an edge of body and garment, in larger images

@@ -18,7 +18,7 @@ from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import to_root
-from facerf_cli.synth.texture_samples import Sample, SampleSource
+from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 

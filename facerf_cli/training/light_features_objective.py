@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from facerf_cli.network.feature_networks import LightNetwork
 from facerf_cli.network.inputs import head_rotation, resize
-from facerf_cli.synth.texture_samples import SampleSource
+from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed

@@ -17,7 +17,7 @@ from facerf_cli.colour import srgb_to_linear
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20212

@@ -13,13 +13,7 @@ from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
 from facerf_cli.portrait.parse import LANDMARKS
-from facerf_cli.synth.transport_bank import (
-    TransportBankSettings,
-    load_view,
-    seen_in,
-    seen_path,
-    transport_of,
-)
+from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 

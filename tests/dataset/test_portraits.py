@@ -11,7 +11,7 @@ from facerf_cli.dataset.portraits import DatasetPortraits, open_dataset_portrait
 from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.square import SIDE_PX
-from facerf_cli.synth.portrait_samples import PortraitSample
+from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
 
 LACKS = 3

@@ -20,8 +20,8 @@ from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.raster.texture import unwrap
+from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.synth.sky.skies import ProceduralMaps
-from facerf_cli.synth.texture_samples import Sample
 from facerf_cli.training.loop import train
 from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings

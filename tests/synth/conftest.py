@@ -3,8 +3,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
-from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
+from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
 
 TINY = HeadBakeSettings(side=32, lights=20, bake=BakeSettings(light_samples=1, bounce_samples=2))
 

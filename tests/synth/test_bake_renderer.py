@@ -11,12 +11,12 @@ from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
-from facerf_cli.synth import bake_renderer
+from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
-from facerf_cli.synth.bake_renderer import RenderSettings, photograph, scattered_irradiance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
+from facerf_cli.synth.renderer import RenderSettings, photograph, scattered_irradiance
 from facerf_cli.synth.shading import LOBES
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.views import StageCamera
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
 POINT_LIGHT = BakeSettings(light_radius_deg=0, bounce_samples=0)
@@ -109,7 +109,7 @@ def test_pictures_do_not_depend_on_the_chunks(monkeypatch: pytest.MonkeyPatch) -
     irradiance = scattered_irradiance(head, person, transport)
 
     def images(chunk: int, settings: RenderSettings) -> torch.Tensor:
-        monkeypatch.setattr(bake_renderer, "_CHUNK", chunk)
+        monkeypatch.setattr(renderer, "_CHUNK", chunk)
         return photograph(head, person, transport, camera(32), settings, irradiance)[0]
 
     diffuse, full = RenderSettings(gloss=False, relief=False), RenderSettings()

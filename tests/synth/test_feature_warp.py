@@ -3,7 +3,7 @@
 import torch
 
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.synth.feature_warp import FeatureWarp
+from facerf_cli.synth.bank.parsing import FeatureWarp
 
 _MODEL = load_face_model("builtin")
 _MEAN = _MODEL.vertices(torch.zeros(1, len(_MODEL.identity)), torch.zeros(1, len(_MODEL.expression)))

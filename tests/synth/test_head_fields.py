@@ -1,7 +1,7 @@
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.synth.head_fields import lid_shadows
+from facerf_cli.synth.bank.texture_samples import lid_shadows
 from facerf_cli.synth.random_fields import Window, mask
 
 SIDE = 128

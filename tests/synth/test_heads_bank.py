@@ -10,10 +10,16 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.bake_heads import bake_head, bake_heads, draw_coefficients
-from facerf_cli.synth.heads_bank import Bank, load_bank
-from facerf_cli.synth.texture_samples import draw_light
-from facerf_cli.synth.views import ViewSettings, build_views
+from facerf_cli.synth.bank.heads import (
+    Bank,
+    ViewSettings,
+    bake_head,
+    bake_heads,
+    build_views,
+    draw_coefficients,
+    load_bank,
+)
+from facerf_cli.synth.bank.texture_samples import draw_light
 from tests.synth.conftest import TINY
 
 EXACT = ViewSettings(point_noise=0, group_noise=0, contour_noise=0, yaw_deg=0, pitch_deg=0, roll_deg=0)

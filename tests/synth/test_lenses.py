@@ -7,8 +7,8 @@ import torch
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth.head.mesh import HeadMesh, strandless
-from facerf_cli.synth.lenses import Lenses, lenses_in, over_lenses, reflections
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.renderer import Lenses, lenses_in, over_lenses, reflections
+from facerf_cli.synth.views import StageCamera
 
 RIG = rig_directions(150)
 SIDE = 32

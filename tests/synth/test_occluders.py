@@ -1,7 +1,7 @@
 import torch
 
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.occluders import with_occluders
+from facerf_cli.synth.bank.texture_samples import with_occluders
 from facerf_cli.synth.random_fields import Window
 
 SIDE, FACES = 64, 40

@@ -12,12 +12,12 @@ from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
-from facerf_cli.synth import bake_renderer, path_tracer
+from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
-from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.renderer import RenderSettings
+from facerf_cli.synth.views import StageCamera
 
 LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
 CAMERA = StageCamera(Camera(400, 60, 40, 24.0, 25.0), torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
@@ -78,7 +78,7 @@ def _both(settings: PathSettings) -> tuple[torch.Tensor, torch.Tensor, torch.Ten
     transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
     ours = RenderSettings(settings.bounces, False, settings.gloss, settings.relief)
     return (
-        *bake_renderer.photograph(head, person, transport, CAMERA, ours),
+        *renderer.photograph(head, person, transport, CAMERA, ours),
         *path_tracer.photograph(head, person, LIGHTS, CAMERA, settings),
     )
 
@@ -122,7 +122,7 @@ def test_highlights_are_the_same_in_both() -> None:
     bake = BakeSettings(light_radius_deg=0, bounce_samples=0)
     transport = bake_mesh(head.vertices, head.normals, head.triangles, LIGHTS, bake)
     plain = RenderSettings(0, False, True, False)
-    ours, coverage = bake_renderer.photograph(head, black, transport, CAMERA, plain)
+    ours, coverage = renderer.photograph(head, black, transport, CAMERA, plain)
     theirs, _ = path_tracer.photograph(head, black, LIGHTS, CAMERA, glossy)
     assert theirs[0].max() > 0.02
     assert _relative_rms(ours[:1], theirs[:1], coverage) < 0.15

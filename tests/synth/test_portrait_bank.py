@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
-from facerf_cli.synth import portrait_bank
-from facerf_cli.synth.portrait_bank import PortraitBankSettings, add_portraits, photos_of
+from facerf_cli.synth.bank import portraits
+from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, photos_of
 
 SMALL = PortraitBankSettings(views=2, photos=3, side_px=64)
 
@@ -50,8 +50,8 @@ def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         made.append(index)
         return {"of": torch.tensor([index])}
 
-    monkeypatch.setattr(portrait_bank, "photos_of", draw)
-    monkeypatch.setattr(portrait_bank, "in_shards", lambda work, items, jobs: work(items))
+    monkeypatch.setattr(portraits, "photos_of", draw)
+    monkeypatch.setattr(portraits, "in_shards", lambda work, items, jobs: work(items))
     add_portraits(tmp_path, ["a", "b"], range(3), 1, 0)
     add_portraits(tmp_path, ["a", "b"], range(4), 1, 0)
     assert made == [0, 1, 2, 3] and len(list(tmp_path.iterdir())) == 4

@@ -9,8 +9,8 @@ from safetensors.torch import save_file
 
 from facerf_cli.errors import InputError
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
-from facerf_cli.synth import portrait_crops
-from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank import parsing
+from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 
 SIDE, STORED = 64, 96
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -52,7 +52,7 @@ def drawn(portraits: StoredPortraits, seed: int) -> PortraitCrops:
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every sample shows a person, uncovered and whole."""
     for name in ("_EMPTY", "_HEADLESS", "_OCCLUDED", "_BORDERED", "_SECOND"):
-        monkeypatch.setattr(portrait_crops, name, 0.0)
+        monkeypatch.setattr(parsing, name, 0.0)
 
 
 def test_a_draw_is_a_function_of_its_generator(portraits: StoredPortraits) -> None:
@@ -96,7 +96,7 @@ def test_a_mirrored_photo_has_mirrored_landmarks(portraits: StoredPortraits) -> 
 
 
 def test_an_empty_crop_has_no_person(portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(portrait_crops, "_EMPTY", 1.0)
+    monkeypatch.setattr(parsing, "_EMPTY", 1.0)
     crop = drawn(portraits, 3)
     assert crop.present.tolist() == [0] and not crop.known.any() and not crop.alpha.any()
     assert crop.crops.std() > 0.01
@@ -106,7 +106,7 @@ def test_a_body_without_its_head_is_no_head(
     portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, share in (("_EMPTY", 0.0), ("_HEADLESS", 1.0), ("_BORDERED", 0.0)):
-        monkeypatch.setattr(portrait_crops, name, share)
+        monkeypatch.setattr(parsing, name, share)
     crops = [drawn(portraits, seed) for seed in range(12)]
     assert all(crop.present.tolist() == [0] and not crop.known.any() for crop in crops)
     assert not any(
@@ -120,9 +120,9 @@ def test_what_stands_before_a_person_is_background(
 ) -> None:
     covered = 0
     for seed in range(20):
-        monkeypatch.setattr(portrait_crops, "_OCCLUDED", 1.0)
+        monkeypatch.setattr(parsing, "_OCCLUDED", 1.0)
         with_one = drawn(portraits, seed)
-        monkeypatch.setattr(portrait_crops, "_OCCLUDED", 0.0)
+        monkeypatch.setattr(parsing, "_OCCLUDED", 0.0)
         without = drawn(portraits, seed)
         assert (with_one.alpha <= without.alpha + 1e-6).all()
         covered += int(float(with_one.alpha.sum()) < float(without.alpha.sum()) - 5)
@@ -132,7 +132,7 @@ def test_what_stands_before_a_person_is_background(
 def test_beyond_the_photos_border_nothing_is_known(
     portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(portrait_crops, "_BORDERED", 1.0)
+    monkeypatch.setattr(parsing, "_BORDERED", 1.0)
     crop = drawn(portraits, 5)
     outside = crop.weight[0, 0] == 0
     assert outside.all() and torch.equal(crop.crops[0, :, 0], crop.crops[0, :, 1])
@@ -151,10 +151,10 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
 ) -> None:
     """Each image over black, with decoys and without: the person stays, and shapes appear around it."""
     monkeypatch.setattr(StoredPortraits, "_background", lambda self, side, _: torch.zeros(3, side, side))
-    monkeypatch.setattr(portrait_crops, "_as_taken", lambda image, generator: image)
+    monkeypatch.setattr(parsing, "_as_taken", lambda image, generator: image)
     found = {}
     for share in (0.0, 1.0):
-        monkeypatch.setattr(portrait_crops, "_DECOYED", share)
+        monkeypatch.setattr(parsing, "_DECOYED", share)
         found[share] = [drawn(portraits, seed) for seed in range(8)]
     around = 0.0
     for plain, decoyed in zip(found[0.0], found[1.0], strict=True):
@@ -166,7 +166,7 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
     assert around > 0.01
     crop, colour = found[0.0][0], torch.tensor([0.4, 0.2, 0.1]).view(3, 1, 1)
     tinted = replace(crop, crops=crop.alpha[:, None] * colour)
-    seen = portrait_crops._with_decoys(torch.zeros(3, SIDE, SIDE), tinted, torch.Generator().manual_seed(1))
+    seen = parsing._with_decoys(torch.zeros(3, SIDE, SIDE), tinted, torch.Generator().manual_seed(1))
     assert seen[0].max() > 0.05
     torch.testing.assert_close(seen / colour, (seen[:1] / colour[0]).expand_as(seen))
 
@@ -175,7 +175,7 @@ def test_the_outline_lies_just_off_the_person() -> None:
     """Around a rectangle of an image that is not mirrored by chance: places are (x, y), within two pixels."""
     alpha = torch.zeros(SIDE, SIDE)
     alpha[10:20, 30:50] = 1
-    x, y = (portrait_crops._outline(alpha) * SIDE - 0.5).T
+    x, y = (parsing._outline(alpha) * SIDE - 0.5).T
     assert x.min() == 28 and x.max() == 51 and y.min() == 8 and y.max() == 21
     assert not alpha[y.long(), x.long()].any()
-    assert not len(portrait_crops._outline(torch.zeros(SIDE, SIDE)))
+    assert not len(parsing._outline(torch.zeros(SIDE, SIDE)))

@@ -15,9 +15,8 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
-from facerf_cli.synth import bake_renderer
+from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
-from facerf_cli.synth.bake_renderer import RenderSettings
 from facerf_cli.synth.head.mesh import PARTS, joined, strandless
 from facerf_cli.synth.portraits import (
     BakedPortrait,
@@ -27,8 +26,9 @@ from facerf_cli.synth.portraits import (
     save_portrait,
     visibility_of,
 )
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.subjects import Subject
+from facerf_cli.synth.views import StageCamera
 
 EAR = "left ear top"
 LIGHTS = rig_directions(24).numpy().astype(np.float64)
@@ -103,7 +103,7 @@ def test_it_shades_as_the_bake_renderer_does(
         two_sided=mesh.part == PARTS.index("hair"),
     )
     settings = RenderSettings(bounces=1, scattering=False, relief=False)
-    olats, _ = bake_renderer.photograph(mesh, other, transport, camera, settings)
+    olats, _ = renderer.photograph(mesh, other, transport, camera, settings)
     expected = torch.einsum("lchw,lc->chw", olats, weights(seed))
     photo = photograph(portrait, other, weights(seed))
     # Bytes of irradiance and smooth harmonics of the bounce, whose white balls tint it by one mean albedo.

@@ -10,7 +10,7 @@ from facerf_cli.synth.shading import (
     scatter,
     strand_highlights,
     tilt_normals,
-    unit,
+    unit_along,
 )
 
 
@@ -54,11 +54,11 @@ def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
     radius = (1 - z * z).sqrt()
     lights = torch.stack([radius * turn.cos(), radius * turn.sin(), z], -1)[None]
     normals = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1)
-    view = unit(torch.tensor([0.5, 0.0, 1.0]), 0).view(1, 3, 1, 1)
+    view = unit_along(torch.tensor([0.5, 0.0, 1.0]), 0).view(1, 3, 1, 1)
     mirror = _skin(1, specular=1.0, roughness=0.4)
     reflected = highlights(normals, view, lights, mirror).sum() * (2 * math.pi / count) / math.pi
     assert 0.6 < reflected < 1.01
-    light = unit(torch.tensor([0.0, 0.6, 0.8]), 0)
+    light = unit_along(torch.tensor([0.0, 0.6, 0.8]), 0)
     there = highlights(normals, view, light.view(1, 1, 3), _skin(1))[0, 0, 0, 0] / 0.8
     back = (
         highlights(normals, light.view(1, 3, 1, 1), view.view(1, 1, 3), _skin(1))[0, 0, 0, 0]
@@ -68,7 +68,7 @@ def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
 
 
 def test_flat_relief_leaves_normals_alone() -> None:
-    normals = unit(torch.randn(1, 3, 4, 4), 1)
+    normals = unit_along(torch.randn(1, 3, 4, 4), 1)
     assert torch.allclose(
         tilt_normals(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6
     )

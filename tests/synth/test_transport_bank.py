@@ -13,10 +13,9 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.square import SIDE_PX
-from facerf_cli.synth import transport_bank
-from facerf_cli.synth.portrait_samples import PortraitSample, StoredTransport
-from facerf_cli.synth.portraits import albedo_of, images_under
-from facerf_cli.synth.transport_bank import (
+from facerf_cli.synth.bank import transport
+from facerf_cli.synth.bank.portrait_samples import PortraitSample, StoredTransport
+from facerf_cli.synth.bank.transport import (
     StoredView,
     TransportBankSettings,
     add_transport,
@@ -25,6 +24,7 @@ from facerf_cli.synth.transport_bank import (
     seen_path,
     transport_of,
 )
+from facerf_cli.synth.portraits import albedo_of, images_under
 
 SMALL = TransportBankSettings(views=2, looks=2, lights=14)
 
@@ -117,7 +117,7 @@ def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
 
 def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
     """Normals, lights, shadows and their summary are mirrored alike."""
-    from facerf_cli.synth.portrait_samples import mirrored
+    from facerf_cli.synth.bank.portrait_samples import mirrored
 
     sample = drawn(folder, 2)
     other = mirrored(sample)
@@ -148,8 +148,8 @@ def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         made.append(index)
         return [{"of": torch.tensor([index])}] * settings.views
 
-    monkeypatch.setattr(transport_bank, "transport_of", draw)
-    monkeypatch.setattr(transport_bank, "in_shards", lambda work, items, jobs: work(items))
+    monkeypatch.setattr(transport, "transport_of", draw)
+    monkeypatch.setattr(transport, "in_shards", lambda work, items, jobs: work(items))
     add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
     add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
     assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6

@@ -10,11 +10,10 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, Material
-from facerf_cli.synth.bake_heads import mean_coefficients
+from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
-from facerf_cli.synth.stage_cameras import StageCamera
-from facerf_cli.synth.truth import more_landmarks, truth_of
+from facerf_cli.synth.views import StageCamera, more_landmarks, truth_of
 
 SIDE_PX, RADIUS_M, FAR_M = 64, 0.05, 10.0
 

@@ -5,8 +5,8 @@ import torch
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import rotation_to_pose
-from facerf_cli.synth.stage_cameras import stage_cameras
 from facerf_cli.synth.subjects import draw_subject, subject_model
+from facerf_cli.synth.views import stage_cameras
 from tools.talking_head import Actor, seen_from, turned
 
 

@@ -2,8 +2,8 @@ import torch
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.diffuse_sh import DiffuseEstimate, DiffuseNetwork, DiffuseSettings
-from facerf_cli.synth.heads_bank import Bank
-from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.diffuse_sh_objective import (
     DiffuseObjective,
     SumSettings,

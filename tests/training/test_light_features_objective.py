@@ -6,8 +6,8 @@ from torch import Tensor
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.synth.heads_bank import Bank
-from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
 from facerf_cli.training.objective import seeded
 from tests.toy_faces import ToyFaces

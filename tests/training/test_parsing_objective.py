@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from facerf_cli.network.parsing import Parsing, ParsingNetwork, ParsingSettings
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.parse import LANDMARKS
-from facerf_cli.synth.portrait_crops import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.parsing_objective import ParsingObjective, ParsingObjectiveSettings
 
 SIDE = 8

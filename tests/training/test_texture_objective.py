@@ -13,8 +13,8 @@ from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.inputs import colour_cast
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
-from facerf_cli.synth.heads_bank import Bank
-from facerf_cli.synth.texture_samples import Sample
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.loop import train
 from facerf_cli.training.losses import root_loss
 from facerf_cli.training.objective import concatenate, seeded

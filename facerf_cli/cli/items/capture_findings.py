@@ -24,8 +24,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.logs import LOGGER_NAME, STDERR, counted, json_line, one_line
-from facerf_cli.synth.threads import one_thread
-from facerf_cli.workers import process_died, spread
+from facerf_cli.workers import one_thread, process_died, spread
 
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
 _ROWS_LIMIT_BYTES = 256 << 20

@@ -48,7 +48,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.logs import LOGGER_NAME
-from facerf_cli.synth.threads import one_thread
+from facerf_cli.workers import one_thread
 
 log = logging.getLogger(LOGGER_NAME)
 

@@ -10,7 +10,7 @@ from facerf_cli.cli.synth_stage import SynthStage
 from facerf_cli.synth.path_tracer import load_mitsuba
 from facerf_cli.synth.stage import StageSettings, close_capture, open_capture, write_subject
 from facerf_cli.synth.subjects import draw_subject, subject_model
-from facerf_cli.synth.threads import one_thread
+from facerf_cli.workers import one_thread
 
 
 def photograph_people(options: SynthStage) -> int:

@@ -10,12 +10,11 @@ from torch import Tensor
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
-from facerf_cli.synth.backgrounds import load_backgrounds
-from facerf_cli.synth.head.makehuman import MAKEHUMAN_LICENCE
-from facerf_cli.synth.portrait_bank import PortraitBankSettings, add_portraits
-from facerf_cli.synth.portrait_crops import StoredPortraits
-from facerf_cli.synth.portrait_samples import PortraitSource, StoredTransport
-from facerf_cli.synth.transport_bank import TransportBankSettings, add_proxies, add_transport
+from facerf_cli.synth.bank.parsing import StoredPortraits
+from facerf_cli.synth.bank.portrait_samples import PortraitSource, StoredTransport
+from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, load_backgrounds
+from facerf_cli.synth.bank.transport import TransportBankSettings, add_proxies, add_transport
+from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.parsing_objective import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.portrait_objective import PortraitObjective, PortraitObjectiveSettings
 

@@ -35,12 +35,11 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance import make_reflectance_network
-from facerf_cli.synth.bake_heads import HeadBakeSettings, bake_heads
-from facerf_cli.synth.face_crops import RenderedFaces
-from facerf_cli.synth.head_images import add_head_images
-from facerf_cli.synth.heads_bank import Bank, add_views, load_bank
-from facerf_cli.synth.portrait_samples import PortraitSource
-from facerf_cli.synth.texture_samples import SampleSource
+from facerf_cli.synth.bank.face_crops import RenderedFaces
+from facerf_cli.synth.bank.head_images import add_head_images
+from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
+from facerf_cli.synth.bank.portrait_samples import PortraitSource
+from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.training.appearance_objective import AppearanceObjective
 from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings

@@ -8,9 +8,13 @@ from torch import Tensor
 
 from facerf_cli.metrics import ita_deg
 from facerf_cli.raster.texture import texel_centres_uv
-from facerf_cli.synth.appearance.eye_textures import eyeball_textures
-from facerf_cli.synth.appearance.people import People, draw_people, parameters_of
-from facerf_cli.synth.appearance.pigments import hair_albedo
+from facerf_cli.synth.appearance.people import (
+    People,
+    draw_people,
+    eyeball_textures,
+    hair_albedo,
+    parameters_of,
+)
 from facerf_cli.synth.appearance.skin import bare_skin, paint_skin, scattering_mm
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_noise

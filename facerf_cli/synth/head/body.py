@@ -13,18 +13,19 @@ from facerf_cli.face.topology import LANDMARK_UV, cylinder_uv
 from facerf_cli.light.transport import build_scene, hits_within
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.makehuman import GARMENTS, packed_mesh
 from facerf_cli.synth.head.mesh import (
+    GARMENTS,
     PARTS,
     HeadMesh,
     cloth_like,
     joined,
     kept_triangles,
+    loop_step,
+    packed_mesh,
     smoothstep,
     strandless,
 )
-from facerf_cli.synth.head.neckwear import draw_neckwear
-from facerf_cli.synth.head.subdivision import loop_step
+from facerf_cli.synth.head.worn import draw_neckwear
 
 _CHIN = 8  # landmark
 _LOWEST_CHIN_M = -0.085  # limit of the chin's height, so that an open mouth does not move the body

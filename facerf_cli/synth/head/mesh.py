@@ -1,12 +1,29 @@
-"""The mesh of a synthetic head in named parts, and the arithmetic that the builders of the parts share."""
+"""Meshes of heads and what is worn: their parts and classes, subdivision, hulls, and packed MakeHuman meshes.
 
+As a matrix from old to new vertices, which serves all shapes, colours and labels of a mesh at once; trimesh's
+`subdivide_loop` gives the vertices of one shape.
+
+The field is that of a capsule: above the middle of the skull a point is measured along the ray from that
+middle, below it along the horizontal from the vertical line through it. Crown, neck and shoulders thus all
+have one radius for each azimuth and arc. Arc is 0 at the height of the middle, positive above, negative
+below.
+"""
+
+import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.resources import files
 
 import numpy as np
 import torch
+from safetensors.numpy import load
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from scipy.sparse import coo_matrix, csr_matrix
 
+from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, LANDMARK_UV, TOP_M, inside_mm
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.labels import part_class
+from facerf_cli.synth.head.cranium import average_head_mm
 
 PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame", "hat")  # of HeadMesh.part, by index
 CLOTH_M = 0.5  # size of the texture of cloth
@@ -131,3 +148,236 @@ def smoothstep(value: np.ndarray, start: float = 0.0, end: float = 1.0) -> np.nd
 def arc_lengths(points: np.ndarray) -> np.ndarray:
     """Arc length [N] from the first point to each point of a polyline [N, C]."""
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
+
+
+CLASS_OF_PART = {
+    "skin": "skin",
+    "eye": "eyes",
+    "mouth": "mouth",
+    "teeth": "mouth",
+    "cloth": "garment",
+    "hair": "hair",
+    "frame": "glasses",
+    "hat": "headwear",
+}
+# Lower edge of the face on the mean head: height in metres at an azimuth in degrees, the same on both sides.
+# It follows the jaw to the lobe of the ear, then the nape below the hair.
+_JAW_DEG = (0, 15, 27, 38, 50, 65, 80, 95, 110, 180)
+_JAW_M = (-0.0755, -0.072, -0.064, -0.053, -0.046, -0.042, -0.041, -0.046, -0.05, -0.058)
+# The ear on the mean head juts out from it, between these azimuths and heights.
+_EAR_DEG, _EAR_M, _EAR_OUT_MM = (66.0, 125.0), (-0.045, 0.06), 4.0
+_MARGIN_UV = 0.02  # around the landmarks, within which features of the face are looked for
+
+
+def part_class(part: str) -> int:
+    """Class that all of a part has, unless its builder says otherwise."""
+    return class_index(CLASS_OF_PART[part])
+
+
+def skin_classes(uv: np.ndarray) -> np.ndarray:
+    """Classes [V] uint8 of skin at (u, v) [V, 2] of the continued UV map; ears: see `ears_of`."""
+    classes = np.full(len(uv), class_index("skin"), np.uint8)
+    azimuth_deg, height_m = _place(uv)
+    classes[height_m < np.interp(np.abs(azimuth_deg), _JAW_DEG, _JAW_M)] = class_index("neck")
+    low, high = LANDMARK_UV[17:].min(0) - _MARGIN_UV, LANDMARK_UV[17:].max(0) + _MARGIN_UV
+    central = np.flatnonzero(((uv > low) & (uv < high)).all(-1))
+    left = uv[central].copy()
+    left[:, 0] = np.minimum(left[:, 0], 1 - left[:, 0])
+    classes[central[inside_mm("brows", left) > 0]] = class_index("brows")
+    classes[central[inside_mm("lips", uv[central]) > 0]] = class_index("lips")
+    return classes
+
+
+def ears_of(mean_m: np.ndarray) -> np.ndarray:
+    """[V] bool: the ears of a mean head [V, 3], where it juts out."""
+    azimuth_deg, height_m = np.degrees(np.arctan2(mean_m[:, 0], mean_m[:, 2])), mean_m[:, 1]
+    around = np.abs(azimuth_deg)
+    near = (around > _EAR_DEG[0]) & (around < _EAR_DEG[1])
+    near &= (height_m > _EAR_M[0]) & (height_m < _EAR_M[1])
+    smooth = average_head_mm(
+        0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG), (TOP_M - height_m) / (TOP_M - BOTTOM_M)
+    )
+    out_mm = 1000 * np.hypot(mean_m[:, 0], mean_m[:, 2]) - np.hypot(smooth[:, 0], smooth[:, 2])
+    found: np.ndarray = near & (out_mm > _EAR_OUT_MM)
+    return found
+
+
+def _place(uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth in degrees and height in metres [V] of places of the UV map on the mean head."""
+    return (uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG, TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)
+
+
+def loop_step(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
+    """One step of Loop's subdivision for triangles [F, 3] of `count` vertices.
+
+    Returns the matrix [count + E, count] from old to new vertices (the old ones first, then one per edge)
+    and the new triangles [4 F, 3]. Vertices of no triangle stay; a border is smoothed as a separate curve.
+    """
+    sides = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    opposite = triangles[:, [2, 0, 1]].reshape(-1)
+    edges, edge = np.unique(np.sort(sides, -1), axis=0, return_inverse=True)
+    edge = edge.reshape(-1)
+    inner = np.bincount(edge, minlength=len(edges)) == 2
+
+    new = count + np.arange(len(edges))
+    entries = [(new, edges[:, end], np.where(inner, 3 / 8, 1 / 2)) for end in (0, 1)]
+    entries.append((new[edge[inner[edge]]], opposite[inner[edge]], np.array(1 / 8)))
+    entries += _old_vertices(edges, inner, count)
+    rows, columns, weights = zip(*entries, strict=True)
+    weights = [np.broadcast_to(weight, row.shape) for row, weight in zip(rows, weights, strict=True)]
+    step = coo_matrix(
+        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
+        shape=(count + len(edges), count),
+    ).tocsr()
+
+    ab, bc, ca = (count + edge.reshape(-1, 3)).T
+    a, b, c = triangles.T
+    divided = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1).reshape(-1, 3)
+    return step, divided
+
+
+def _old_vertices(
+    edges: np.ndarray, inner: np.ndarray, count: int
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Matrix entries (rows, columns, weights) of the old vertices; edges [E, 2], inner [E] bool."""
+    border = np.zeros(count, bool)
+    border[edges[~inner]] = True
+    both = np.concatenate([edges, edges[:, ::-1]])
+    both_inner = np.concatenate([inner, inner])
+    valence = np.bincount(both[:, 0], minlength=count)
+    share = np.zeros(count)
+    regular = valence > 0
+    share[regular] = _neighbour_weight(valence[regular])
+    smooth = both[~border[both[:, 0]]]
+    rim = both[~both_inner]
+    rim_valence = np.bincount(rim[:, 0], minlength=count)
+    every = np.arange(count)
+    own = np.where(border, np.where(rim_valence == 2, 3 / 4, 1.0), 1 - valence * share)
+    return [
+        (smooth[:, 0], smooth[:, 1], share[smooth[:, 0]]),
+        (rim[:, 0], rim[:, 1], np.where(rim_valence[rim[:, 0]] == 2, 1 / 8, 0.0)),
+        (every, every, own),
+    ]
+
+
+def _neighbour_weight(valence: np.ndarray) -> np.ndarray:
+    """Weight of each neighbour of an old vertex inside the surface, by its number of neighbours."""
+    return (5 / 8 - (3 / 8 + np.cos(2 * math.pi / valence) / 4) ** 2) / valence
+
+
+def quartered(uv: np.ndarray) -> np.ndarray:
+    """Corners [4 F, 3, 2] of the four triangles that `loop_step` makes of each triangle, in its order."""
+    a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1)
+    return corners.reshape(-1, 3, 2)
+
+
+_AZIMUTHS = 96
+_ARC_M = 0.004  # height of a cell
+HULL_RADIUS_M = 0.09  # arc per radian of elevation
+_LOWEST_M = -0.36  # arc of the lowest row
+_MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skull, above the ears
+_SLICE_M = (0.07, 0.09)  # range of heights in which front and back of the skull are measured
+_STEP_M = 0.002  # step over which the slope of the field is measured
+_SMOOTH_CELLS = 0.8  # sigma of the Gaussian that smooths the field
+_OUTER = [PARTS.index("skin"), PARTS.index("cloth")]  # parts that the field covers
+
+
+@dataclass(frozen=True, eq=False)
+class Hull:
+    """Radius [rows, azimuths] in metres of the outermost surface around `middle` [3]; smooth and closed."""
+
+    middle: np.ndarray
+    radius: np.ndarray
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Distance [...] of points [..., 3] outside the hull, along the capsule's ray; negative inside."""
+        out, azimuth, arc = self._coordinates(points)
+        column = azimuth / (2 * np.pi) * _AZIMUTHS
+        row = np.clip((arc - _LOWEST_M) / _ARC_M, 0, len(self.radius) - 1)
+        padded = np.concatenate([self.radius, self.radius[:, :1]], 1)
+        return out - map_coordinates(padded, [row, column % _AZIMUTHS], order=1, mode="nearest")
+
+    def rays(self, points: np.ndarray) -> np.ndarray:
+        """The unit direction [..., 3] in which the height of points [..., 3] is measured."""
+        offset = points - self.middle
+        offset = np.stack([offset[..., 0], np.maximum(offset[..., 1], 0), offset[..., 2]], -1)
+        return unit(offset)
+
+    def normals(self, points: np.ndarray) -> np.ndarray:
+        """Unit normals [..., 3] of the level surfaces of height through points [..., 3]."""
+        here = self.height(points)
+        slope = np.stack([self.height(points + step) - here for step in np.eye(3) * _STEP_M], -1)
+        return unit(slope)
+
+    def lifted(self, points: np.ndarray, least: np.ndarray | float) -> np.ndarray:
+        """Points [..., 3] after those lower than `least` [...] are pushed out to that height."""
+        short = np.maximum(least - self.height(points), 0)
+        return points + short[..., None] * self.rays(points)
+
+    def _coordinates(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Radius, azimuth in 0..2 pi and arc [...] of points [..., 3]."""
+        x, y, z = np.moveaxis(points - self.middle, -1, 0)
+        level = np.hypot(x, z)
+        above = np.maximum(y, 0)
+        arc = np.where(y > 0, HULL_RADIUS_M * np.arctan2(above, level), y)
+        return np.hypot(level, above), np.arctan2(x, z) % (2 * np.pi), arc
+
+
+def hull_of(head: HeadMesh) -> Hull:
+    """Build the hull of a head's skin and clothes, if it wears any."""
+    corners = head.vertices[head.triangles[np.isin(head.part[head.triangles[:, 0]], _OUTER)]].astype(float)
+    coarse = corners[np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1) > _ARC_M]
+    sampled = [corners.mean(1), corners[:, 0], *(coarse[:, k] for k in (1, 2))]
+    points = np.concatenate([*sampled, *((coarse[:, k] + coarse[:, k - 1]) / 2 for k in range(3))])
+    hull = Hull(_middle(points), np.zeros((1, _AZIMUTHS)))
+    out, azimuth, arc = hull._coordinates(points)
+    rows = int((np.pi / 2 * HULL_RADIUS_M - _LOWEST_M) / _ARC_M) + 2
+    row = np.clip(np.rint((arc - _LOWEST_M) / _ARC_M).astype(int), 0, rows - 1)
+    column = np.rint(azimuth / (2 * np.pi) * _AZIMUTHS).astype(int) % _AZIMUTHS
+    radius = np.zeros((rows, _AZIMUTHS))
+    np.maximum.at(radius, (row, column), out)
+    return Hull(hull.middle, gaussian_filter(_filled(radius), _SMOOTH_CELLS, mode=("nearest", "wrap")))
+
+
+def _middle(points: np.ndarray) -> np.ndarray:
+    """The capsule's middle [3], halfway between the forehead and the back of the skull."""
+    belt = points[(points[:, 1] > _SLICE_M[0]) & (points[:, 1] < _SLICE_M[1])]
+    return np.array([0, _MIDDLE_M, (belt[:, 2].min() + belt[:, 2].max()) / 2])
+
+
+def _filled(radius: np.ndarray) -> np.ndarray:
+    """Give cells that hold no point the radius of the nearest cell that does, also across the wrap-around."""
+    third = radius.shape[1]
+    tiled = np.tile(radius, (1, 3))
+    nearest = distance_transform_edt(tiled == 0, return_distances=False, return_indices=True)
+    return tiled[tuple(nearest)][:, third : 2 * third]
+
+
+MAKEHUMAN_LICENCE = "bodies and clothes: CC0 1.0 (MakeHuman)"
+STEP_M = 2e-5  # unit of the stored coordinates
+GARMENTS = (
+    "tee",
+    "loose tee",
+    "v-neck",
+    "round neck",
+    "blouse",
+    "sweater",
+    "polo",
+    "shirt",
+    "jacket",
+    "suit",
+)
+
+
+def packed_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] (m, the middle of the neck at the origin) and triangles [F, 3] of a packed shape."""
+    tensors = _tensors()
+    vertices = tensors[f"{name}.vertices"].astype(np.float64) * STEP_M
+    return vertices, tensors[f"{name}.triangles"].astype(np.int64)
+
+
+@lru_cache(maxsize=1)
+def _tensors() -> dict[str, np.ndarray]:
+    return load(files("facerf_cli.assets").joinpath("makehuman.safetensors").read_bytes())

@@ -8,9 +8,11 @@ from facerf_cli.colour import lab_d65
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.metrics import ita_deg
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.synth.appearance.people import RANDOM_TEXTURES, People, draw_people
-from facerf_cli.synth.appearance.pigments import (
+from facerf_cli.synth.appearance.people import (
+    RANDOM_TEXTURES,
     WAVELENGTHS_NM,
+    People,
+    draw_people,
     hair_albedo,
     observer_weights,
     skin_albedo,

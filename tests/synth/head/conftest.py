@@ -1,7 +1,7 @@
 import pytest
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.synth.bake_heads import mean_coefficients
+from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
 

@@ -7,10 +7,9 @@ import torch
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.synth.head import body, neckwear
+from facerf_cli.synth.head import body, worn
 from facerf_cli.synth.head.body import chin_height_m, draw_body
-from facerf_cli.synth.head.makehuman import GARMENTS, packed_mesh
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.mesh import GARMENTS, PARTS, HeadMesh, packed_mesh
 
 SIDE_PX, SIDE_M, FAR_M = 160, 0.56, 60.0
 
@@ -71,14 +70,14 @@ def test_bare_shoulders_are_one_surface_with_the_neck(head: HeadMesh, plain: pyt
     assert (classes[rows(chin - 0.2, chin - 0.25), columns(0.08)] == class_index("garment")).mean() > 0.99
 
 
-@pytest.mark.parametrize("kind", neckwear.NECKWEAR)
+@pytest.mark.parametrize("kind", worn.NECKWEAR)
 def test_neckwear_lies_around_the_neck(head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neckwear, "NECKWEAR", (kind,))
+    monkeypatch.setattr(worn, "NECKWEAR", (kind,))
     chin = chin_height_m(head)
-    worn = neckwear.draw_neckwear(head, chin, np.random.default_rng(4))
-    assert (worn.part == PARTS.index("cloth")).all()
-    assert worn.vertices[:, 1].max() < chin and worn.vertices[:, 1].min() > chin - 0.17
-    a, b, c = (worn.vertices[worn.triangles[:, k]].astype(float) for k in range(3))
+    cloth = worn.draw_neckwear(head, chin, np.random.default_rng(4))
+    assert (cloth.part == PARTS.index("cloth")).all()
+    assert cloth.vertices[:, 1].max() < chin and cloth.vertices[:, 1].min() > chin - 0.17
+    a, b, c = (cloth.vertices[cloth.triangles[:, k]].astype(float) for k in range(3))
     outward = (a + b + c) / 3 * [1, 0, 1]
     outer = np.linalg.norm(outward, axis=-1) > np.quantile(np.linalg.norm(outward, axis=-1), 0.6)
     assert ((np.cross(b - a, c - a) * outward).sum(-1)[outer] > 0).mean() > 0.9

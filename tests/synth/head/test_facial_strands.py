@@ -5,10 +5,9 @@ import pytest
 
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.head.facial_strands import grow_beard, grow_lashes
-from facerf_cli.synth.head.held import draw_earrings, draw_hand, draw_microphone
-from facerf_cli.synth.head.hull import hull_of
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.hair import grow_beard, grow_lashes
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, hull_of
+from facerf_cli.synth.head.worn import draw_earrings, draw_hand, draw_microphone
 
 FULL = {"beard": 1.0, "moustache": 1.0, "goatee": 0.0}
 

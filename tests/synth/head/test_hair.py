@@ -7,10 +7,16 @@ import pytest
 
 from facerf_cli.face.topology import cylinder_uv
 from facerf_cli.synth.head.hair import draw_hair, grow_hair
-from facerf_cli.synth.head.hair_styles import STYLES, HairStyle, draw_style, scalp_cover, scalp_margin_m
-from facerf_cli.synth.head.hair_tails import ROWS, tail_paths
-from facerf_cli.synth.head.hull import hull_of
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.hair_styles import (
+    ROWS,
+    STYLES,
+    HairStyle,
+    draw_style,
+    scalp_cover,
+    scalp_margin_m,
+    tail_paths,
+)
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, hull_of
 
 Hairs = dict[str, tuple[HairStyle, HeadMesh]]
 HAIRY = tuple(name for name in STYLES if name != "bald")

@@ -13,8 +13,7 @@ from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.synth.head import heads
 from facerf_cli.synth.head.heads import build_head
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.head.subdivision import loop_step
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, loop_step
 
 FULL = 1 / 0.3  # the coefficient of a whole blendshape
 

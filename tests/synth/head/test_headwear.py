@@ -5,16 +5,16 @@ import pytest
 import trimesh
 
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.head import headwear
+from facerf_cli.synth.head import worn
 from facerf_cli.synth.head.body import chin_height_m
 from facerf_cli.synth.head.hair import grow_hair
 from facerf_cli.synth.head.hair_styles import draw_style
-from facerf_cli.synth.head.headwear import HEADWEAR, Headwear, draw_headwear
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.worn import HEADWEAR, Headwear, draw_headwear
 
 
 def drawn(head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch) -> Headwear:
-    monkeypatch.setattr(headwear, "HEADWEAR", (kind,))
+    monkeypatch.setattr(worn, "HEADWEAR", (kind,))
     return draw_headwear(head, chin_height_m(head), np.random.default_rng(7))
 
 

@@ -4,8 +4,7 @@ import numpy as np
 
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.synth.head.labels import ears_of, part_class, skin_classes
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, ears_of, part_class, skin_classes
 
 
 def near(head: HeadMesh, place_m: np.ndarray) -> str:

@@ -17,10 +17,9 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import TOP_M, UV_SIZE_MM, grid_triangles, grid_uv, inside_mm
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.synth.bake_heads import HeadBakeSettings, draw_coefficients
-from facerf_cli.synth.head.eyes import RADIUS_MM
+from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
-from facerf_cli.synth.head.shell import shell_head
+from facerf_cli.synth.head.shell import EYEBALL_RADIUS_MM, shell_head
 
 FACES = ("mean", "jaw_open", "blink", "half_blink", *range(4))
 AWAY_FROM_CUTS_MM = 2.5
@@ -168,14 +167,14 @@ def test_eyeballs_stay_behind_the_lids(which: str | int) -> None:
     for side in (-1, 1):
         points = mesh.vertices[np.unique(balls[mesh.vertices[balls[:, 0], 0] * side > 0])] * 1000.0
         centre = (points.min(0) + points.max(0)) / 2
-        centre[2] = points[:, 2].min() + RADIUS_MM
-        assert abs(np.linalg.norm(points - centre, axis=-1).min() - RADIUS_MM) < 0.01
+        centre[2] = points[:, 2].min() + EYEBALL_RADIUS_MM
+        assert abs(np.linalg.norm(points - centre, axis=-1).min() - EYEBALL_RADIUS_MM) < 0.01
         around = np.linalg.norm(skin[:, :2] - centre[:2], axis=-1) < 16
         ahead = around & (skin[:, 2] > centre[2])
         outer = np.minimum(uv[:, 0], 1 - uv[:, 0])
         near = np.flatnonzero(ahead)
         near = near[inside_mm("eyes", np.stack([outer, uv[:, 1]], -1)[near]) < -0.3]
-        assert np.linalg.norm(skin[near] - centre, axis=-1).min() > RADIUS_MM + 0.3
+        assert np.linalg.norm(skin[near] - centre, axis=-1).min() > EYEBALL_RADIUS_MM + 0.3
 
 
 def seen_parts(mesh: HeadMesh, yaw: float = 0, pitch: float = 0) -> dict[str, int]:

@@ -5,12 +5,12 @@ import pytest
 import trimesh
 
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.synth.bake_heads import mean_coefficients
+from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head import glasses
 from facerf_cli.synth.head.body import chin_height_m, draw_body
 from facerf_cli.synth.head.glasses import GLASSES, draw_glasses
-from facerf_cli.synth.head.headwear import draw_headwear
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.worn import draw_headwear
 
 
 @pytest.fixture(scope="module")

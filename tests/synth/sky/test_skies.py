@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.synth.sky.clouds import Layer, add_clouds
 from facerf_cli.synth.sky.daylight import SUN_RADIUS_DEG
-from facerf_cli.synth.sky.landscape import Land, Skyline, add_land, sun_is_visible
+from facerf_cli.synth.sky.interiors import Lights, draw_room
+from facerf_cli.synth.sky.outdoors import Land, Layer, Skyline, add_clouds, add_land, sun_is_visible
 from facerf_cli.synth.sky.painting import (
     Rectangle,
     disc,
@@ -17,7 +17,6 @@ from facerf_cli.synth.sky.painting import (
     sample_tile,
     toward,
 )
-from facerf_cli.synth.sky.rooms import Lights, draw_room
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of, parse_envmaps
 
 UP, NO_BEAM = np.array([0.0, 1.0, 0.0]), np.zeros(3)

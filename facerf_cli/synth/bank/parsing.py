@@ -1,6 +1,10 @@
 """Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
 
-A stored photo (`portrait_bank.py`) is mirrored or not, turned, scaled and shifted in the crop, over a
+Synthetic people have brows and lips painted at the same places of one mesh. A network that is trained on them
+guesses where these are from the rest of the face; real brows lie higher or lower, and real lips are thinner
+or thicker.
+
+A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a
 background, sometimes with another person in it or something before the face. A camera then degrades it.
 Wide variation is what makes training on synthetic people serve for real ones (Wood et al., *Fake it till you
 make it*, 2021).
@@ -25,10 +29,63 @@ from facerf_cli.errors import InputError
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.synth.backgrounds import background_of
-from facerf_cli.synth.face_crops import blurred
-from facerf_cli.synth.feature_warp import FeatureWarp
+from facerf_cli.synth.bank.face_crops import gaussian_blurred
+from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.random_fields import Uniform
+
+_FEATURES = (slice(17, 22), slice(22, 27), slice(27, 36), slice(36, 42), slice(42, 48), slice(48, 68))
+_REACHES = (0.10, 0.10, 0.12, 0.08, 0.08, 0.13)  # standard deviations, in extents of the 68 landmarks
+_MOVE_STD = 0.02  # in extents
+_STRETCH_STD = 0.15
+_MOST = 2.0  # standard deviations; beyond it a warp could fold
+_ROUNDS = 8  # of the search for the place that is taken from another; each lowers its error threefold
+
+
+@dataclass(frozen=True)
+class FeatureWarp:
+    """A smooth warp of the plane: what is shown at p is taken from p + `shift(p)`; all in pixels.
+
+    Of each of K features: its centre [K, 2] and reach [K], how far it moves [K, 2], and how much it is
+    stretched [K, 2] along x and y.
+    """
+
+    centres: Tensor
+    reaches: Tensor
+    moves: Tensor
+    stretches: Tensor
+
+    @staticmethod
+    def draw(landmarks_px: Tensor, generator: torch.Generator) -> "FeatureWarp":
+        """Draw a warp of a face with landmarks [68, 2]."""
+        extent = (landmarks_px.amax(0) - landmarks_px.amin(0)).max()
+        moves, stretches = (
+            torch.randn(2, len(_FEATURES), 2, generator=generator).clamp(-_MOST, _MOST).unbind()
+        )
+        return FeatureWarp(
+            centres=torch.stack([landmarks_px[feature].mean(0) for feature in _FEATURES]),
+            reaches=extent * torch.tensor(_REACHES),
+            moves=extent * _MOVE_STD * moves,
+            stretches=_STRETCH_STD * stretches,
+        )
+
+    def shift(self, places: Tensor) -> Tensor:
+        """Offsets from places [..., 2] to those that are shown there."""
+        total = torch.zeros_like(places)
+        for centre, reach, move, stretch in zip(
+            self.centres, self.reaches, self.moves, self.stretches, strict=True
+        ):
+            off = places - centre
+            weight = torch.exp(-0.5 * off.square().sum(-1, keepdim=True) / reach**2)
+            total = total + weight * (move + stretch * off)
+        return total
+
+    def shown_at(self, places: Tensor) -> Tensor:
+        """Places at which those at [..., 2] are shown, the inverse of the warp."""
+        shown = places
+        for _ in range(_ROUNDS):
+            shown = places - self.shift(shown)
+        return shown
+
 
 # Shares of samples: without a person, of a body without its head, grey, turned far, with a second person, and
 # with something before the face; of a face whose features were moved; with decoys behind the person.
@@ -148,7 +205,9 @@ class StoredPortraits:
             behind = _Placement.aside(other, generator).crop(other, side)
             cover = behind.alpha * (behind.weight > 0)
             blur_px = float(4 * Uniform(generator)(0, 1) ** 2)
-            shown, cover = (blurred(x, blur_px) for x in (behind.crops[0] * (behind.weight > 0), cover))
+            shown, cover = (
+                gaussian_blurred(x, blur_px) for x in (behind.crops[0] * (behind.weight > 0), cover)
+            )
             image = shown + (1 - cover) * image
         if torch.rand((), generator=generator) < _DECOYED:
             image = _with_decoys(image, crop, generator)
@@ -341,7 +400,7 @@ def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
     white = torch.exp(uniform(0.3, 2.2)) * image.mean().clamp_min(1e-4)
     image = (image / white).clamp(0, 1)
     if torch.rand((), generator=generator) < 0.5:
-        image = blurred(image, float(uniform(0, 1) ** 2 * 2.5))
+        image = gaussian_blurred(image, float(uniform(0, 1) ** 2 * 2.5))
     encoded = torch.from_numpy(linear_to_srgb(image.numpy())) ** torch.exp(uniform(-0.45, 0.45))
     encoded = ((encoded - 0.5) * uniform(0.7, 1.15) + 0.5 + uniform(-0.08, 0.08)).clamp(0, 1)
     encoded = encoded + uniform(0, 1) ** 3 * 0.12 * torch.randn(encoded.shape, generator=generator)

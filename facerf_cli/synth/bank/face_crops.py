@@ -19,7 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE
-from facerf_cli.synth.head_images import ImageSettings
+from facerf_cli.synth.bank.head_images import ImageSettings
 from facerf_cli.synth.random_fields import Uniform
 
 _IMAGES = ImageSettings()
@@ -213,12 +213,12 @@ def _with_camera_errors(image: Tensor, generator: torch.Generator) -> Tensor:
         image = image.mean(0, keepdim=True).expand(3, -1, -1)
     clip = uniform(1.6, 6.0) * image.mean().clamp_min(1e-4)
     image = (image / clip).clamp(0, 1)
-    image = blurred(image, float(uniform(0, 1.3))) ** torch.exp(uniform(-0.3, 0.3))
+    image = gaussian_blurred(image, float(uniform(0, 1.3))) ** torch.exp(uniform(-0.3, 0.3))
     noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.04) ** 1.2
     return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
 
 
-def blurred(image: Tensor, sigma_px: float) -> Tensor:
+def gaussian_blurred(image: Tensor, sigma_px: float) -> Tensor:
     """Blur an image [3, S, S] by a Gaussian, as two matrix products: the fastest way at this size."""
     at = torch.arange(image.shape[-1])
     kernel = torch.exp(-0.5 * ((at[:, None] - at) / max(sigma_px, 0.05)) ** 2)

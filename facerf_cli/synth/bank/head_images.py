@@ -1,6 +1,6 @@
 """Images of the bank's heads to train the Geometry Network, each with the fit that it should find.
 
-A baked face, with random skin and light, is photographed as in `views.py`. Skull, ears, neck, hair, clothes
+A baked face, with random skin and light, is photographed as in `heads.py`. Skull, ears, neck, hair, clothes
 and glasses around it have simple shading without shadows. The background stays transparent.
 """
 
@@ -22,18 +22,17 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.synth.appearance.pigments import hair_albedo
+from facerf_cli.synth.appearance.people import hair_albedo
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, photograph_head
+from facerf_cli.synth.bank.texture_samples import HeadFields, draw_light, head_fields
 from facerf_cli.synth.head.body import draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.synth.head.shell import shell_head
-from facerf_cli.synth.head_fields import HeadFields, head_fields
 from facerf_cli.synth.random_fields import Uniform
-from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit
-from facerf_cli.synth.texture_samples import draw_light
-from facerf_cli.synth.views import HeadPhoto, ViewSettings, photograph_head
+from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 from facerf_cli.workers import in_shards
 
 BRIGHTEST = 6.0  # largest stored radiance, over the mean radiance of the face
@@ -215,7 +214,7 @@ def _face_radiance(fields: HeadFields, skin: Skin, weights: Tensor, camera_m: Te
     irradiance = diffuse_irradiance(visibility, bounce, cosines, albedo, weights[used])
     radiance = albedo * scatter(irradiance[None], skin.scattering_texels)[0]
     bright = power.topk(min(_HIGHLIGHTS, len(used))).indices
-    views = unit(camera_m.view(3, 1, 1) - fields.positions, 0)
+    views = unit_along(camera_m.view(3, 1, 1) - fields.positions, 0)
     gloss = highlights(normals, views[None], fields.directions[bright][None], skin)[0]
     return radiance + torch.einsum("lc,lij->cij", weights[bright], gloss * fields.visibility[bright] / 255)
 

@@ -19,12 +19,12 @@ from facerf_cli.network.portrait import (
     reached_by,
 )
 from facerf_cli.portrait.own_shading import own_shading
-from facerf_cli.synth.backgrounds import background_of
-from facerf_cli.synth.face_crops import blurred
+from facerf_cli.synth.bank.face_crops import gaussian_blurred
+from facerf_cli.synth.bank.portraits import background_of
+from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
+from facerf_cli.synth.bank.transport import load_view, seen_path
 from facerf_cli.synth.portraits import albedo_of, images_under
 from facerf_cli.synth.random_fields import Uniform
-from facerf_cli.synth.texture_samples import draw_light, draw_target_lights
-from facerf_cli.synth.transport_bank import load_view, seen_path
 
 _LAMP_SHARE = 0.3  # of photos, lit by one lamp in near darkness
 _GREY = 0.2  # share of grey photos
@@ -226,7 +226,7 @@ def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
     uniform = Uniform(generator)
     image = (image / uniform(1.6, 6.0)).clamp(0, 1)
     if torch.rand((), generator=generator) < 0.4:
-        image = blurred(image, float(uniform(0.3, 1.2)))
+        image = gaussian_blurred(image, float(uniform(0.3, 1.2)))
     image = image ** torch.exp(uniform(-0.22, 0.22))
     noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.02)
     return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)

@@ -28,7 +28,8 @@ from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.square import SIDE_PX, SIDES
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
-from facerf_cli.synth.backgrounds import background_of
+from facerf_cli.synth.bank.portraits import background_of
+from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.portraits import (
     BakedPortrait,
     bake_subject,
@@ -37,9 +38,8 @@ from facerf_cli.synth.portraits import (
     portrait_tensors,
     view_of,
 )
-from facerf_cli.synth.stage_cameras import StageCamera
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
-from facerf_cli.synth.texture_samples import draw_light
+from facerf_cli.synth.views import StageCamera
 from facerf_cli.workers import in_shards
 
 _LOOK_PX = 256  # texture side of looks other than the person's own

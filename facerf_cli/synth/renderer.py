@@ -1,7 +1,9 @@
-"""Images of a synthetic head under one light at a time, rendered from its baked light transport.
+"""Images of a synthetic head under one light at a time, from its baked light transport, and its glasses.
 
 Irradiance is stored at the vertices of the mesh. Per channel, all images of a camera are one sparse product:
 area x albedo x barycentric weights [facets, V] times irradiance [V, L]. Highlights are shaded per facet.
+
+They lie over finished images, since nothing else here is transparent. What they refract is left out.
 """
 
 import math
@@ -10,16 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from facerf_cli.light.mesh_transport import MeshTransport
+from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample
-from facerf_cli.synth.facets import Facets, facets_of
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, widened_lobes
-from facerf_cli.synth.stage_cameras import StageCamera
+from facerf_cli.synth.views import Facets, StageCamera, facets_of
 
 _SKIN, _HAIR = PARTS.index("skin"), PARTS.index("hair")
 _CHUNK = 1 << 19  # pixels x lights shaded at a time; fits the CPU caches
@@ -192,3 +195,53 @@ def _relief_ratio(facets: Facets, lights: Tensor) -> np.ndarray:
     ratio = (bent + _RELIEF_SOFTNESS) / (smooth + _RELIEF_SOFTNESS)
     ratio[facets.part == _HAIR] = 1
     return ratio.numpy()
+
+
+_REFLECTANCE = 0.04  # of one surface at normal incidence: a refractive index of 1.5
+_SURFACES = 2
+_SHARPNESS = 150.0  # of the lobe in which a light of the rig stands for its surroundings
+
+
+@dataclass(frozen=True, eq=False)
+class Lenses:
+    """Pixels [N] of an image [S, S], row by row, that show lenses; their normals and views [N, 3]."""
+
+    pixels: Tensor
+    normals: Tensor
+    views: Tensor
+
+
+def lenses_in(lenses: HeadMesh, camera: StageCamera, depth_m: np.ndarray) -> Lenses:
+    """Find the pixels that show lenses before everything else, whose depth [H, W] (m) is 0 for nothing."""
+    rotation = camera.head_to_camera.float()
+    vertices = torch.from_numpy(lenses.vertices).float() @ rotation.T + camera.translation_m.float()
+    triangles = torch.from_numpy(lenses.triangles).long()
+    fragments = rasterize(vertices, triangles, camera.camera)
+    normals = torch.from_numpy(lenses.normals).float() @ rotation.T
+    found = interpolate(torch.cat([vertices, normals], 1), triangles, fragments)
+    nothing_before = torch.from_numpy(depth_m == 0) | (-found[..., 2] < torch.from_numpy(depth_m))
+    pixels = (fragments.covered & nothing_before).flatten().nonzero()[:, 0]
+    place, normal = torch.split(found.flatten(0, 1)[pixels], 3, 1)
+    return Lenses(pixels, F.normalize(normal, dim=1), F.normalize(-place, dim=1))
+
+
+def over_lenses(images: Tensor, lenses: Lenses, directions: Tensor) -> Tensor:
+    """Lay lenses over images [L, 3, H, W] of single lights, from directions [L, 3] in camera space."""
+    seen, transmitted = reflections(lenses, directions)
+    flat = images.flatten(2).clone()
+    flat[..., lenses.pixels] = flat[..., lenses.pixels] * transmitted + seen.T[:, None]
+    return flat.view_as(images)
+
+
+def reflections(lenses: Lenses, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Radiance [N, L] that lenses reflect of each light of a rig, and share [N] that they let through.
+
+    A light of weight 1 stands for a cell of the sphere with a radiance of pi over its solid angle
+    (docs/design.md, 'Units of light').
+    """
+    cosine = (lenses.normals * lenses.views).sum(1)
+    mirrored = 2 * cosine[:, None] * lenses.normals - lenses.views
+    share = (_SHARPNESS * mirrored @ directions.T).softmax(1)
+    fresnel = _REFLECTANCE + (1 - _REFLECTANCE) * (1 - cosine.abs().clamp(0, 1)) ** 5
+    reflected = _SURFACES * fresnel / (1 + fresnel)
+    return reflected[:, None] * share * (len(directions) / 4), 1 - reflected
