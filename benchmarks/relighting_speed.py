@@ -24,7 +24,7 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.field import Field
 from facerf_cli.files.images import read_image
 from facerf_cli.light.envmap import envmap_weights, rotated_weights
-from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models, load_models
 from facerf_cli.pipeline import fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
@@ -85,8 +85,8 @@ def report_second_map(models: Models, rig: Tensor, side: int) -> None:
 
     def relit(count: int) -> None:
         weights = torch.stack([envmap_weights(envmap, rig) for envmap in maps[:count]])
-        for light, part in zip(weights, relit_by(composition, head, reflectance, rig, weights), strict=True):
-            composition.image(RigLight(rig, light), part)
+        for one in relit_by(composition, head, reflectance, rig, weights):
+            composition.image(one)
 
     seconds, _ = best_s({"one map": lambda: relit(1), "all maps": lambda: relit(len(maps))}, _ROUNDS)
     more_s = (seconds["all maps"] - seconds["one map"]) / (len(maps) - 1)
