@@ -214,7 +214,7 @@ def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, t
 
 
 def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> None:
-    """Its people are made up here; `tests/synth/test_portrait_bank.py` has a real one."""
+    """Its people are made up here; `tests/synth/bank/test_portraits.py` has a real one."""
     bank = tmp_path / "bank"
     (bank / "portraits").mkdir(parents=True)
     save_file({"backgrounds": torch.full((2, 3, 16, 16), 90).byte()}, bank / "backgrounds.safetensors")

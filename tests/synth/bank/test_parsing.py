@@ -8,9 +8,10 @@ import torch
 from safetensors.torch import save_file
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
-from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
 
 SIDE, STORED = 64, 96
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -179,3 +180,27 @@ def test_the_outline_lies_just_off_the_person() -> None:
     assert x.min() == 28 and x.max() == 51 and y.min() == 8 and y.max() == 21
     assert not alpha[y.long(), x.long()].any()
     assert not len(parsing._outline(torch.zeros(SIDE, SIDE)))
+
+
+_MODEL = load_face_model("builtin")
+_MEAN = _MODEL.vertices(torch.zeros(1, len(_MODEL.identity)), torch.zeros(1, len(_MODEL.expression)))
+FACE_PX = _MODEL.landmarks(_MEAN)[0, :, :2] * torch.tensor([1500.0, -1500.0]) + 300  # pixels
+
+
+def warps() -> list[FeatureWarp]:
+    return [FeatureWarp.draw(FACE_PX, torch.Generator().manual_seed(seed)) for seed in range(20)]
+
+
+def test_landmarks_go_where_the_image_shows_them() -> None:
+    """The image at p is taken from p + shift(p): from the landmark, where it is shown."""
+    for warp in warps():
+        shown = warp.shown_at(FACE_PX)
+        torch.testing.assert_close(shown + warp.shift(shown), FACE_PX, rtol=0, atol=0.1)  # pixels
+
+
+def test_features_move_and_what_is_far_away_stays() -> None:
+    moved = torch.stack([(warp.shown_at(FACE_PX) - FACE_PX).norm(dim=-1) for warp in warps()])
+    extent = float((FACE_PX.amax(0) - FACE_PX.amin(0)).max())
+    assert 0.01 * extent < moved[:, 17:].mean() < 0.06 * extent
+    far = FACE_PX.mean(0) + torch.tensor([[-3 * extent, 0.0], [2 * extent, 2 * extent]])
+    assert max(float(warp.shift(far).abs().max()) for warp in warps()) < 1e-3

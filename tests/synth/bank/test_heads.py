@@ -1,3 +1,5 @@
+"""Baked heads, the views that are fitted to them, and their samples."""
+
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,3 +1,5 @@
+"""Images from baked light transport, and lenses over them."""
+
 import math
 from dataclasses import replace
 
@@ -13,8 +15,16 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance, Material
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
-from facerf_cli.synth.renderer import RenderSettings, photograph, scattered_irradiance
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless
+from facerf_cli.synth.renderer import (
+    Lenses,
+    RenderSettings,
+    lenses_in,
+    over_lenses,
+    photograph,
+    reflections,
+    scattered_irradiance,
+)
 from facerf_cli.synth.shading import LOBES
 from facerf_cli.synth.views import StageCamera
 
@@ -236,3 +246,64 @@ def test_an_eye_keeps_its_highlight_in_a_coarse_image() -> None:
         images, coverage = photograph(head, appearance(wet), transport, camera(side, 0.03))
         means.append(float(images.sum() / coverage.sum()))
     assert means[0] == pytest.approx(means[1], rel=0.35)
+
+
+RIG = rig_directions(150)
+SIDE = 32
+
+
+def lens(tilt: float = 0.0) -> Lenses:
+    """One pixel of a lens seen from +z, turned about the vertical axis."""
+    normal = torch.tensor([[np.sin(tilt), 0.0, np.cos(tilt)]]).float()
+    return Lenses(torch.tensor([0]), normal, torch.tensor([[0.0, 0.0, 1.0]]))
+
+
+def test_under_even_light_of_radiance_one_it_shows_its_reflectance() -> None:
+    seen, transmitted = reflections(lens(), RIG)
+    even = torch.full((150,), 4 / 150)
+    two_surfaces = 2 * 0.04 / 1.04  # of refractive index 1.5, with the light that goes back and forth
+    assert float(seen @ even) == pytest.approx(two_surfaces, rel=1e-5)
+    assert float(transmitted) == pytest.approx(1 - two_surfaces, rel=1e-5)
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 20, -35])
+def test_it_mirrors_the_light_at_twice_its_tilt(tilt_deg: float) -> None:
+    seen, _ = reflections(lens(np.radians(tilt_deg)), RIG)
+    mirrored = torch.tensor([np.sin(2 * np.radians(tilt_deg)), 0.0, np.cos(2 * np.radians(tilt_deg))]).float()
+    assert int(seen[0].argmax()) == int((RIG @ mirrored).argmax())
+
+
+def test_a_grazing_view_is_mirrored_whole() -> None:
+    _, steep = reflections(lens(np.radians(85)), RIG)
+    _, front = reflections(lens(), RIG)
+    assert float(steep) < 0.6 < 0.9 < float(front)
+
+
+def pane(depth_m: float) -> HeadMesh:
+    """A square of 10 cm before the camera."""
+    corners = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
+    points = np.column_stack([corners, np.full(4, -depth_m)])
+    normals = np.broadcast_to([0.0, 0, 1], points.shape)
+    return strandless("frame", points, normals, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((4, 2)))
+
+
+def test_what_is_nearer_hides_it() -> None:
+    camera = StageCamera(Camera(SIDE * 5.0, SIDE, SIDE, SIDE / 2, SIDE / 2), torch.eye(3), torch.zeros(3))
+    depth_m = np.zeros((SIDE, SIDE), np.float32)
+    depth_m[: SIDE // 2] = 0.5  # something nearer than the pane above,
+    depth_m[SIDE // 2 :, : SIDE // 2] = 2.0  # farther below on the left, and nothing on the right
+    found = lenses_in(pane(1.0), camera, depth_m)
+    shown = torch.zeros(SIDE * SIDE)
+    shown[found.pixels] = 1
+    shown = shown.view(SIDE, SIDE)
+    assert not shown[: SIDE // 2].any()
+    assert shown[SIDE // 2 + 1 : SIDE // 2 + 7, 9:23].all()  # eight pixels around the middle
+    assert torch.allclose(found.normals, torch.tensor([0.0, 0, 1]).expand_as(found.normals))
+
+
+def test_images_of_single_lights_get_their_own_reflection() -> None:
+    images = torch.rand(150, 3, 1, 2)
+    covered = over_lenses(images, lens(), RIG)
+    seen, transmitted = reflections(lens(), RIG)
+    assert torch.equal(covered[..., 1], images[..., 1])
+    assert torch.allclose(covered[:, 1, 0, 0], images[:, 1, 0, 0] * transmitted + seen[0])
