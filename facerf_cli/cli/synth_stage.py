@@ -1,7 +1,7 @@
 """`facerf synth-stage`: photograph synthetic people in a virtual light stage."""
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import replace
+from typing import Annotated
 
 import typer
 
@@ -12,80 +12,27 @@ from facerf_cli.cli.options import (
     DryRunOption,
     OutputOption,
     OverwriteOption,
-    Settings,
     settings_of,
 )
 from facerf_cli.errors import UsageError
-
-_STAGE = "People and stage"
-Renderer = Literal["bake", "mitsuba"]
-Frame = Literal["head", "bust"]
-
-
-@dataclass(frozen=True)
-class SynthStage:
-    """The options of a run; settings only."""
-
-    subjects: int
-    size_px: int
-    face_model: str
-    renderer: Renderer
-    lights: int
-    frame: Frame
-    transport: bool
-    batch: BatchOptions
-    settings: Settings
+from facerf_cli.synth.stage_settings import StageSettings
 
 
 def synth_stage(
     context: typer.Context,
     output: OutputOption,
+    *,
     subjects: Annotated[
         int,
-        typer.Option(min=1, max=9999, metavar="N", help="Photograph so many people.", rich_help_panel=_STAGE),
-    ] = 10,
-    face_model: Annotated[
-        str,
         typer.Option(
-            metavar="NAME|PATH",
-            help="Draw people from this face model: builtin, or a .npz of `face-model import`.",
-            rich_help_panel=_STAGE,
-        ),
-    ] = "builtin",
-    lights: Annotated[
-        int,
-        typer.Option(
-            min=4,
-            max=1000,
+            min=1,
+            max=9999,
             metavar="N",
-            help="Use so many lights, uniform on the sphere.",
-            rich_help_panel=_STAGE,
+            help="Photograph so many people.",
+            rich_help_panel="People and stage",
         ),
-    ] = 150,
-    size: Annotated[
-        int,
-        typer.Option(
-            min=64,
-            max=1024,
-            metavar="PX",
-            help="Write square images of this side.",
-            rich_help_panel=IMAGE,
-        ),
-    ] = 256,
-    frame: Annotated[
-        Frame,
-        typer.Option(
-            help="Show the head down to the collar, or a bust down to the chest.", rich_help_panel=IMAGE
-        ),
-    ] = "head",
-    renderer: Annotated[
-        Renderer,
-        typer.Option(
-            help="Render with light transport baked once a person (bake), or by path tracing, slow and "
-            "accurate (mitsuba).",
-            rich_help_panel=IMAGE,
-        ),
-    ] = "bake",
+    ] = 10,
+    stage: StageSettings,
     transport: Annotated[
         bool,
         typer.Option(
@@ -110,11 +57,11 @@ def synth_stage(
     Person number n depends on --seed, n and the face model alone, so a larger --subjects adds people and
     changes none.
     """
-    if transport and renderer != "bake":
+    if transport and stage.renderer != "bake":
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
     from facerf_cli.cli.items.synth_subjects import photograph_people
 
     batch = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
-    work = SynthStage(subjects, size, face_model, renderer, lights, frame, transport, batch, settings)
-    raise typer.Exit(photograph_people(work))
+    stage = replace(stage, seed=settings.seed)
+    raise typer.Exit(photograph_people(subjects, stage, transport, batch, settings))

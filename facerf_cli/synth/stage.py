@@ -1,9 +1,9 @@
 """A synthetic light stage: random subjects, photographed by every camera under every light into a capture."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.json_reader import read_json
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
-from facerf_cli.light.sphere import RIG_LIGHTS, rig_directions
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.raster.texture import bake_attributes
@@ -28,27 +28,15 @@ from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.renderer import lenses_in, over_lenses
+from facerf_cli.synth.stage_settings import StageSettings
 from facerf_cli.synth.subjects import Subject, subject_model
-from facerf_cli.synth.views import CAMERA_DISTANCE_M, Frame, StageCamera, stage_cameras, truth_of
+from facerf_cli.synth.views import CAMERA_DISTANCE_M, StageCamera, stage_cameras, truth_of
 
-Renderer = Literal["bake", "mitsuba"]
 _TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
 TRUTH = "truth"  # folder of a subject with the true layers of each camera
 EVEN_LIGHT = 4.0  # sum of the weights of a rig's lights under a map of radiance 1
 _LEAST_FACING = -0.2  # cosine to a camera below which a vertex is not baked
 _BAKE = BakeSettings()
-
-
-@dataclass(frozen=True)
-class StageSettings:
-    """Settings of a capture; `size_px` is the side of an image."""
-
-    size_px: int = 256
-    face_model: str = "builtin"
-    renderer: Renderer = "bake"
-    lights: int = RIG_LIGHTS
-    seed: int = 0
-    frame: Frame = "head"
 
 
 def light_directions(settings: StageSettings) -> np.ndarray:

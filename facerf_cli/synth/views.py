@@ -5,7 +5,6 @@ Further landmarks than the 68 of `face.topology` have names: centres and outline
 
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 import torch
@@ -19,9 +18,9 @@ from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sa
 from facerf_cli.synth.appearance.people import IRIS_DEG
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, unit
 from facerf_cli.synth.shading import unit_along
+from facerf_cli.synth.stage_settings import Frame
 
 CAMERA_DISTANCE_M = 1.2  # from the head
-Frame = Literal["head", "bust"]
 # Height that an image shows at that distance, and height of its middle over the origin of the head frame.
 _FRAMES_M: dict[Frame, tuple[float, float]] = {"head": (0.36, 0.0), "bust": (0.56, -0.06)}
 # Azimuth and elevation of the cameras seen from the head, all in front (paper, 'Dataset').

@@ -3,28 +3,27 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from facerf_cli.cli.batch import run_items, sums_up
+from facerf_cli.cli.batch import BatchOptions, run_items, sums_up
 from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.options import Settings
 from facerf_cli.cli.report import Outcome
-from facerf_cli.cli.synth_stage import SynthStage
 from facerf_cli.synth.path_tracer import load_mitsuba
-from facerf_cli.synth.stage import StageSettings, close_capture, open_capture, write_subject
+from facerf_cli.synth.stage import close_capture, open_capture, write_subject
+from facerf_cli.synth.stage_settings import StageSettings
 from facerf_cli.synth.subjects import draw_subject, subject_model
 from facerf_cli.workers import one_thread
 
 
-def photograph_people(options: SynthStage) -> int:
+def photograph_people(
+    subjects: int, stage: StageSettings, transport: bool, batch: BatchOptions, settings: Settings
+) -> int:
     """Write a capture of synthetic people; return the exit code."""
-    subject_model(options.face_model)  # raises for an invalid model before anything is written
-    if options.renderer == "mitsuba":
+    subject_model(stage.face_model)  # raises for an invalid model before anything is written
+    if stage.renderer == "mitsuba":
         load_mitsuba()
-    batch, settings = options.batch, options.settings
-    stage = StageSettings(
-        options.size_px, options.face_model, options.renderer, options.lights, settings.seed, options.frame
-    )
-    folders = [batch.output / f"{index:04d}" for index in range(options.subjects)]
+    folders = [batch.output / f"{index:04d}" for index in range(subjects)]
     items = [Item(folder, folder, folder.name) for folder in folders]
-    photograph = _Photograph(stage, batch.output / "transport" if options.transport else None)
+    photograph = _Photograph(stage, batch.output / "transport" if transport else None)
     if not batch.dry_run:
         open_capture(batch.output, stage)
     code = run_items("synth-stage", items, photograph, photograph.outputs_of, batch, settings)

@@ -1,0 +1,44 @@
+"""Settings of a synthetic capture, which `facerf synth-stage` offers as options."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from facerf_cli.option import option
+
+Renderer = Literal["bake", "mitsuba"]
+Frame = Literal["head", "bust"]
+_STAGE, _IMAGE = "People and stage", "Image"
+
+
+@dataclass(frozen=True)
+class StageSettings:
+    """Settings of a capture; `size_px` is the side of an image."""
+
+    size_px: int = option(
+        256,
+        "Write square images of this side.",
+        "PX",
+        panel=_IMAGE,
+        flags=("--size",),
+        least=64,
+        most=1024,
+    )
+    face_model: str = option(
+        "builtin",
+        "Draw people from this face model: builtin, or a .npz of `face-model import`.",
+        "NAME|PATH",
+        panel=_STAGE,
+    )
+    renderer: Renderer = option(
+        "bake",
+        "Render with light transport baked once a person (bake), or by path tracing, slow and accurate "
+        "(mitsuba).",
+        panel=_IMAGE,
+    )
+    lights: int = option(
+        150, "Use so many lights, uniform on the sphere.", "N", panel=_STAGE, least=4, most=1000
+    )
+    seed: int = 0
+    frame: Frame = option(
+        "head", "Show the head down to the collar, or a bust down to the chest.", panel=_IMAGE
+    )
