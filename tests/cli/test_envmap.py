@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.items.envmap_sheet import write_sheet
+from facerf_cli.cli.items.draw_envmaps import write_sheet
 from facerf_cli.cli.lights import collect_setups
 from facerf_cli.files.atomic import _machine
 from facerf_cli.files.images import read_image, write_exr

@@ -1,16 +1,22 @@
-"""The maps of `facerf envmap`."""
+"""The maps of `facerf envmap`, and their contact sheet: each map beside a white ball under it."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from facerf_cli import __version__
-from facerf_cli.cli.items.envmap_sheet import MOST_MAPS, write_sheet
 from facerf_cli.cli.options import Overwrite
+from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import sweep_leftovers
+from facerf_cli.files.drawings import contact_sheet, labels
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.light_files import read_map_file
+from facerf_cli.light.envmap import ball, mean_radiance
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of
 
@@ -71,3 +77,29 @@ def _is_to_be_made(path: Path, facts: Facts, width_px: int, overwrite: Overwrite
 def _is_older(sheet: Path, maps: Iterable[Path]) -> bool:
     """Tell if a run was ended between the last map and the sheet."""
     return not sheet.exists() or any(path.stat().st_mtime > sheet.stat().st_mtime for path in maps)
+
+
+MOST_MAPS = 300  # on a sheet; more would be too many to look at
+_MAP_PX = 96  # height of a map
+_LABEL_PX = 16
+
+
+def write_sheet(maps: Sequence[Path], sheet: Path) -> None:
+    """Read maps, the first `MOST_MAPS` at most, and write their contact sheet as an image for display."""
+    tiles = np.stack([_tile(path) for path in maps[:MOST_MAPS]])
+    write_display(sheet, contact_sheet(tiles), metadata={"Software": f"facerf {__version__}"})
+
+
+def _tile(path: Path) -> np.ndarray:
+    """A map and its ball side by side, each exposed well, over the name [h, 3 maps' heights, 3], linear."""
+    envmap = mean_radiance(read_map_file(path), _MAP_PX, 0)
+    pixels = torch.nn.functional.interpolate(envmap.permute(2, 0, 1)[None], (_MAP_PX, 2 * _MAP_PX))[0]
+    shaded = ball(envmap, _MAP_PX, "diffuse").numpy()
+    shown = [_exposed(pixels.permute(1, 2, 0).numpy(), None), _exposed(shaded, shaded.max(-1) > 0)]
+    picture = np.concatenate(shown, 1)
+    return np.concatenate([picture, labels([path.stem], picture.shape[1], _LABEL_PX)])
+
+
+def _exposed(linear: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    gain = np.float32(2 ** auto_exposure_ev(linear, mask))
+    return np.asarray((linear * gain).clip(0, 1))
