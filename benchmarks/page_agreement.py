@@ -1,9 +1,10 @@
 """Agreement of a page of `facerf view`, as Chromium draws it, with `facerf relight`, in steps of 255; bytes.
 
-    python benchmarks/page_agreement.py [PHOTO ...]
+    python benchmarks/page_agreement.py [PHOTO ...] [--lights N] [--size PX]
 
-Ten single lights and three procedural maps, at the automatic exposure of each side and the default view, over
-the pixels of which the person has more than half. Needs Chromium; WebGL2 is drawn by software.
+N lights of the rig, N between its lights and three procedural maps, at the automatic exposure of each side
+and the default view, over the pixels of which the person has more than half. Needs Chromium; WebGL2 is drawn
+by software.
 """
 
 import sys
@@ -15,81 +16,87 @@ import numpy as np
 import torch
 from _common import ASTRONAUT, ROOT, arguments
 
-from facerf_cli.cli.items.view_photos import page_maps, portrait_field_of
-from facerf_cli.colour import SOFT_VIEW, encode_display
+from facerf_cli.cli.items.view_photos import head_place, of_photo, page_maps
+from facerf_cli.colour import SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.files.images import read_image
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, golden_spiral, rig_directions
 from facerf_cli.models import load_models
-from facerf_cli.pipeline import composition_of, find_for, head_of, relit_by
+from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
 from facerf_cli.resize import shrunk_photo
-from facerf_cli.viewer.packing import packed
-from facerf_cli.viewer.page import page
+from facerf_cli.viewer.page import packed, page
 
 sys.path.insert(0, str(ROOT))
 from tests.viewer.browser import drawn
 
-LIGHTS = (
-    (20, 5),
-    (40, 25),
-    (-70, 10),
-    (0, 80),
-    (0, -40),
-    (75, -20),
-    (-30, 50),
-    (110, 20),
-    (-140, 20),
-    (180, 30),
-)
 MAPS = ("sun", "windows", "studio")
-PHOTO_PX = 1024
+Setup = tuple[str, str, torch.Tensor, torch.Tensor]
 
 
-def setups() -> list[tuple[str, torch.Tensor, torch.Tensor]]:
-    """Addresses, directions [L, 3] and weights [L, 3] of all lights."""
-    one = torch.ones(1, 3)
-    found = [(f"light={az},{el}", azel_to_direction(az, el)[None].float(), one) for az, el in LIGHTS]
-    rig = rig_directions()
+def setups(count: int) -> list[Setup]:
+    """Kind, address, directions [L, 3] and weights [L, 3] of all lights."""
+    rig, found = rig_directions(), []
+    between = torch.from_numpy(golden_spiral(count)).float()
+    for kind, some in (("on the rig", rig[:: len(rig) // count][:count]), ("between", between)):
+        for toward in some:
+            azimuth, elevation = (round(float(x), 3) for x in direction_to_azel(toward))
+            exact = azel_to_direction(azimuth, elevation)[None].float()
+            found.append((kind, f"light={azimuth},{elevation}", exact, torch.ones(1, 3)))
     for sky in page_maps():
         if sky.name in MAPS:
-            pixels = torch.from_numpy(sky.pixels.astype(np.float16).astype(np.float32))
-            found.append((f"env={sky.name}", rig, envmap_weights(pixels, rig)))
+            pixels = torch.from_numpy(sky.pixels.astype(np.float32))
+            found.append(("map", f"env={sky.name}", rig, envmap_weights(pixels, rig)))
     return found
 
 
-def measure(path: Path, folder: Path) -> None:
+def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     """Print the table of one photo."""
     models = load_models(None, "builtin", torch.device("cpu"))
     photo = read_image(path).pixels
     face = find_for(models.default_geometry, photo, str(path))[0]
-    photo, head = shrunk_photo(photo, head_of(models, photo, face), PHOTO_PX)
-    field = portrait_field_of(models, head, photo)
-    whole = composition_of(models, photo, head, field)
-    text = page(path.stem, path.name, packed(photo, head.fit.crop, field, whole, page_maps()), "")
+    photo, head = shrunk_photo(photo, head_of(models, photo, face), size_px)
+    basis, plate = of_photo(models, photo, head)
+    document = packed(basis, plate, head_place(head.fit.crop, plate.matte), page_maps())
+    text = page(path.stem, path.name, document, "")
     print(f"{path.name}: {photo.shape[1]} x {photo.shape[0]}, {len(text) / 2**20:.1f} MiB")
     begun = time.perf_counter()
-    shown = drawn(text, [name for name, *_ in setups()], folder)
+    given = setups(count)
+    shown = drawn(text, [address for _, address, *_ in given], folder)
     print(f"{time.perf_counter() - begun:.0f} s for {len(shown)} states in software")
-    print("light              EV relight   page    mean   99 %    most")
+    field = reflectance_of(models, head, "portrait", photo=photo)
+    whole = composition_of(models, photo, head, field)
     seen = whole.matte > 0.5
-    for (name, directions, weights), one in zip(setups(), shown, strict=True):
+    print("light                    EV relight   page    mean   95 %   99 %    most")
+    errors: dict[str, list[np.ndarray]] = {}
+    for (kind, name, directions, weights), one in zip(given, shown, strict=True):
         relit = next(relit_by(whole, head, field, directions, weights[None]))
-        ev = whole.exposure_ev(relit, "auto")
+        strength = float(weights.sum(0) @ torch.tensor([0.2126, 0.7152, 0.0722]))
+        ev = min(whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", strength))
         exposed = whole.image(relit, ev).pixels * np.float32(2.0**ev)
         truth = np.round(255 * encode_display(exposed, SOFT_VIEW, whole.matte))
         error = np.abs(truth - one.pixels[..., :3])[seen]
-        errors = f"{error.mean():8.2f}{np.percentile(error, 99):7.1f}{error.max():8.0f}"
-        print(f"{name:18}{ev:11.2f}{one.ev:7.2f}{errors}", flush=True)
+        errors.setdefault(kind, []).append(error)
+        print(f"{name:24}{ev:11.2f}{one.ev:7.2f}{figures(error)}", flush=True)
+    for kind, some in errors.items():
+        print(f"{kind + ', all values':42}{figures(np.concatenate(some))}")
+
+
+def figures(error: np.ndarray) -> str:
+    """Mean, percentiles and maximum of errors, as columns."""
+    of_95, of_99 = np.percentile(error, (95, 99))
+    return f"{error.mean():8.2f}{of_95:7.1f}{of_99:7.1f}{error.max():8.0f}"
 
 
 def main() -> None:
     """Print the tables."""
     parser = arguments(__doc__)
     parser.add_argument("photos", nargs="*", type=Path, default=[ASTRONAUT])
+    parser.add_argument("--lights", type=int, default=20)
+    parser.add_argument("--size", type=int, default=512)
     options = parser.parse_args()
     for path in options.photos:
         with tempfile.TemporaryDirectory() as folder:
-            measure(path, Path(folder))
+            measure(path, Path(folder), options.lights, options.size)
 
 
 if __name__ == "__main__":

@@ -295,7 +295,6 @@ class PhotoDetail:
         own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
         side = face.texture.shape[1:]
         own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[0, 0]
-        self.own_texture = own
         self.trusted = face.visible * (1 - own)
         self.mean_source = _mean(face.texture, self.trusted)
         self.floor = _DARK * float(self.mean_source.mean()) + _TINY

@@ -1,4 +1,4 @@
-"""`facerf view`: a photo as a page in which a person moves the lights."""
+"""`facerf view`: photos and OLAT stacks as pages in which lights are moved by hand."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ _PAGE, _INDEX = ".html", "index.html"
 
 @dataclass(frozen=True)
 class MakePage:
-    """Makes the page of one photo; settings only."""
+    """Make the page of one photo or stack; settings only."""
 
     photo: PhotoOptions
     size_px: int
@@ -84,9 +84,9 @@ def view(
     dry_run: DryRunOption = False,
     jobs: JobsOption = 1,
 ) -> None:
-    """Make a web page in which a photo is relit by moving lights.
+    """Make a web page in which a photo, or an OLAT stack, is relit by moving lights.
 
-    One file of about 10 MB, which a browser opens without a server or a network: single lights, rotated
+    One file of about 4 MB, which a browser opens without a server or a network: single lights, rotated
     environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
     """
     photo = PhotoOptions(

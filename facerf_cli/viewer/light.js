@@ -1,195 +1,268 @@
-// Directions of light, and the coefficients of lights and maps over the rig.
+// Lights and maps as weights of the lights of an OLAT stack, and the readers of maps.
 // Conventions are facerf's (docs/design.md): azimuth > 0 lights the image's right side, elevation > 0 from above.
 
 const DEGREE = Math.PI / 180;
-const MAP_ROWS = 256; // of the grid on which the cells of the stage's lights are found
+const MAP_ROWS = 256; // of the grid on which the cells of the lights are found
+const MOST_PIXELS = 8192 * 4096; // of a map
+
+const byId = (id) => document.getElementById(id);
+const limited = (value, low, high) => Math.min(high, Math.max(low, value));
+const turned = (degrees) => ((((degrees + 180) % 360) + 360) % 360) - 180;
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const luminance = (rgb) => 0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2];
+const decoded = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4);
+const encoded = (x) => (x <= 0.0031308 ? 12.92 * Math.max(0, x) : 1.055 * Math.min(1, x) ** (1 / 2.4) - 0.055);
+const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer);
 
 function directionOf(azimuth, elevation) {
   const ring = Math.cos(elevation * DEGREE);
   return [ring * Math.sin(azimuth * DEGREE), Math.sin(elevation * DEGREE), ring * Math.cos(azimuth * DEGREE)];
 }
 
-function azimuthElevation([x, y, z]) {
-  return [Math.atan2(x, z) / DEGREE, Math.atan2(y, Math.hypot(x, z)) / DEGREE];
+// A half float's value, from its 16 bits.
+function halfValue(bits) {
+  const [sign, exponent, fraction] = [bits & 0x8000 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
+  if (exponent === 31) return fraction ? NaN : sign * Infinity;
+  return sign * (exponent ? (1 + fraction / 1024) * 2 ** (exponent - 15) : fraction * 2 ** -24);
 }
 
-// The stage: the lights over which maps are integrated, and coefficients of its factored textures.
+async function imageOf(base64, type) {
+  const image = new Image();
+  image.src = `data:image/${type};base64,${base64}`;
+  await image.decode();
+  return image;
+}
+
+// The bytes [R, G, B, A, ...] of an image at a size.
+function pixelsOf(image, width, height) {
+  const canvas = Object.assign(document.createElement("canvas"), { width, height });
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(image, 0, 0, width, height);
+  return context.getImageData(0, 0, width, height).data;
+}
+
 class Rig {
-  constructor(stage) {
-    this.rank = stage.scales.length;
-    this.stage = floatsOf(stage.directions);
-    this.table = floatsOf(stage.coefficients);
-    this.planes = this.inverses(wordsOf(stage.triangles));
-    this.lights = this.stage.length / 3;
-  }
-
-  // The unit direction of a light of the stage.
-  toward(light) {
-    return Array.from(this.stage.subarray(3 * light, 3 * light + 3));
-  }
-
-  // For each triangle its corners, and the inverse of the matrix of their directions.
-  inverses(triangles) {
-    const found = [];
-    for (let t = 0; t < triangles.length; t += 3) {
-      const corners = Array.from(triangles.subarray(t, t + 3));
-      const [a, b, c] = corners.map((i) => this.toward(i));
+  constructor(data) {
+    const flat = floatsOf(data.directions);
+    this.lights = Array.from({ length: flat.length / 3 }, (_, i) => Array.from(flat.subarray(3 * i, 3 * i + 3)));
+    const corners = new Uint16Array(bytesOf(data.triangles).buffer);
+    this.triangles = Array.from({ length: corners.length / 3 }, (_, t) => Array.from(corners.subarray(3 * t, 3 * t + 3)));
+    this.inverses = this.triangles.map((triangle) => {
+      const [a, b, c] = triangle.map((i) => this.lights[i]);
       const rows = [cross(b, c), cross(c, a), cross(a, b)];
       const volume = dot(a, rows[0]);
-      found.push({ corners, rows: rows.map((row) => row.map((x) => x / volume)) });
-    }
-    return found;
-  }
-
-  // Coefficients [K] of a unit direction: those of a triangle's corners, weighted by its shares of them.
-  coefficients(toward) {
-    let best = null;
-    let least = -Infinity;
-    for (const plane of this.planes) {
-      const shares = plane.rows.map((row) => dot(row, toward));
-      const lowest = Math.min(...shares);
-      if (lowest > least) {
-        [best, least] = [{ plane, shares }, lowest];
-        if (lowest >= 0) break;
-      }
-    }
-    const total = best.shares.reduce((a, b) => a + b);
-    const sum = new Float32Array(this.rank);
-    best.plane.corners.forEach((corner, i) => {
-      const share = best.shares[i] / total;
-      for (let k = 0; k < this.rank; k++) sum[k] += share * this.table[corner * this.rank + k];
+      return rows.map((row) => row.map((value) => value / volume));
     });
-    return sum;
   }
 
-  // Sums [K * 3] of a map's weights [lights * 3].
-  sums(weights) {
-    const sums = new Float32Array(3 * this.rank);
-    for (let i = 0; i < this.lights; i++) {
-      for (let k = 0; k < this.rank; k++) {
-        const own = this.table[i * this.rank + k];
-        for (let c = 0; c < 3; c++) sums[3 * k + c] += own * weights[3 * i + c];
-      }
+  nearest(toward) {
+    const cosines = this.lights.map((light) => dot(light, toward));
+    return cosines.indexOf(Math.max(...cosines));
+  }
+
+  // Lights around a direction and their shares; the nearest one where no triangle is.
+  around(toward) {
+    for (const [t, rows] of this.inverses.entries()) {
+      const shares = rows.map((row) => dot(row, toward));
+      const total = shares[0] + shares[1] + shares[2];
+      if (Math.min(...shares) >= -1e-4 && total > 0) return this.triangles[t].map((light, i) => [light, shares[i] / total]);
     }
-    return sums;
+    return [[this.nearest(toward), 1]];
   }
 
-  // Index of the stage's light that is nearest to each texel of a grid, found once.
+  // The light that is nearest to each texel of a lat-long grid, found once.
   get cells() {
-    if (!this.found) {
-      this.found = new Uint16Array(2 * MAP_ROWS * MAP_ROWS);
-      for (let row = 0; row < MAP_ROWS; row++) {
-        for (let column = 0; column < 2 * MAP_ROWS; column++) {
-          const toward = directionOf(180 - (360 * (column + 0.5)) / (2 * MAP_ROWS), 90 - (180 * (row + 0.5)) / MAP_ROWS);
-          this.found[row * 2 * MAP_ROWS + column] = this.nearest(toward);
-        }
-      }
-    }
+    this.found ??= Uint16Array.from({ length: 2 * MAP_ROWS * MAP_ROWS }, (_, i) => {
+      const [row, column] = [Math.floor(i / (2 * MAP_ROWS)), i % (2 * MAP_ROWS)];
+      return this.nearest(directionOf(180 - (180 * (column + 0.5)) / MAP_ROWS, 90 - (180 * (row + 0.5)) / MAP_ROWS));
+    });
     return this.found;
   }
 
-  nearest([x, y, z]) {
-    let best = 0;
-    let most = -2;
-    for (let i = 0; i < this.lights; i++) {
-      const cosine = x * this.stage[3 * i] + y * this.stage[3 * i + 1] + z * this.stage[3 * i + 2];
-      if (cosine > most) [best, most] = [i, cosine];
-    }
-    return best;
-  }
-
-  // Weights [lights * 3] of the stage under a map that is rotated by `degrees`: its integral over each cell, over pi.
-  weights(map, degrees) {
-    const weights = new Float64Array(3 * this.lights);
+  // Weights [lights * 3] under a turned map: its integral over each light's cell, over pi.
+  mapWeights(map, degrees) {
+    const weights = new Float64Array(3 * this.lights.length);
     const width = 2 * MAP_ROWS;
     for (let row = 0; row < MAP_ROWS; row++) {
       const band = Math.sin((0.5 - row / MAP_ROWS) * Math.PI) - Math.sin((0.5 - (row + 1) / MAP_ROWS) * Math.PI);
-      const edges = map.upTo(row, degrees);
       for (let column = 0; column < width; column++) {
-        const at = 3 * this.cells[row * width + column];
-        for (let c = 0; c < 3; c++) {
-          const mean = edges[3 * column + 3 + c] - edges[3 * column + c];
-          weights[at + c] += (mean * band * 2 * Math.PI) / Math.PI;
-        }
+        const radiance = map.at((column + 0.5) / width + degrees / 360, (row + 0.5) / MAP_ROWS);
+        const to = 3 * this.cells[row * width + column];
+        for (let c = 0; c < 3; c++) weights[to + c] += (radiance[c] * band * 2) / width;
       }
     }
     return weights;
   }
 }
 
-// A lat-long map [height, width, 3], averaged down to the rows of the grid.
+// A lat-long map [height, width, 3]; a large one is averaged down to the rows of the grid.
 class LatLong {
   constructor(name, width, height, pixels, command = "", path = name) {
-    Object.assign(this, { name, command, path });
-    [this.width, this.height] = [width, height];
-    this.pixels = pixels;
-    while (this.height > MAP_ROWS && this.height % 2 === 0 && this.width % 2 === 0) this.halve();
-    this.cumulative = this.integrals();
-  }
-
-  halve() {
-    const [width, height] = [this.width / 2, this.height / 2];
-    const small = new Float32Array(3 * width * height);
-    for (let y = 0; y < height; y++) {
-      for (let x = 0; x < width; x++) {
-        for (let c = 0; c < 3; c++) {
-          const at = (row, column) => this.pixels[3 * ((2 * y + row) * this.width + 2 * x + column) + c];
-          small[3 * (y * width + x) + c] = (at(0, 0) + at(0, 1) + at(1, 0) + at(1, 1)) / 4;
-        }
-      }
+    const rows = Math.min(height, MAP_ROWS);
+    Object.assign(this, { name, command, path, width: 2 * rows, height: rows, pixels: new Float32Array(6 * rows * rows) });
+    const counts = new Uint32Array(2 * rows * rows);
+    for (let i = 0; i < width * height; i++) {
+      const to = Math.floor((Math.floor(i / width) * rows) / height) * 2 * rows + Math.floor(((i % width) * 2 * rows) / width);
+      counts[to]++;
+      for (let c = 0; c < 3; c++) this.pixels[3 * to + c] += pixels[3 * i + c];
     }
-    Object.assign(this, { width, height, pixels: small });
+    for (let i = 0; i < this.pixels.length; i++) this.pixels[i] /= counts[Math.floor(i / 3)];
   }
 
-  // For each row the sum of pixels to the left of each edge, as a share of a turn.
-  integrals() {
-    const sums = new Float64Array(3 * this.height * (this.width + 1));
-    for (let y = 0; y < this.height; y++) {
-      for (let x = 0; x < this.width; x++) {
-        const from = 3 * (y * (this.width + 1) + x);
-        for (let c = 0; c < 3; c++) {
-          sums[from + 3 + c] = sums[from + c] + this.pixels[3 * (y * this.width + x) + c] / this.width;
-        }
-      }
-    }
-    return sums;
-  }
-
-  // Those sums at the edges of the grid's columns [(2 rows + 1) * 3] in one of its rows, of the rotated map.
-  upTo(row, degrees) {
-    const y = Math.min(this.height - 1, Math.floor(((row + 0.5) / MAP_ROWS) * this.height));
-    const start = 3 * y * (this.width + 1);
-    const edges = new Float64Array(3 * (2 * MAP_ROWS + 1));
-    for (let column = 0; column <= 2 * MAP_ROWS; column++) {
-      const u = column / (2 * MAP_ROWS) + degrees / 360; // u decreases with azimuth
-      const turns = Math.floor(u);
-      const position = (u - turns) * this.width;
-      const pixel = Math.min(this.width - 1, Math.floor(position));
-      for (let c = 0; c < 3; c++) {
-        const before = this.cumulative[start + 3 * pixel + c];
-        const after = this.cumulative[start + 3 * pixel + 3 + c];
-        const turn = this.cumulative[start + 3 * this.width + c];
-        edges[3 * column + c] = before + (position - pixel) * (after - before) + turns * turn;
-      }
-    }
-    return edges;
-  }
-
-  // The radiance in a direction, without interpolation.
-  look([x, y, z], degrees) {
-    const [azimuth, elevation] = azimuthElevation([x, y, z]);
-    const u = 0.5 - (azimuth - degrees) / 360;
-    const column = Math.floor((u - Math.floor(u)) * this.width) % this.width;
-    const row = Math.min(this.height - 1, Math.floor((0.5 - elevation / 180) * this.height));
-    const at = 3 * (row * this.width + column);
-    return [this.pixels[at], this.pixels[at + 1], this.pixels[at + 2]];
+  // The radiance at (u, v); u is in turns.
+  at(u, v) {
+    const column = Math.min(this.width - 1, Math.floor((u - Math.floor(u)) * this.width));
+    const from = 3 * (Math.floor(v * this.height) * this.width + column);
+    return [this.pixels[from], this.pixels[from + 1], this.pixels[from + 2]];
   }
 }
 
-function dot(a, b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+// ---- Maps that are dropped on the page: Radiance .hdr, and OpenEXR scanlines of half or float ----
+
+async function readMap(file) {
+  const bytes = new Uint8Array(await file.arrayBuffer());
+  const isExr = bytes.length > 8 && new DataView(bytes.buffer).getUint32(0, true) === 20000630;
+  const { width, height, pixels } = isExr ? await readExr(bytes) : readHdr(bytes);
+  if (width !== 2 * height) throw new Error(`${width} x ${height} pixels; a lat-long map is twice as wide as high`);
+  return new LatLong(file.name, width, height, pixels.map((value) => (value > 0 ? Math.min(value, 65504) : 0)));
 }
 
-function cross(a, b) {
-  return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+function newPixels(width, height) {
+  const fits = width > 0 && height > 0 && width * height <= MOST_PIXELS;
+  if (!fits) throw new Error("the map is damaged or too large; give one of 8192 x 4096 pixels at most");
+  return new Float32Array(3 * width * height);
+}
+
+// Radiance RGBE: a text header, "-Y H +X W", then rows, run-length coded or flat.
+function readHdr(bytes) {
+  let at = 0;
+  const line = () => {
+    let text = "";
+    while (at < bytes.length && bytes[at] !== 10 && text.length < 1000) text += String.fromCharCode(bytes[at++]);
+    at++;
+    return text;
+  };
+  if (!line().startsWith("#?")) throw new Error("neither an .hdr nor an .exr map; convert it to one of them");
+  while (at < bytes.length && line() !== "");
+  const size = /^-Y (\d+) \+X (\d+)\s*$/.exec(line());
+  if (!size) throw new Error("an .hdr of rotated rows; save it again with -Y H +X W");
+  const [height, width] = [Number(size[1]), Number(size[2])];
+  const pixels = newPixels(width, height);
+  const row = new Uint8Array(4 * width); // planes R, G, B, E
+  for (let y = 0; y < height; y++) {
+    at = hdrRow(bytes, at, row, width);
+    for (let x = 0; x < width; x++) {
+      const scale = row[3 * width + x] ? 2 ** (row[3 * width + x] - 136) : 0;
+      for (let c = 0; c < 3; c++) pixels[3 * (y * width + x) + c] = row[c * width + x] * scale;
+    }
+  }
+  return { width, height, pixels };
+}
+
+// Decode one row; return where the next one begins.
+function hdrRow(bytes, start, row, width) {
+  let at = start;
+  const next = () => {
+    if (at >= bytes.length) throw new Error("the .hdr map is cut short; copy it again");
+    return bytes[at++];
+  };
+  const coded = bytes[at] === 2 && bytes[at + 1] === 2 && (bytes[at + 2] << 8) + bytes[at + 3] === width;
+  if (!coded) {
+    for (let i = 0; i < 4 * width; i++) row[(i % 4) * width + (i >> 2)] = next();
+    return at;
+  }
+  at += 4;
+  for (let c = 0; c < 4; c++) {
+    for (let x = 0; x < width; ) {
+      const code = next();
+      const [count, run] = [code > 128 ? code - 128 : code, code > 128 ? next() : null];
+      if (!count || x + count > width) throw new Error("the .hdr map is damaged; save it again");
+      for (const end = x + count; x < end; x++) row[c * width + x] = run ?? next();
+    }
+  }
+  return at;
+}
+
+const EXR_ROWS = { 0: 1, 2: 1, 3: 16 }; // in a block, by compression: none, ZIPS, ZIP
+const EXR_BYTES = [4, 2, 4]; // of unsigned integers, halves, floats
+const EXR_DAMAGED = "the .exr map is damaged or cut short; save or copy it again";
+
+async function readExr(bytes) {
+  const view = new DataView(bytes.buffer);
+  if (view.getUint32(4, true) & 0x1a00) throw new Error("an .exr of tiles or several parts; save plain scanlines");
+  const { attributes, end } = exrHeader(bytes, view);
+  const kind = bytes[attributes.compression];
+  const rows = EXR_ROWS[kind];
+  if (!rows) throw new Error("an .exr with a compression that the page cannot read; save it with ZIP or none");
+  const [left, top, right, bottom] = [0, 4, 8, 12].map((i) => view.getInt32(attributes.dataWindow + i, true));
+  const [width, height] = [right - left + 1, bottom - top + 1];
+  const pixels = newPixels(width, height);
+  const channels = exrChannels(bytes, view, attributes.channels);
+  const rowBytes = channels.reduce((sum, { type }) => sum + width * EXR_BYTES[type], 0);
+  for (let block = 0; block < Math.ceil(height / rows); block++) {
+    const at = Number(view.getBigUint64(end + 8 * block, true));
+    const first = view.getInt32(at, true) - top;
+    const size = Math.min(rows, height - first) * rowBytes;
+    let raw = bytes.subarray(at + 8, at + 8 + view.getInt32(at + 4, true));
+    if (kind && raw.length < size) raw = await exrUnzipped(raw);
+    if (first < 0 || !(size > 0) || raw.length < size) throw new Error(EXR_DAMAGED);
+    exrBlock(new DataView(raw.buffer, raw.byteOffset, size), channels, width, pixels.subarray(3 * first * width));
+  }
+  return { width, height, pixels };
+}
+
+// Where the values of the header's attributes begin, and where the header ends.
+function exrHeader(bytes, view) {
+  let at = 8;
+  const text = () => {
+    const start = at;
+    while (bytes[at]) at++;
+    return String.fromCharCode(...bytes.subarray(start, at++));
+  };
+  const attributes = {};
+  while (bytes[at]) {
+    const name = text();
+    text(); // its type
+    attributes[name] = at + 4;
+    at += 4 + Math.max(0, view.getInt32(at, true));
+  }
+  if (!("channels" in attributes && "compression" in attributes && "dataWindow" in attributes)) throw new Error(EXR_DAMAGED);
+  return { attributes, end: at + 1 };
+}
+
+// Channels in the order of the file: their type, and which of R, G, B they are (Y is all of them).
+function exrChannels(bytes, view, start) {
+  const found = [];
+  for (let at = start; bytes[at]; at += 17) {
+    let name = "";
+    while (bytes[at]) name += String.fromCharCode(bytes[at++]);
+    const type = view.getInt32(at + 1, true);
+    if (!(type in EXR_BYTES)) throw new Error(EXR_DAMAGED);
+    found.push({ type, to: name === "Y" ? [0, 1, 2] : ["R", "G", "B"].flatMap((c, i) => (c === name ? [i] : [])) });
+  }
+  if (!found.some(({ to }) => to.length)) throw new Error("the .exr map has no channels R, G, B; save it as RGB");
+  return found;
+}
+
+// ZIP of EXR: inflated, then differences of bytes, in two halves that are interleaved.
+async function exrUnzipped(packed) {
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const coded = new Uint8Array(await new Response(stream).arrayBuffer().catch(() => Promise.reject(new Error(EXR_DAMAGED))));
+  for (let i = 1; i < coded.length; i++) coded[i] = coded[i - 1] + coded[i] - 128;
+  const half = (coded.length + 1) >> 1;
+  return coded.map((_, i) => coded[i & 1 ? half + (i >> 1) : i >> 1]);
+}
+
+function exrBlock(view, channels, width, pixels) {
+  for (let y = 0, at = 0; at < view.byteLength; y++) {
+    for (const { type, to } of channels) {
+      for (let x = 0; x < width; x++, at += EXR_BYTES[type]) {
+        if (!to.length) continue;
+        const value = type === 1 ? halfValue(view.getUint16(at, true)) : type === 2 ? view.getFloat32(at, true) : view.getUint32(at, true);
+        for (const c of to) pixels[3 * (y * width + x) + c] = value;
+      }
+    }
+  }
 }

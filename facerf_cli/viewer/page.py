@@ -1,8 +1,9 @@
-"""The page of a photo: HTML, style and script joined into one file that loads nothing."""
+"""The page of a person under moving lights: one file of HTML, style, script and data that loads nothing."""
 
 import base64
 import hashlib
 import html
+import io
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,29 +11,51 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+from PIL import Image
+from scipy.spatial import ConvexHull, QhullError
+
+from facerf_cli.colour import (
+    AUTO_EXPOSURE_PERCENTILE,
+    AUTO_EXPOSURE_TARGET_LINEAR,
+    FACE_PERCENTILE,
+    MOST_OVER_FRONT_EV,
+    linear_to_srgb,
+    luminance,
+)
 from facerf_cli.files.documents import json_text
+from facerf_cli.resize import resized
+from facerf_cli.viewer.basis import Basis
 
 _HERE = Path(__file__).parent
-# In the order in which they are joined: each uses those before it.
-SCRIPTS = (
-    "bytes.js",
-    "arrays.js",
-    "planes.js",
-    "light.js",
-    "exposure.js",
-    "rays.js",
-    "portrait.js",
-    "decoder.js",
-    "face.js",
-    "readers.js",
-    "whole_person.js",
-    "gpu.js",
-    "canvas.js",
-    "ball.js",
-    "state.js",
-    "panel.js",
-    "main.js",
-)
+_RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
+_SURE = 0.5  # share from which on a pixel is skin, or the person's
+_SAMPLES = 4000  # pixels by which a page chooses its exposure
+
+
+@dataclass(frozen=True, eq=False)
+class PageMap:
+    """An environment map of a page: lat-long [h, 2 h, 3], and the command that draws it."""
+
+    name: str
+    pixels: np.ndarray
+    command: str
+    path: str  # that the command writes
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """What a page shows besides its basis: all images [H, W, ...].
+
+    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown;
+    `face` the share of the pixels by which the exposure is chosen, as bright as in `before`: None of stacks
+    that hold no photo, whose person is shown well.
+    """
+
+    before: np.ndarray
+    matte: np.ndarray
+    background: np.ndarray | None = None
+    face: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -44,10 +67,83 @@ class IndexEntry:
     strip: str
 
 
+def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[PageMap]) -> dict[str, Any]:
+    """The document of a page: all that its script needs, without names.
+
+    `head` is the middle of the face as shares of the sides, and the radius of the head in the shorter one.
+    """
+    height, width = plate.matte.shape
+    background = np.zeros_like(plate.before) if plate.background is None else plate.background
+    return {
+        "size": [width, height],
+        "small": [basis.ratios.shape[2], basis.ratios.shape[1]],
+        "head": list(head),
+        "directions": _floats(basis.directions),
+        "triangles": _bytes(_triangles(basis.directions).astype("<u2").tobytes()),
+        "ratios": [_jpeg(ratio, _RATIO_QUALITY) for ratio in basis.ratios],
+        "scales": basis.scales.tolist(),
+        "guide": _webp(basis.guide),
+        "white": basis.white,
+        "photo": _jpeg(_encoded(plate.before), _PHOTO_QUALITY),
+        "plate": _webp(_encoded(background)),
+        "background": plate.background is not None,
+        "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
+        "exposure": _exposure(basis, plate),
+        "envmaps": [
+            {
+                "name": one.name,
+                "size": [one.pixels.shape[1], one.pixels.shape[0]],
+                "pixels": _floats(one.pixels),
+                "command": one.command,
+                "path": one.path,
+            }
+            for one in maps
+        ],
+    }
+
+
+def _triangles(directions: np.ndarray) -> np.ndarray:
+    """Lights [T, 3] of the triangles between which a page interpolates; none where they surround nothing."""
+    try:
+        return np.asarray(ConvexHull(directions.astype(float)).simplices)
+    except (QhullError, ValueError):
+        return np.zeros((0, 3), int)
+
+
+def _exposure(basis: Basis, plate: Plate) -> dict[str, Any]:
+    """Pixels of the guide by which a page chooses its exposure, and the brightness that it compares with."""
+    size = basis.ratios.shape[1:3]
+    person = resized(plate.matte, *size)
+    face = person if plate.face is None else resized(plate.face * plate.matte, *size)
+    places = np.flatnonzero(person.ravel() > _SURE)
+    places = places[:: max(1, len(places) // _SAMPLES)]
+    guide = resized(basis.linear_guide, *size).reshape(-1, 3)[places] / person.reshape(-1, 1)[places]
+    before = luminance(resized(plate.before, *size))
+
+    def brighter(mask: np.ndarray, percentile: float) -> float:
+        return float(np.percentile(before[mask], percentile)) if mask.any() else 0.0
+
+    anchor = None
+    if plate.face is not None:
+        whole = brighter(person > _SURE, AUTO_EXPOSURE_PERCENTILE)
+        anchor = {"face": brighter(face > _SURE, FACE_PERCENTILE), "person": whole}
+    return {
+        "places": _bytes(places.astype("<u4").tobytes()),
+        "guide": _floats(guide),
+        "face": _bytes((face.ravel()[places] > _SURE).astype(np.uint8).tobytes()),
+        "facePercentile": FACE_PERCENTILE,
+        "personPercentile": AUTO_EXPOSURE_PERCENTILE,
+        "anchor": anchor,
+        "target": AUTO_EXPOSURE_TARGET_LINEAR,
+        "mostOverFront": MOST_OVER_FRONT_EV,
+    }
+
+
 def page(title: str, photo: str, document: Mapping[str, Any], strip: str) -> str:
     """The page of a photo; `photo` is its path on a command line, `strip` a JPEG in base64."""
     data = json_text({**document, "title": title, "source": shlex.quote(photo)})
-    return _filled("page.html", title, _script(), data=_in_script(data), strip=strip)
+    script = '"use strict";\n' + _text("light.js") + _text("page.js")
+    return _filled("page.html", title, script, data=data.replace("<", "\\u003c"), strip=strip)
 
 
 def index_page(entries: Sequence[IndexEntry]) -> str:
@@ -69,10 +165,15 @@ def strip_of(text: str) -> str:
     return rest.partition('"')[0] if found else ""
 
 
+def strip_jpeg(images: Sequence[np.ndarray]) -> str:
+    """Images [h, w, 3], encoded 0..1, side by side as a JPEG in base64."""
+    whole = np.concatenate(list(images), 1)
+    return _jpeg(np.round(whole.clip(0, 1) * 255).astype(np.uint8), _STRIP_QUALITY)
+
+
 def _filled(name: str, title: str, script: str, **parts: str) -> str:
     style = _text("page.css")
-    template = Template(_text(name))
-    return template.substitute(
+    return Template(_text(name)).substitute(
         title=html.escape(title),
         style=style,
         script=script,
@@ -82,15 +183,6 @@ def _filled(name: str, title: str, script: str, **parts: str) -> str:
     )
 
 
-def _script() -> str:
-    return '"use strict";\n' + "\n".join(_text(name) for name in SCRIPTS)
-
-
-def _in_script(data: str) -> str:
-    """JSON as the content of a script element, which ends at the first closing tag."""
-    return data.replace("<", "\\u003c")
-
-
 def _hash(text: str) -> str:
     """The name of an inline element in a content security policy."""
     return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") + "'"
@@ -98,3 +190,30 @@ def _hash(text: str) -> str:
 
 def _text(name: str) -> str:
     return (_HERE / name).read_text(encoding="utf-8")
+
+
+def _encoded(linear: np.ndarray) -> np.ndarray:
+    """Scene-linear [H, W, 3] as 8-bit sRGB."""
+    data: np.ndarray = np.round(linear_to_srgb(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
+    return data
+
+
+def _jpeg(data: np.ndarray, quality: int) -> str:
+    stream = io.BytesIO()
+    Image.fromarray(data).save(stream, "JPEG", quality=quality, subsampling=0, optimize=True)
+    return _bytes(stream.getvalue())
+
+
+def _webp(data: np.ndarray) -> str:
+    """An image without loss."""
+    stream = io.BytesIO()
+    Image.fromarray(data).save(stream, "WEBP", lossless=True, quality=60, method=4, exact=True)
+    return _bytes(stream.getvalue())
+
+
+def _floats(values: np.ndarray) -> str:
+    return _bytes(np.ascontiguousarray(values, "<f4").tobytes())
+
+
+def _bytes(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")

@@ -1,11 +1,16 @@
-"""`facerf view`: where pages go, and what is refused. No network is loaded."""
+"""`facerf view`: where pages go, and what is refused. No network is run."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from facerf_cli.cli.values import parse_exposure
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 
 
@@ -45,3 +50,25 @@ def test_a_photo_named_index_is_refused(folder: Path, capsys: pytest.CaptureFixt
 
 def test_the_exposure_of_a_page_s_command_is_understood() -> None:
     assert parse_exposure("1.37") == 1.37 and parse_exposure("auto") == "auto"
+
+
+def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
+    seen = np.zeros((24, 32), np.float32)
+    seen[4:20, 6:26] = 1
+    header = StackHeader(
+        kind="image",
+        directions=rig_directions(12).numpy(),
+        rotation=np.eye(3),
+        source=np.full((24, 32, 3), 0.2, np.float32),
+        seen=seen,
+        normals=np.zeros((24, 32, 3), np.float32),
+        layout_version=1,
+        fit={},
+    )
+    olats = torch.rand(12, 3, 24, 32) * torch.from_numpy(seen)
+    write_olat_stack(tmp_path / "captured.exr", header, [olats])
+    assert main(["view", str(tmp_path / "captured.exr"), "-o", str(tmp_path / "page.html")]) == 0
+    made = (tmp_path / "page.html").read_text()
+    data = json.loads(made.partition('id="data">')[2].partition("</script>")[0])
+    assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
+    assert data["exposure"]["anchor"] is None and data["source"].endswith("captured.exr")

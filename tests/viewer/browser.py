@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 _BUDGET_MS = 1_000_000_000  # of virtual time, which runs on while the page waits for another thread
-_AT_ONCE = 5  # states of a page in one run: what a run may take is limited
+_AT_ONCE = 20  # states of a page in one run: what a run may take is limited
 _DRIVER = """
 const wanted = %s;
 async function drive() {
@@ -125,11 +125,6 @@ def driven(page: str, script: str, folder: Path) -> Any:
     results = json.loads(html.unescape(found[1]))
     assert not (isinstance(results, dict) and "error" in results), results["error"]
     return results
-
-
-def image_of(address: str) -> np.ndarray:
-    """The pixels [H, W, 4] in 0..255 of a PNG as an address (data:)."""
-    return _pixels(address)
 
 
 def _drawn_at_once(page: str, addresses: Sequence[str], folder: Path, *options: str) -> list[Drawn]:

@@ -1,20 +1,18 @@
-"""A page's text is closed to the network, and its arrays come back; no browser is needed."""
+"""A page's text is closed to the network, and its basis gives images back; no browser is needed."""
 
 import base64
 import hashlib
 import json
 import re
-import zlib
 from typing import Any
 
 import numpy as np
-import pytest
+import torch
 
+from facerf_cli.light.sphere import golden_spiral, rig_directions
 from facerf_cli.resize import fitted, resized
-from facerf_cli.viewer.arrays import ArrayPack
-from facerf_cli.viewer.packing import strip_jpeg
-from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_of
-from facerf_cli.viewer.stage import atlas, factored
+from facerf_cli.viewer.basis import Basis, basis_of_stack, evenly_spread
+from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_jpeg, strip_of
 
 
 def text(title: str = "me", photo: str = "me.jpg") -> str:
@@ -29,65 +27,36 @@ def document_of(made: str) -> dict[str, Any]:
     return document
 
 
-def unpacked(document: dict[str, Any], name: str) -> np.ndarray:
-    """An array of a page, as its script reads it."""
-    entry = document["arrays"][name]
-    size = 1 if entry["kind"] == "byte" else 2
-    count = int(np.prod(entry["shape"]))
-    raw = zlib.decompress(base64.b64decode(document["bytes"]))[entry["at"] :][: size * count]
-    words = np.frombuffer(raw, np.uint8).reshape(size, count).T.copy()
-    if entry["kind"] == "half":
-        return words.view("<f2").reshape(entry["shape"]).astype(float)
-    values = words.view("<u1" if size == 1 else "<u2").reshape(-1)
-    if entry["kind"] == "index":
-        return np.cumsum(values, dtype=np.uint16).reshape(entry["shape"])
-    planes = values.reshape(len(entry["low"]), -1).astype(float)
-    found = np.array(entry["low"])[:, None] + np.array(entry["step"])[:, None] * planes
-    return np.asarray(found.reshape(entry["shape"]))
-
-
-@pytest.mark.parametrize(("kind", "error"), [("half", 5e-3), ("byte", 0.04), ("short", 2e-4)])
-def test_arrays_come_back(kind: Any, error: float) -> None:
+def test_a_basis_gives_the_images_of_its_lights_back() -> None:
     random = np.random.default_rng(2)
-    one = random.uniform([[-9.0], [3.0]], [[9.0], [4.0]], (2, 50))  # two planes of other ranges
-    pack = ArrayPack()
-    pack.add("first", np.zeros((1, 3)), "byte")
-    pack.add("one", one, kind)
-    found = unpacked(pack.document(), "one")
-    assert np.abs(found - one).max() < error
-    if kind != "half":
-        assert np.abs(found[1] - one[1]).max() < error / 10  # each plane by its own range
+    directions = rig_directions(20).numpy()
+    albedo = random.uniform(0.05, 0.6, (24, 32, 3))
+    images = albedo * np.clip(directions[:, 2], 0.01, 1)[:, None, None, None]
+    basis = Basis.of(directions, images.astype(np.float16), images.mean(0), np.ones((24, 32)))
+    assert basis.guide.dtype == basis.ratios.dtype == np.uint8
+    for direction, image in zip(directions, images, strict=True):
+        np.testing.assert_allclose(basis.image(direction), image, rtol=0.02, atol=2e-3)
 
 
-def test_indices_come_back_exactly() -> None:
-    values = np.array([[0, 65535, 7], [7, 6, 40000]])
-    pack = ArrayPack()
-    pack.add("index", values, "index")
-    np.testing.assert_array_equal(unpacked(pack.document(), "index"), values)
+def test_a_basis_is_finite_and_black_where_nobody_is() -> None:
+    matte = np.zeros((24, 32))
+    matte[4:20, 6:26] = 1
+    images = np.ones((6, 24, 32, 3)) * matte[..., None]
+    basis = Basis.of(rig_directions(6).numpy(), images.astype(np.float16), images.mean(0), matte)
+    assert not basis.guide[matte == 0].any() and np.isfinite(basis.scales).all()
+    assert basis.image(np.array([0, 0, 1.0]))[matte == 0].max() == 0
 
 
-def test_factors_of_enough_rank_give_the_images_back() -> None:
-    images = np.einsum("lk,khwc->lhwc", np.random.rand(30, 4), np.random.rand(4, 5, 6, 3)).astype(np.float32)
-    maps, coefficients = factored(images, np.ones((5, 6, 1)), 4)
-    np.testing.assert_allclose(np.einsum("lk,khwc->lhwc", coefficients, maps), images, atol=1e-5)
-
-
-def test_weights_decide_what_a_low_rank_keeps() -> None:
-    images = np.zeros((2, 1, 2, 3), np.float32)
-    images[0, 0, 0], images[1, 0, 1] = 1.0, 0.5
-    for weight, kept in (((1, 1), 0), ((1, 4), 1)):
-        maps, coefficients = factored(images, np.array(weight, float).reshape(1, 2, 1), 1)
-        found = np.einsum("lk,khwc->lhwc", coefficients, maps)
-        np.testing.assert_allclose(found[kept], images[kept], atol=1e-6)
-
-
-def test_maps_lie_in_tiles() -> None:
-    maps = np.random.default_rng(1).normal(size=(5, 6, 10, 3))
-    data, scales, columns, tile = atlas(maps)
-    assert tile == [16, 8]
-    for k, one in enumerate(maps):
-        part = data[k // columns * 8 :, k % columns * 16 :][:6, :10].astype(float)
-        np.testing.assert_allclose((part - 128) / 127 * scales[k], one, atol=scales[k] / 250)
+def test_a_stack_becomes_a_basis_and_evenly_spread_lights_are_kept() -> None:
+    directions = golden_spiral(40)
+    olats = torch.rand(40, 3, 12, 16)
+    basis = basis_of_stack(directions, lambda: torch.split(olats, 7), np.ones((12, 16)), 512)
+    assert basis.guide.shape == (12, 16, 3) and basis.ratios.shape == (40, 12, 16, 3)
+    found = basis.image(directions[8])
+    np.testing.assert_allclose(found, olats[8].permute(1, 2, 0).numpy(), atol=0.05)
+    assert evenly_spread(directions) == list(range(40))
+    kept = evenly_spread(golden_spiral(900), 100)
+    assert 90 <= len(kept) <= 100 and len(set(kept)) == len(kept)
 
 
 def test_the_page_loads_nothing_and_names_are_escaped() -> None:

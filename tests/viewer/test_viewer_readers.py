@@ -14,7 +14,7 @@ import pytest
 from facerf_cli.viewer import page
 from tests.viewer.browser import chromium, dumped
 
-READERS = ("bytes.js", "light.js", "readers.js")
+READERS = ("light.js",)
 _DRIVER = """
 (async () => {
   const results = {};
