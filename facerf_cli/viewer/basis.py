@@ -13,12 +13,19 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.colour import (
+    AUTO_EXPOSURE_PERCENTILE,
+    FACE_PERCENTILE,
+    linear_to_srgb,
+    luminance,
+    srgb_to_linear,
+)
 from facerf_cli.composite import Composition, Relit
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, relit_by
+from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.resize import fitted, resized, shrunk_photo
 
@@ -27,7 +34,21 @@ MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
 _LIGHTS_AT_ONCE = 10
 _DARK = 5e-3  # added to the guide, as a share of its mean over the person: no ratio divides by 0
 _PERSON = 0.02  # share of the person from which on a pixel has a ratio
+_SURE = 0.5  # share from which on a pixel is skin, or the person's
+_SAMPLES = 700  # pixels of the face, and of the person, by which a page chooses its exposure
 _WHITE_PERCENTILE = 99.9  # of a guide and of a ratio: the white of their bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Pixels of a person by which the exposure is chosen: `face` [L, F, 3] and `person` [L, P, 3].
+
+    `plate` is the brightness of both in the photo, at the percentiles of `relight`; None shows them well.
+    """
+
+    face: np.ndarray
+    person: np.ndarray
+    plate: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +63,20 @@ class Basis:
     scales: np.ndarray
     guide: np.ndarray
     white: float
+    samples: Samples
 
     @staticmethod
-    def of(directions: np.ndarray, images: np.ndarray, mean: np.ndarray, matte: np.ndarray) -> "Basis":
-        """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W]."""
+    def of(
+        directions: np.ndarray,
+        images: np.ndarray,
+        mean: np.ndarray,
+        matte: np.ndarray,
+        samples: Samples | None = None,
+    ) -> "Basis":
+        """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W].
+
+        The samples are by default those of the images.
+        """
         dark = np.float32(_DARK * mean.sum() / max(3 * float(matte.sum()), 1.0))
         guide = np.maximum(mean, 0) + dark * matte[..., None]
         white = max(float(np.percentile(guide, _WHITE_PERCENTILE)), 1e-9)
@@ -60,7 +91,11 @@ class Basis:
             ratio = (np.maximum(image.astype(np.float32), 0) / below)[nearest]
             scales[light] = max(float(np.percentile(ratio, _WHITE_PERCENTILE)), 1e-9)
             ratios[light] = np.round(255 * np.sqrt((ratio / scales[light]).clip(0, 1)))
-        return Basis(directions, ratios, scales, encoded, white)
+        if samples is None:
+            person = _some(share > _SURE)
+            straight = images.reshape(len(images), -1, 3)[:, person] / share.reshape(-1, 1)[person]
+            samples = Samples(straight, straight)
+        return Basis(directions, ratios, scales, encoded, white, samples)
 
     @property
     def linear_guide(self) -> np.ndarray:
@@ -70,8 +105,35 @@ class Basis:
     def image(self, toward: np.ndarray) -> np.ndarray:
         """The small image [h, w, 3] over black under the light that is nearest to a direction [3]."""
         light = int((self.directions @ toward).argmax())
-        ratio = (self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light]
-        return np.asarray(resized(self.linear_guide, *ratio.shape[:2]) * ratio)
+        return np.asarray(resized(self.linear_guide, *self.ratios.shape[1:3]) * self._ratio(light))
+
+    def anchored(self, photo: np.ndarray, face: np.ndarray, matte: np.ndarray) -> "Basis":
+        """The basis whose exposure leaves a face, a share [H, W], as bright as in the photo [H, W, 3]."""
+        size = self.ratios.shape[1:3]
+        plate = luminance(resized(photo, *size))
+        share, skin = resized(matte, *size), resized(face, *size)
+        places, masks = (_some(skin > _SURE), _some(share > _SURE)), (skin > _SURE, share > _SURE)
+        straight = resized(self.linear_guide, *size) / share.clip(_PERSON)[..., None]
+        found = [
+            np.stack([self._ratio(light).reshape(-1, 3)[some] for light in range(len(self.ratios))])
+            * straight.reshape(-1, 3)[some]
+            for some in places
+        ]
+        percentiles = (FACE_PERCENTILE, AUTO_EXPOSURE_PERCENTILE)
+        bright = [
+            float(np.percentile(plate[m], p)) if m.any() else 0.0
+            for m, p in zip(masks, percentiles, strict=True)
+        ]
+        return replace(self, samples=Samples(found[0], found[1], (bright[0], bright[1])))
+
+    def _ratio(self, light: int) -> np.ndarray:
+        return np.asarray((self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light])
+
+
+def _some(mask: np.ndarray) -> np.ndarray:
+    """Places of at most about `_SAMPLES` pixels of a mask [H, W], evenly taken, in its flat order."""
+    places = np.flatnonzero(mask)
+    return places[:: max(1, len(places) // _SAMPLES)]
 
 
 def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
@@ -91,14 +153,31 @@ def basis_of_photo(
     )
     rig = rig_directions()
     images: list[np.ndarray] = []
+    coarse: list[np.ndarray] = []
     mean: Relit | None = None
     for relit in _single(composition, head, field, rig):
+        assert relit.surround is not None
         images.append(small.light_layer(relit)[:].astype(np.float16))
+        part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
+        coarse.append((part * field.exposure).flatten(1).T.numpy().astype(np.float16))
         mean = relit if mean is None else mean.plus(torch.ones(1), relit.texture, relit.surround)
     assert mean is not None and mean.surround is not None
     mean = Relit(mean.texture / len(rig), mean.surround / len(rig))
     whole = composition.light_layer(mean)[:]
-    return Basis.of(rig.numpy(), np.stack(images), whole, composition.matte)
+    samples = _samples(np.stack(coarse), field)
+    return Basis.of(rig.numpy(), np.stack(images), whole, composition.matte, samples)
+
+
+def _samples(coarse: np.ndarray, field: PortraitField) -> Samples:
+    """The samples of a photo's person, whose images [L, S S, 3] are as coarse as the maps of its field."""
+    classes = field.person.classes.numpy()
+    face, person = classes[class_index("skin")] > _SURE, 1 - classes[0] > _SURE
+    photo = luminance(field.person.image.permute(1, 2, 0).numpy())
+    plate = [
+        float(np.percentile(photo[mask], percentile)) if mask.any() else 0.0
+        for mask, percentile in ((face, FACE_PERCENTILE), (person, AUTO_EXPOSURE_PERCENTILE))
+    ]
+    return Samples(coarse[:, _some(face)], coarse[:, _some(person)], (plate[0], plate[1]))
 
 
 def _single(composition: Composition, head: Head, field: PortraitField, lights: Tensor) -> Iterator[Relit]:
@@ -124,7 +203,7 @@ def basis_of_stack(
     Its images are read in batches [l, 3, H, W] over black; `seen` [H, W] is the person's share.
     """
     kept = evenly_spread(directions)
-    size = fitted(*seen.shape, most_px)
+    size = fitted(seen.shape[0], seen.shape[1], most_px)
     small_size = fitted(*size, RATIO_PX)
     mean, images = np.zeros((*seen.shape, 3), np.float32), []
     each = (image for batch in batches() for image in batch.permute(0, 2, 3, 1).numpy())

@@ -187,31 +187,27 @@ function softened(colour) {
 class AutoExposure {
   constructor(data) {
     this.about = data.exposure;
-    this.places = new Uint32Array(bytesOf(this.about.places).buffer);
-    this.guide = floatsOf(this.about.guide);
-    this.face = bytesOf(this.about.face);
-    this.scales = data.scales;
-    this.ratios = []; // of each light [places * 3], bytes
+    this.samples = [this.about.face, this.about.person].map(({ scales, count, bytes }) => ({ scales, count, roots: bytesOf(bytes) }));
   }
 
-  add(pixels) {
-    this.ratios.push(Uint8Array.from({ length: 3 * this.places.length }, (_, i) => pixels[4 * this.places[Math.floor(i / 3)] + (i % 3)]));
+  // The luminances of samples under weights [lights * 3].
+  luminances({ scales, count, roots }, weights) {
+    const sum = new Float32Array(3 * count);
+    scales.forEach((scale, light) => {
+      const rgb = Array.from(weights.subarray(3 * light, 3 * light + 3), (value) => (value * scale) / 255 ** 2);
+      const from = 3 * count * light;
+      if (rgb.some(Boolean)) for (let i = 0; i < sum.length; i++) sum[i] += rgb[i % 3] * roots[from + i] ** 2;
+    });
+    return Array.from({ length: count }, (_, i) => luminance(sum.subarray(3 * i, 3 * i + 3)));
   }
 
   // EV to two decimals under weights [lights * 3].
   ev(weights) {
-    const sum = new Float32Array(this.guide.length);
-    this.ratios.forEach((ratio, light) => {
-      const rgb = weights.subarray(3 * light, 3 * light + 3).map((value) => (value * this.scales[light]) / 255 ** 2);
-      if (rgb.some(Boolean)) for (let i = 0; i < sum.length; i++) sum[i] += rgb[i % 3] * ratio[i] ** 2;
-    });
-    const values = Array.from(this.places, (_, i) => luminance([0, 1, 2].map((c) => sum[3 * i + c] * this.guide[3 * i + c])));
-    const { anchor, target, mostOverFront } = this.about;
-    const person = percentile(values, this.about.personPercentile);
-    const face = percentile(values.filter((_, i) => this.face[i]), this.about.facePercentile);
-    let gain = target / person;
-    if (anchor) gain = Math.min(anchor.face / face, (2 * Math.max(1, anchor.person)) / person);
-    if (!(gain > 0 && Number.isFinite(gain)) || Math.min(face, person) < 1e-9) return 0;
+    const { plate, target, mostOverFront, facePercentile, personPercentile } = this.about;
+    const [faces, people] = this.samples.map((samples) => this.luminances(samples, weights));
+    const [face, person] = [percentile(faces, facePercentile), percentile(people, personPercentile)];
+    if (Math.min(face, person, plate ? plate[0] : 1) < 1e-9) return 0;
+    const gain = plate ? Math.min(plate[0] / face, (2 * Math.max(1, plate[1])) / person) : target / person;
     let strength = 0;
     for (let i = 0; i < weights.length; i += 3) strength += luminance(weights.subarray(i, i + 3));
     return Math.round(100 * Math.min(Math.log2(gain), mostOverFront - Math.log2(strength))) / 100;
@@ -312,11 +308,7 @@ class Page {
     this.maps = data.envmaps.map((one) => new LatLong(one.name, ...one.size, floatsOf(one.pixels), one.command, one.path));
     this.auto = new AutoExposure(data);
     this.view = this.newView(images);
-    ratios.forEach((image, light) => {
-      const pixels = pixelsOf(image, ...data.small);
-      this.view.add(light, pixels);
-      this.auto.add(pixels);
-    });
+    ratios.forEach((image, light) => this.view.add(light, pixelsOf(image, ...data.small)));
     byId("before").src = images.photo.src;
     byId("frame").style.setProperty("--sides", data.size[0] / data.size[1]);
     this.state = stateOf(location, this.maps);

@@ -21,16 +21,12 @@ from facerf_cli.colour import (
     FACE_PERCENTILE,
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
-    luminance,
 )
 from facerf_cli.files.documents import json_text
-from facerf_cli.resize import resized
-from facerf_cli.viewer.basis import Basis
+from facerf_cli.viewer.basis import Basis, Samples
 
 _HERE = Path(__file__).parent
 _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
-_SURE = 0.5  # share from which on a pixel is skin, or the person's
-_SAMPLES = 4000  # pixels by which a page chooses its exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +43,12 @@ class PageMap:
 class Plate:
     """What a page shows besides its basis: all images [H, W, ...].
 
-    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown;
-    `face` the share of the pixels by which the exposure is chosen, as bright as in `before`: None of stacks
-    that hold no photo, whose person is shown well.
+    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown.
     """
 
     before: np.ndarray
     matte: np.ndarray
     background: np.ndarray | None = None
-    face: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -88,7 +81,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "plate": _webp(_encoded(background)),
         "background": plate.background is not None,
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
-        "exposure": _exposure(basis, plate),
+        "exposure": _exposure(basis.samples),
         "envmaps": [
             {
                 "name": one.name,
@@ -110,33 +103,25 @@ def _triangles(directions: np.ndarray) -> np.ndarray:
         return np.zeros((0, 3), int)
 
 
-def _exposure(basis: Basis, plate: Plate) -> dict[str, Any]:
-    """Pixels of the guide by which a page chooses its exposure, and the brightness that it compares with."""
-    size = basis.ratios.shape[1:3]
-    person = resized(plate.matte, *size)
-    face = person if plate.face is None else resized(plate.face * plate.matte, *size)
-    places = np.flatnonzero(person.ravel() > _SURE)
-    places = places[:: max(1, len(places) // _SAMPLES)]
-    guide = resized(basis.linear_guide, *size).reshape(-1, 3)[places] / person.reshape(-1, 1)[places]
-    before = luminance(resized(plate.before, *size))
-
-    def brighter(mask: np.ndarray, percentile: float) -> float:
-        return float(np.percentile(before[mask], percentile)) if mask.any() else 0.0
-
-    anchor = None
-    if plate.face is not None:
-        whole = brighter(person > _SURE, AUTO_EXPOSURE_PERCENTILE)
-        anchor = {"face": brighter(face > _SURE, FACE_PERCENTILE), "person": whole}
+def _exposure(samples: Samples) -> dict[str, Any]:
+    """Pixels under each light by which a page chooses its exposure, and what it compares them with."""
     return {
-        "places": _bytes(places.astype("<u4").tobytes()),
-        "guide": _floats(guide),
-        "face": _bytes((face.ravel()[places] > _SURE).astype(np.uint8).tobytes()),
+        "face": _roots(samples.face),
+        "person": _roots(samples.person),
+        "plate": samples.plate,
         "facePercentile": FACE_PERCENTILE,
         "personPercentile": AUTO_EXPOSURE_PERCENTILE,
-        "anchor": anchor,
         "target": AUTO_EXPOSURE_TARGET_LINEAR,
         "mostOverFront": MOST_OVER_FRONT_EV,
     }
+
+
+def _roots(values: np.ndarray) -> dict[str, Any]:
+    """Linear values [L, N, 3] as bytes of their square roots, each light by its own scale."""
+    values = np.maximum(values.astype(np.float32), 0)
+    scales = np.maximum(values.reshape(len(values), -1).max(1, initial=0), 1e-9)
+    steps = np.round(255 * np.sqrt(values / scales[:, None, None])).astype(np.uint8)
+    return {"scales": scales.tolist(), "count": values.shape[1], "bytes": _bytes(steps.tobytes())}
 
 
 def page(title: str, photo: str, document: Mapping[str, Any], strip: str) -> str:

@@ -71,4 +71,4 @@ def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     made = (tmp_path / "page.html").read_text()
     data = json.loads(made.partition('id="data">')[2].partition("</script>")[0])
     assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
-    assert data["exposure"]["anchor"] is None and data["source"].endswith("captured.exr")
+    assert data["exposure"]["plate"] is None and data["source"].endswith("captured.exr")

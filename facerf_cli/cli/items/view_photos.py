@@ -85,7 +85,7 @@ def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plat
     basis = basis_of_photo(models, photo, head, field, composition)
     matte = composition.matte
     background = photo - matte[..., None] * composition.own[:]
-    return basis, Plate(photo, matte, background, field.person.segmentation.layer("skin")[:])
+    return basis, Plate(photo, matte, background)
 
 
 def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, Any]:
@@ -95,11 +95,11 @@ def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, A
         header.directions, lambda: stream_olats(item.input_path), header.seen, work.size_px
     )
     size = basis.guide.shape[:2]
-    head, face = (0.5, 0.5, 0.5), None
+    head = (0.5, 0.5, 0.5)
     if header.kind == "photo":
         head, face = _face_of_stack(item, header, work)
-        face = resized(face, *size)
-    plate = Plate(resized(header.source, *size), resized(header.seen, *size), face=face)
+        basis = basis.anchored(header.source, face * header.seen, header.seen)
+    plate = Plate(resized(header.source, *size), resized(header.seen, *size))
     _write(path, item, "", basis, plate, head)
     return {"lights": len(header.directions)}
 
@@ -163,7 +163,7 @@ def page_maps() -> tuple[PageMap, ...]:
 
 def _strip(basis: Basis, plate: Plate) -> str:
     """The photo and the person under a few lights, small and side by side."""
-    size = fitted(*plate.matte.shape, _STRIP_PX)
+    size = fitted(plate.matte.shape[0], plate.matte.shape[1], _STRIP_PX)
     images = [resized(plate.before.clip(0, 1), *size)]
     seen = resized(plate.matte, *basis.ratios.shape[1:3])
     for light in _STRIP_LIGHTS:
