@@ -1,65 +1,83 @@
-"""Pickles read without running any code: an interpreter that builds only arrays and inert stand-ins.
+"""Pickles read without running any code of theirs: Python's unpickler with names from an allow-list.
 
-`pickle.load` calls any function that a file names. Here no name is imported or called: each must be in
-`_ALLOWED`, and a call becomes a number, an array over the file's own bytes, or a `StandIn` that stores the
-arguments. FLAME's pickles, which contain chumpy and scipy.sparse objects, therefore open without these
-packages, and a hostile pickle is refused. The opcodes are those of the standard library's `pickletools`;
-pickles of Python 2 are read too.
+Each name that a pickle imports becomes a class of stand-ins, which only store what they are given; `array_of`
+then reads the numbers of an array of numpy, chumpy or scipy.sparse over the file's own bytes. FLAME's pickles
+therefore open without these packages, and a hostile pickle is refused.
 """
 
 import io
+import pickle
 import pickletools
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from facerf_cli.errors import InputError
-from facerf_cli.files.inert_arrays import (
-    InertArray,
-    InertDtype,
-    Refused,
-    StandIn,
-    array_over,
-    require,
-    text_of,
-)
 from facerf_cli.logs import one_line
 
 _MAX_BYTES = 512 << 20  # of a file
 _MAX_OPCODES = 200_000  # FLAME has a few thousand
-_MAX_ENCODED = 512 << 20  # bytes decoded from text in total; a short text may be decoded many times
-_PLAIN_KEYS = (str, bytes, int, float, bool, type(None))  # dict keys; a deep tuple's hash recurses
+_MAX_TUPLES = 5000  # nested ones recurse where they are keys
+_MAX_DIMENSIONS = 8  # of an array
+_MAX_DENSE = 4 << 20  # entries of a sparse matrix; FLAME's joints are 5 x 5023
+# Number types that are read; without objects, text and records.
+_NUMBERS = frozenset({"f2", "f4", "f8", "b1", *(f"{kind}{size}" for kind in "iu" for size in (1, 2, 4, 8))})
 
-# Functions with a known result: numpy's constructors, and encodings of bytes.
-_RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
 _SCALAR = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
-_DTYPE = ("numpy.dtype",)
-_ENCODE = ("_codecs.encode",)
-_BYTES = ("__builtin__.bytes",)  # without arguments: empty data
 _BARE = ("copy_reg._reconstructor", "copyreg._reconstructor")  # arguments: class, base, state of the base
-# Classes whose objects become stand-ins.
-_CLASSES = (
-    *("numpy.ndarray", "__builtin__.object", "builtins.object", "__builtin__.set", "builtins.set"),
-    *("collections.OrderedDict", "torch._utils._rebuild_tensor_v2"),
-    *("torch.storage._load_from_bytes", "torch.FloatStorage", "torch.LongStorage", "torch.DoubleStorage"),
-    *(f"scipy.sparse.{module}.{kind}_matrix" for kind in ("csc", "csr") for module in (kind, f"_{kind}")),
-    *(f"scipy.sparse._{kind}.{kind}_array" for kind in ("csc", "csr")),
+# Names that begin with chumpy. are allowed, too.
+_ALLOWED = frozenset(
+    (
+        *("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct", "numpy.dtype"),
+        *(*_FROM_BUFFER, *_SCALAR, *_BARE, "numpy.ndarray", "_codecs.encode", "__builtin__.bytes"),
+        *("__builtin__.object", "builtins.object", "__builtin__.set", "builtins.set"),
+        *("collections.OrderedDict", "torch._utils._rebuild_tensor_v2"),
+        *("torch.storage._load_from_bytes", "torch.FloatStorage", "torch.LongStorage", "torch.DoubleStorage"),
+        *(f"scipy.sparse.{module}.{kind}_matrix" for kind in ("csc", "csr") for module in (kind, f"_{kind}")),
+        *(f"scipy.sparse._{kind}.{kind}_array" for kind in ("csc", "csr")),
+    )
 )
-# Names that begin with chumpy. are allowed too; chumpy's operations become stand-ins, which do nothing.
-_ALLOWED = frozenset((*_RECONSTRUCT, *_FROM_BUFFER, *_SCALAR, *_DTYPE, *_ENCODE, *_BYTES, *_BARE, *_CLASSES))
 
 
-@dataclass(frozen=True)
-class _Name:
-    """A name that the pickle wants to import: module and attribute joined by a dot."""
+class _Refused(Exception):
+    """The pickle contains something that is not read; the text says what."""
 
-    text: str
+
+class StandIn:
+    """An object of a pickle, not created: its class's name, its constructor's arguments and its state."""
+
+    name = ""
+    arguments: tuple[Any, ...]
+    state: Any = None
+
+    def __new__(cls, *arguments: Any) -> "StandIn":  # noqa: D102  # some opcodes call it alone
+        made = super().__new__(cls)
+        made.arguments = arguments
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        """Leave out an entry of a class of dicts."""
+
+    def append(self, value: Any) -> None:
+        """Leave out an entry of a class of lists."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> type[StandIn]:
+        """Return a class of stand-ins for an allowed name."""
+        whole = f"{module}.{name}"
+        if whole not in _ALLOWED and not whole.startswith("chumpy."):
+            raise _Refused(f"names {whole[:80]}, which is not part of a face model")
+        return type("StandIn", (StandIn,), {"name": whole})
 
 
 def read_inert_pickle(path: Path) -> Any:
-    """Read a .pkl of dicts, lists, tuples, text, numbers, and the stand-ins of `inert_arrays`.
+    """Read a .pkl of dicts, lists, tuples, text, numbers, and stand-ins.
 
     No code of the file runs. A damaged file, and one that names anything other than arrays of numpy, chumpy
     and scipy.sparse, raises an InputError.
@@ -74,204 +92,127 @@ def read_inert_pickle(path: Path) -> Any:
 
 def read_inert_stream(file: BinaryIO, path: Path) -> Any:
     """Read the pickle that begins at an open file's position; errors name `path`."""
-    machine = _Machine()
+    content = file.read(_MAX_BYTES)
     try:
-        for opcode, argument, _ in pickletools.genops(io.BytesIO(file.read(_MAX_BYTES))):
-            machine.step(opcode.name, argument)
-        return _unwrapped(machine.pop())
-    except Refused as refused:
+        _check_work(content)
+        return _unwrapped(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
+    except _Refused as refused:
         raise InputError(f"{path}: refused: it {refused}; nothing of it was run") from None
-    except (ValueError, IndexError, KeyError, TypeError, OverflowError, EOFError, MemoryError) as error:
+    except Exception as error:  # whatever damage makes an unpickler raise
         raise InputError(
             f"{path}: not a readable pickle ({one_line(str(error))[:120]}); get the file again"
         ) from None
 
 
+def _check_work(content: bytes) -> None:
+    """Refuse a pickle of too many instructions, and one that would make the unpickler take much memory."""
+    tuples = 0
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(content), 1):
+        tuples += opcode.name.startswith(("TUPLE", "FROZENSET"))
+        if count > _MAX_OPCODES or tuples > _MAX_TUPLES:
+            raise _Refused(f"has more than {_MAX_OPCODES} instructions, or {_MAX_TUPLES} tuples")
+        if "PUT" in opcode.name and int(argument or 0) > _MAX_OPCODES:
+            raise _Refused(f"numbers an object {argument}")
+
+
 def _unwrapped(value: Any) -> Any:
     """Return the only object of an array of objects, which is how numpy saves one object."""
-    if isinstance(value, InertArray) and isinstance(value.values, list) and len(value.values) == 1:
-        return value.values[0]
+    match value:
+        case StandIn(state=(_, _, StandIn(arguments=("O8" | "O", *_)), _, [entry])):
+            return entry
     return value
 
 
-class _Machine:
-    """The stack machine of pickles; its memo stores objects by number."""
+def array_of(value: Any) -> np.ndarray:
+    """Return the numbers in a value of an inert pickle; ValueError if there are none.
 
-    def __init__(self) -> None:
-        self._stack: list[Any] = []
-        self._marks: list[int] = []
-        self._memo: dict[int, Any] = {}
-        self._steps = 0
-        self._encoded = 0
+    A chumpy object gives its `x`, and a scipy.sparse matrix of at most `_MAX_DENSE` entries a dense array.
+    """
+    if isinstance(value, StandIn) and isinstance(value.state, dict):
+        if "indptr" in value.state:
+            return _dense(value)
+        if _class_name(value) == "chumpy.ch.Ch":
+            value = value.state.get("x")
+    return _numbers(value)
 
-    def step(self, opcode: str, argument: Any) -> None:
-        """Execute one opcode."""
-        self._steps += 1
-        if self._steps > _MAX_OPCODES:
-            raise Refused(f"has more than {_MAX_OPCODES} instructions")
-        if opcode in _CONSTANTS:
-            self._stack.append(_CONSTANTS[opcode])
-        elif opcode in _LITERALS:
-            self._stack.append(argument)
-        elif opcode in _OPCODES:
-            _OPCODES[opcode](self, argument)
-        elif opcode not in _IDLE:
-            raise Refused(f"uses the instruction {opcode}, which no array needs")
 
-    def pop(self) -> Any:
-        """Remove and return the top of the stack."""
-        if self._marks and self._marks[-1] == len(self._stack):
-            raise ValueError("a mark instead of a value")
-        return self._stack.pop()
+def _numbers(value: Any) -> np.ndarray:
+    """Return the numbers in an array of numpy, a scalar of it, or a list."""
+    match value:
+        case np.ndarray():
+            return value
+        case StandIn(state=(_, shape, dtype, fortran, raw)):
+            return _array_over(_bytes(raw), dtype, shape, bool(fortran))
+        case StandIn(name=name, arguments=(raw, dtype, shape, order)) if name in _FROM_BUFFER:
+            return _array_over(_bytes(raw), dtype, shape, order == "F")
+        case StandIn(name=name, arguments=(dtype, raw)) if name in _SCALAR:
+            return _array_over(_bytes(raw), dtype, (), False)
+        case [*entries] if entries and all(isinstance(entry, (int, float)) for entry in entries):
+            return np.array(entries)
+    name = _class_name(value) if isinstance(value, StandIn) else type(value).__name__
+    raise ValueError(f"a {name} stands where numbers should be")
 
-    def _drop(self, _: Any) -> None:
-        self.pop()
 
-    def _drop_marked(self, _: Any) -> None:
-        self._marked()
+def _class_name(value: StandIn) -> str:
+    """Return the name of the class that a stand-in is of."""
+    if value.name in _BARE and value.arguments and isinstance(value.arguments[0], type):
+        return str(getattr(value.arguments[0], "name", ""))
+    return value.name
 
-    def _marked(self) -> list[Any]:
-        at = self._marks.pop()
-        taken = self._stack[at:]
-        del self._stack[at:]
-        return taken
 
-    def _mark(self, _: Any) -> None:
-        self._marks.append(len(self._stack))
+def _dense(matrix: StandIn) -> np.ndarray:
+    """Return a compressed sparse matrix as a dense array; check its indices, which scipy does not."""
+    state = _require(matrix.state, dict)
+    data, indices, starts = (_numbers(state.get(key)) for key in ("data", "indices", "indptr"))
+    rows, columns = _require(state.get("_shape", state.get("shape")), tuple)
+    by_column = "csc" in _class_name(matrix)
+    lines, length = (columns, rows) if by_column else (rows, columns)
+    is_consistent = (
+        0 < _require(lines, int) * _require(length, int) <= _MAX_DENSE
+        and starts.shape == (lines + 1,)
+        and (starts[0], starts[-1]) == (0, len(data))
+        and len(indices) == len(data)
+        and bool((np.diff(starts) >= 0).all() and ((indices >= 0) & (indices < length)).all())
+    )
+    if not is_consistent:
+        raise ValueError("a sparse matrix is damaged")
+    dense = np.zeros((lines, length))
+    np.add.at(dense, (np.repeat(np.arange(lines), np.diff(starts)), indices.astype(np.int64)), data)
+    return dense.T if by_column else dense
 
-    def _new(self, value: Any) -> None:
-        self._stack.append(value)
 
-    def _tuple(self, count: int) -> None:
-        taken = [self.pop() for _ in range(count)]
-        self._stack.append(tuple(reversed(taken)))
+def _array_over(data: bytes, dtype: Any, shape: Any, fortran: bool) -> np.ndarray:
+    """Return a read-only view of the pickle's bytes; no memory is allocated for a size that a file claims."""
+    code = str(_require(dtype, StandIn).arguments[0])
+    order = str(dtype.state[1]) if isinstance(dtype.state, tuple) else "="
+    if code not in _NUMBERS or order not in "<>|=":
+        raise ValueError(f"it contains an array of type {code[:20]}")
+    kind = np.dtype(code).newbyteorder(order)  # type: ignore[arg-type]
+    lengths = tuple(_require(length, int) for length in _require(shape, tuple))
+    count = 1
+    for length in lengths:
+        count *= length
+        if length < 0 or count * kind.itemsize > len(data):
+            raise ValueError("it contains an array that is larger than its data")
+    if len(lengths) > _MAX_DIMENSIONS or count * kind.itemsize != len(data):
+        raise ValueError("it contains an array that does not fit its data")
+    return np.ndarray(lengths, kind, data, order="F" if fortran else "C")
 
-    def _dup(self, _: Any) -> None:
-        self._stack.append(self._stack[-1])
 
-    def _put(self, number: Any) -> None:
-        self._memo[len(self._memo) if number is None else int(number)] = self._stack[-1]
-
-    def _get(self, number: Any) -> None:
-        self._stack.append(self._memo[int(number)])
-
-    def _append(self, values: list[Any]) -> None:
-        target = self._stack[-1]
-        (target.items if isinstance(target, StandIn) else require(target, list)).extend(values)
-
-    def _set_items(self, pairs: list[Any]) -> None:
-        target = self._stack[-1]
-        for key, value in zip(pairs[::2], pairs[1::2], strict=True):
-            if isinstance(target, StandIn):
-                target.items.append((key, value))
-            elif isinstance(key, _PLAIN_KEYS):
-                require(target, dict)[key] = value
-            else:
-                raise Refused("has a key that is neither text nor a number")
-
-    def _name(self, text: str) -> None:
-        name = ".".join(text.split(" "))
-        if name not in _ALLOWED and not name.startswith("chumpy."):
-            raise Refused(f"names {name[:80]}, which is not part of a face model")
-        self._stack.append(_Name(name))
-
-    def _stack_name(self, _: Any) -> None:
-        name, module = self.pop(), self.pop()
-        self._name(f"{require(module, str)} {require(name, str)}")
-
-    def _reduce(self, _: Any) -> None:
-        arguments = require(self.pop(), tuple)
-        self._stack.append(self._called(require(self.pop(), _Name).text, arguments))
-
-    def _called(self, name: str, arguments: tuple[Any, ...]) -> Any:
-        """Return the substitute for a call's result; nothing is called."""
-        if name in _ENCODE:
-            text, encoding = arguments
-            if encoding not in ("latin1", "latin-1"):
-                raise Refused("encodes text in a way that no array needs")
-            return self._bytes(require(text, str))
-        if name in _BYTES and not arguments:
+def _bytes(raw: Any) -> bytes:
+    """Return the bytes of an array, which pickles of Python 2 may store as text."""
+    match raw:
+        case StandIn(name="_codecs.encode", arguments=(str(text), "latin1" | "latin-1")):
+            return text.encode("latin-1")
+        case StandIn(name="__builtin__.bytes", arguments=()):
             return b""
-        if name in _RECONSTRUCT:
-            return InertArray()
-        if name in _DTYPE:
-            return InertDtype(text_of(arguments[0]))
-        if name in _FROM_BUFFER:
-            raw, dtype, shape, order = arguments
-            return InertArray(array_over(self._bytes(raw), require(dtype, InertDtype), shape, order == "F"))
-        if name in _SCALAR:
-            return array_over(self._bytes(arguments[1]), require(arguments[0], InertDtype), (), False).item()
-        if name in _BARE:
-            return StandIn(require(arguments[0], _Name).text)
-        return StandIn(name, arguments)
-
-    def _bytes(self, raw: Any) -> bytes:
-        if isinstance(raw, bytes):
-            return raw
-        self._encoded += len(require(raw, (str, bytearray)))
-        if self._encoded > _MAX_ENCODED:
-            raise Refused("makes more bytes of text than a face model has")
-        return raw.encode("latin-1") if isinstance(raw, str) else bytes(raw)
-
-    def _build(self, _: Any) -> None:
-        state, target = self.pop(), self._stack[-1]
-        if isinstance(target, InertArray):
-            _, shape, dtype, fortran, raw = require(state, tuple)
-            is_list = require(dtype, InertDtype).code in ("O", "O8")
-            target.values = (
-                require(raw, list) if is_list else array_over(self._bytes(raw), dtype, shape, bool(fortran))
-            )
-        elif isinstance(target, InertDtype):
-            target.order = text_of(require(state, tuple)[1])
-        else:
-            require(target, StandIn).state = state
+        case str():
+            return raw.encode("latin-1")
+    return bytes(_require(raw, (bytes, bytearray)))
 
 
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_LITERALS = frozenset(
-    {
-        *("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4", "FLOAT", "BINFLOAT"),
-        *("STRING", "BINSTRING", "SHORT_BINSTRING", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE"),
-        *("BINUNICODE8", "BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
-    }
-)
-_IDLE = frozenset({"PROTO", "FRAME", "STOP"})
-_OPCODES: dict[str, Callable[[_Machine, Any], None]] = {
-    "MARK": _Machine._mark,
-    "POP": _Machine._drop,
-    "POP_MARK": _Machine._drop_marked,
-    "DUP": _Machine._dup,
-    "EMPTY_TUPLE": lambda machine, _: machine._tuple(0),
-    "TUPLE1": lambda machine, _: machine._tuple(1),
-    "TUPLE2": lambda machine, _: machine._tuple(2),
-    "TUPLE3": lambda machine, _: machine._tuple(3),
-    "TUPLE": lambda machine, _: machine._new(tuple(machine._marked())),
-    "EMPTY_LIST": lambda machine, _: machine._new([]),
-    "EMPTY_SET": lambda machine, _: machine._new(StandIn("builtins.set")),
-    "LIST": lambda machine, _: machine._new(machine._marked()),
-    "APPEND": lambda machine, _: machine._append([machine.pop()]),
-    "APPENDS": lambda machine, _: machine._append(machine._marked()),
-    "ADDITEMS": lambda machine, _: machine._append(machine._marked()),
-    "EMPTY_DICT": lambda machine, _: machine._new({}),
-    "DICT": lambda machine, _: _dict(machine),
-    "SETITEM": lambda machine, _: _set_item(machine),
-    "SETITEMS": lambda machine, _: machine._set_items(machine._marked()),
-    **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT", "MEMOIZE"), _Machine._put),
-    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _Machine._get),
-    "GLOBAL": _Machine._name,
-    "STACK_GLOBAL": _Machine._stack_name,
-    "REDUCE": _Machine._reduce,
-    "NEWOBJ": _Machine._reduce,  # creates an object without a state, as a call does
-    "BUILD": _Machine._build,
-}
-
-
-def _set_item(machine: _Machine) -> None:
-    value, key = machine.pop(), machine.pop()
-    machine._set_items([key, value])
-
-
-def _dict(machine: _Machine) -> None:
-    pairs = machine._marked()
-    machine._new({})
-    machine._set_items(pairs)
+def _require(value: Any, kind: Any) -> Any:
+    """Return the value if it has the given type; otherwise raise a ValueError."""
+    if not isinstance(value, kind):
+        raise ValueError(f"a {type(value).__name__} in the wrong place")
+    return value

@@ -8,7 +8,6 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import NPZ_ERRORS, check_npz_sizes
-from facerf_cli.files.inert_arrays import InertArray
 from facerf_cli.logs import one_line
 
 EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means
@@ -59,7 +58,7 @@ def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:
         raise ValueError("its triangles name vertices that it does not have")
 
 
-def read_npz(path: Path) -> dict[str, InertArray]:
+def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Read the arrays of an .npz by name, without pickles and with bounds, as `read_inert_pickle` does.
 
     Raises InputError for any other file.
@@ -69,7 +68,7 @@ def read_npz(path: Path) -> dict[str, InertArray]:
             raise ValueError("it is not an .npz")
         check_npz_sizes(path)
         with np.load(path, allow_pickle=False) as file:
-            return {key: InertArray(file[key]) for key in file.files}
+            return {key: file[key] for key in file.files}
     except NPZ_ERRORS as error:
         raise InputError(
             f"{path}: cannot be read ({one_line(str(error))[:160]}); give an .npz of plain arrays"
