@@ -1,15 +1,21 @@
 """Colour spaces: from the encodings of files to scene-linear Rec.709, and from there to sRGB for display.
 
 Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
-the ACES spaces). A name that is not defined here is looked up in an OpenColorIO configuration (`ocio`). A
-view turns scene-linear values into values of a display.
+the ACES spaces). Constants are those of colour-science, which is imported only for what few files need: other
+transfer functions, and colour temperatures. A name that is not defined here is looked up in an OpenColorIO
+configuration (`ocio`). A view turns scene-linear values into values of a display.
 """
 
 import difflib
+import importlib
 import math
+import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from functools import cache
+from typing import Any, Literal
 
 import numpy as np
 
@@ -27,9 +33,6 @@ _ROMM_CHROMATICITIES = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 
 
 # From XYZ to the cone responses of the Bradford transform (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_ADOBE_GAMMA = 563 / 256
-# Film scans: code values of black and of white (18 % grey is at 445), and code values a factor of 10.
-_CINEON_BLACK, _CINEON_WHITE, _CINEON_DECADE = 95, 685, 300
 _BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
 # Limits of chromaticities: the tolerance of equal ones, the largest coordinate, and the smallest area or
 # coordinate of primaries that span a space.
@@ -59,29 +62,51 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.copysign(encoded, linear).astype(np.float32)
 
 
+@cache
+def colour_science() -> Any:
+    """Import colour-science without its warnings and side effects; it takes most of a second."""
+    with np.printoptions(), warnings.catch_warnings(), _without("OpenImageIO"):
+        warnings.simplefilter("ignore")  # about its optional dependencies
+        return importlib.import_module("colour")
+
+
+@contextmanager
+def _without(name: str) -> Iterator[None]:
+    """Hide a module from imports in the block.
+
+    colour-science would keep types of OpenImageIO alive, which OpenImageIO reports as leaks at exit.
+    """
+    modules: dict[str, Any] = sys.modules
+    hidden = modules.get(name)
+    modules[name] = None  # makes Python raise ImportError for it
+    try:
+        yield
+    finally:
+        del modules[name]
+        if hidden is not None:
+            modules[name] = hidden
+
+
 def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Invert ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
-    alpha, beta = 1.09929682680944, 0.018053968510807
-    size = np.abs(encoded)
-    linear = np.where(size < 4.5 * beta, size / 4.5, ((size + alpha - 1) / alpha) ** (1 / 0.45))
-    return np.copysign(linear, encoded).astype(np.float32)
+    decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
+    return np.copysign(decoded, encoded).astype(np.float32)
 
 
 def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
-    return (np.sign(encoded) * np.abs(encoded) ** _ADOBE_GAMMA).astype(np.float32)
+    curve = colour_science().RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding
+    return np.copysign(curve(np.abs(encoded)), encoded).astype(np.float32)
 
 
 def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Invert the transfer function of ROMM RGB (ISO 22028-2), which is ProPhoto RGB."""
-    size = np.abs(encoded)
-    return np.copysign(np.where(size < 16 / 512, size / 16, size**1.8), encoded).astype(np.float32)
+    decoded = colour_science().models.cctf_decoding_ROMMRGB(np.abs(encoded))
+    return np.copysign(decoded, encoded).astype(np.float32)
 
 
 def _cineon_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Invert Kodak's Cineon curve, of code values 0..1023 as 0..1; black is 0 and diffuse white 1."""
-    black = 10 ** ((_CINEON_BLACK - _CINEON_WHITE) / _CINEON_DECADE)
-    relative = 10 ** ((1023 * encoded - _CINEON_WHITE) / _CINEON_DECADE)
-    return ((relative - black) / (1 - black)).astype(np.float32)
+    return np.asarray(colour_science().models.log_decoding_Cineon(encoded), np.float32)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Colour spaces against colour-science and OpenColorIO."""
 
 import math
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -26,6 +28,31 @@ ORACLE_NAMES = {
     ours.LINEAR: "ITU-R BT.709",
     ours.PROPHOTO: "ROMM RGB",
 }
+
+
+def test_primaries_are_those_of_colour_science() -> None:
+    for space, name in {**ORACLE_NAMES, ours.ADOBE_RGB: "Adobe RGB (1998)"}.items():
+        known = oracle.RGB_COLOURSPACES[name]
+        assert space.chromaticities == (*known.primaries.ravel(), *known.whitepoint)
+
+
+def test_usual_images_do_not_import_colour_science() -> None:
+    """sRGB and Display P3, with profiles or without, EXRs and studio lights without a temperature."""
+    program = (
+        "import sys, numpy as np\n"
+        "from facerf_cli import colour\n"
+        "from facerf_cli.files.icc import space_of_profile\n"
+        "from facerf_cli.light.studio_points import StudioLight, intensity_of\n"
+        "from tests import icc_profiles\n"
+        "spaces = colour.SRGB, colour.ACESCG, colour.LINEAR_REC2020\n"
+        "profiles = icc_profiles.DISPLAY_P3, icc_profiles.PROPHOTO\n"
+        "spaces += tuple(space_of_profile(profile, '') for profile in profiles)\n"
+        "for space in spaces:\n"
+        "    colour.to_linear_rec709(np.ones((2, 3, 3), np.uint8), space)\n"
+        "intensity_of(StudioLight((0.0, 0.0)))\n"
+        "assert 'colour' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def oracle_matrix(name: str) -> np.ndarray:

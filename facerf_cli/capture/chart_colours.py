@@ -6,20 +6,13 @@ in alternation with it, as a plane in the logarithm of brightness, after Finlays
 alternating least squares technique for nonuniform intensity color correction'.
 """
 
-import importlib
-import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from facerf_cli.capture.chart_patches import GREYS, centres
-from facerf_cli.colour import lab_d65, luminance
-from facerf_cli.errors import FacerfError
+from facerf_cli.colour import colour_science, lab_d65, luminance
 
 CHART_NAME = "ColorChecker24 - After November 2014"
 _ITERATIONS = 12  # of matrix and light; the next one changes them by less than a thousandth
@@ -83,36 +76,3 @@ def published_colours() -> np.ndarray:
     chart = science.CCS_COLOURCHECKERS[CHART_NAME]
     xyz = science.xyY_to_XYZ(list(chart.data.values()))
     return np.asarray(science.XYZ_to_RGB(xyz, "ITU-R BT.709", chart.illuminant, "Bradford"), np.float64)
-
-
-@cache
-def colour_science() -> Any:
-    """Import colour-science, of the extra `chart`, without its warnings and side effects.
-
-    FacerfError where it is not installed.
-    """
-    try:
-        with np.printoptions(), warnings.catch_warnings(), _without("OpenImageIO"):
-            warnings.simplefilter("ignore")  # about its optional dependencies
-            return importlib.import_module("colour")
-    except ImportError:
-        raise FacerfError(
-            "--colour-chart: colour-science is not installed; run pip install 'facerf[chart]'"
-        ) from None
-
-
-@contextmanager
-def _without(name: str) -> Iterator[None]:
-    """Hide a module from imports in the block.
-
-    colour-science would keep types of OpenImageIO alive, which OpenImageIO reports as leaks at exit.
-    """
-    modules: dict[str, Any] = sys.modules
-    hidden = modules.get(name)
-    modules[name] = None  # makes Python raise ImportError for it
-    try:
-        yield
-    finally:
-        del modules[name]
-        if hidden is not None:
-            modules[name] = hidden

@@ -17,7 +17,6 @@ _NO_BREAK = "\N{NO-BREAK SPACE}"
 # Extras of the package (pyproject.toml) for users, and the use of each.
 EXTRAS = {
     "synth": "`--renderer mitsuba`",
-    "chart": "`prepare-dataset --colour-chart`",
     "face-models": "Basel's models in `face-model import`",
     "tensorboard": "the curves of `train`",
     "ray": "`--ray`, on clusters",

@@ -155,8 +155,9 @@ def _same(space: ColourSpace, known: ColourSpace) -> bool:
     """True if two spaces differ by rounding only."""
     assert space.chromaticities is not None and known.chromaticities is not None
     matrices = matrix_to_rec709(space.chromaticities), matrix_to_rec709(known.chromaticities)
-    curves = _decoded_ramp(space), _decoded_ramp(known)
-    return np.allclose(*matrices, 0, _SAME_MATRIX) and np.allclose(*curves, 0, _SAME_CURVE)
+    if not np.allclose(*matrices, 0, _SAME_MATRIX):  # before a curve that has to be imported
+        return False
+    return np.allclose(_decoded_ramp(space), _decoded_ramp(known), 0, _SAME_CURVE)
 
 
 def _decoded_ramp(space: ColourSpace) -> np.ndarray:

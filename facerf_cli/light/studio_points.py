@@ -3,11 +3,12 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.light.blackbody import blackbody_rgb
+from facerf_cli.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 
@@ -15,6 +16,24 @@ _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 48  # samples of a light from all around
 _NEAREST_M = 0.05  # distance below which a light does not grow any more
 _FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
+WHITE_K = 6504.0  # the correlated colour temperature of D65
+
+
+def blackbody_rgb(kelvin: float) -> np.ndarray:
+    """Linear Rec.709 [3] of a blackbody of 1667 to 25000 K, of luminance 1; 1, 1, 1 at `WHITE_K`.
+
+    The Planckian locus is a little greener than D65: colours are divided by that of `WHITE_K`. What is
+    outside Rec.709, as of candles, is clipped.
+    """
+    rgb = (_planckian_rgb(kelvin) / _planckian_rgb(WHITE_K)).clip(min=0)
+    balanced: np.ndarray = rgb / luminance(rgb)
+    return balanced
+
+
+def _planckian_rgb(kelvin: float) -> np.ndarray:
+    """Linear Rec.709 [3] of the Planckian locus, by Kang et al. 2002."""
+    x, y = colour_science().temperature.CCT_to_xy_Kang2002(kelvin)
+    return np.linalg.solve(rgb_to_xyz(REC709_CHROMATICITIES), np.array([x / y, 1.0, (1 - x - y) / y]))
 
 
 def intensity_of(light: StudioLight) -> Tensor:

@@ -7,11 +7,9 @@ import warnings
 import numpy as np
 import pytest
 
-from facerf_cli.capture import chart_colours as colours
 from facerf_cli.capture.chart_colours import fit_colours, neutral_matrix, published_colours
 from facerf_cli.capture.chart_patches import GREYS, centres
 from facerf_cli.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
-from facerf_cli.errors import FacerfError
 from tests.capture.chart_image import CAMERA
 
 with warnings.catch_warnings():
@@ -88,10 +86,3 @@ def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_colour_science_is_an_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    colours.colour_science.cache_clear()
-    monkeypatch.setitem(sys.modules, "colour", None)
-    with pytest.raises(FacerfError, match=r"pip install 'facerf\[chart\]'"):
-        colours.colour_science()
