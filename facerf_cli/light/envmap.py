@@ -11,14 +11,15 @@ from typing import Literal
 
 import torch
 import torch.nn.functional as F
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.light.rig_triangles import lights_around
 from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong_solid_angles
 
 Sampling = Literal["cell", "smooth", "paper"]
+_DIRECTIONS_AT_ONCE = 1 << 12  # that are compared with all triangles of a rig
+_OUTSIDE = -1e-4  # a share below it: the rig does not surround this direction
 _COLUMNS_AT_ONCE = 1 << 10  # of a map, which are integrated in float64
 _LEAST_CELL_ROWS = 256  # of the grid on which cells are found
 _BALL_SAMPLES = 3  # along each side of a pixel of a ball
@@ -191,3 +192,33 @@ def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:
     sources = latlong_directions(_SOURCE_ROWS, 2 * _SOURCE_ROWS).reshape(-1, 3)
     power = texel_integrals(envmap, _SOURCE_ROWS, 2 * _SOURCE_ROWS, rotate_deg).reshape(-1, 3).float()
     return (normals @ sources.T).clamp(min=0) @ power
+
+
+def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
+    """Three of the lights [L, 3] around each of directions [P, 3]: indices and shares [P, 3], which sum to 1.
+
+    A light that moves passes from one cell of the rig to the next in a step; between the lights of a triangle
+    it is shared by barycentric coordinates, so that an image under it changes without steps. Shares are
+    float64. Where a rig surrounds no such direction, its nearest light has all.
+    """
+    nearest = (directions.double() @ lights.double().T).argmax(1)
+    index = nearest[:, None].expand(-1, 3).clone()
+    share = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).repeat(len(directions), 1)
+    try:
+        hull = ConvexHull(lights.double().numpy())
+    except (QhullError, ValueError):  # fewer than four lights, or all in a plane
+        return index, share
+    corners = torch.from_numpy(hull.simplices).long()  # [F, 3]
+    planes = torch.from_numpy(hull.equations)  # [F, 4]: n . x + d = 0, n outward
+    around = torch.linalg.pinv(lights.double()[corners].mT)  # [F, 3, 3]: from a direction to its shares
+    reciprocal = planes[:, :3] / -planes[:, 3:].clamp(max=-1e-9)  # of the distance along a ray
+    for first in range(0, len(directions), _DIRECTIONS_AT_ONCE):
+        rows = slice(first, first + _DIRECTIONS_AT_ONCE)
+        toward = directions[rows].double()
+        triangle = (toward @ reciprocal.T).argmax(1)
+        found = torch.einsum("pij,pj->pi", around[triangle], toward)
+        inside = (found > _OUTSIDE).all(1) & (planes[triangle, 3] < 0)
+        found = found.clamp(min=0)
+        index[rows][inside] = corners[triangle][inside]
+        share[rows][inside] = (found / found.sum(1, keepdim=True).clamp_min(1e-12))[inside]
+    return index, share

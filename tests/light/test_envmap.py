@@ -9,10 +9,10 @@ from facerf_cli.light.envmap import (
     ball,
     check_envmap,
     envmap_weights,
+    lights_around,
     rotated_weights,
     texel_integrals,
 )
-from facerf_cli.light.rig_triangles import lights_around
 from facerf_cli.light.sphere import (
     azel_to_direction,
     direction_to_uv,
