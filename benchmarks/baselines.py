@@ -29,8 +29,7 @@ from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.weights import load_pairs
-from facerf_cli.evaluation.crop_view import CropView
-from facerf_cli.evaluation.people import Person
+from facerf_cli.evaluation.people import CropView, Person
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight

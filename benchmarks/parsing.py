@@ -31,7 +31,7 @@ from scipy.ndimage import gaussian_gradient_magnitude
 from skimage.transform import resize
 
 from facerf_cli.capture.yale_b import read_yale_b
-from facerf_cli.evaluation.protocols.yale_b_cases import SETTINGS_SUBJECTS
+from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS
 from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS

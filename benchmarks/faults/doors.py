@@ -80,7 +80,7 @@ def _light_list(path: Path) -> None:
 
 def _table(path: Path) -> None:
     from facerf_cli.capture.yale_b import read_shifts
-    from facerf_cli.evaluation.protocols.pairs import read_facts
+    from facerf_cli.evaluation.pairs import read_facts
 
     (read_shifts if path.name == "shifts.csv" else read_facts)(path)
 
@@ -106,7 +106,7 @@ def _fit(path: Path) -> None:
 
 
 def _array(path: Path) -> None:
-    from facerf_cli.evaluation.case import read_array
+    from facerf_cli.evaluation.pairs import read_array
 
     read_array(path)
 
@@ -200,7 +200,7 @@ def _report(path: Path) -> None:
 
 
 def _figures(path: Path) -> None:
-    from facerf_cli.evaluation.case_files import images_csv, read_figures
+    from facerf_cli.evaluation.report import images_csv, read_figures
 
     images_csv(read_figures(path).rows)
 

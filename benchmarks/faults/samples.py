@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import save
 
 from facerf_cli.colour import LINEAR_P3
-from facerf_cli.evaluation.case_files import FORMAT
+from facerf_cli.evaluation.report import FORMAT
 from facerf_cli.face.fit import fit_from_arrays, save_fit
 from facerf_cli.face.importers.ict import VERTICES
 from facerf_cli.face.morphable import BUILTIN_PATH
@@ -477,7 +477,7 @@ def figures() -> Samples:
         "ev": 0.0,
         "has_source": True,
     }
-    content = {"format": FORMAT, "key": "k", "rows": [row], "strips": [strip], "pictures": ["x.exr"]}
+    content = {"format": FORMAT, "rows": [row], "strips": [strip], "pictures": ["x.exr"]}
     return {"a.json": json.dumps(content).encode()}
 
 

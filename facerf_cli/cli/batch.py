@@ -252,7 +252,8 @@ class _Work:
             return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
 
         try:
-            read = read_row(item.input_path) if self.indexed and is_regular(item.input_path) else None
+            can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
+            read = read_row(item.input_path) if self.indexed and can_be_read else None
             outcome = self.process(item)
             made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
             return result(outcome=outcome, made=made)

@@ -1,27 +1,18 @@
 """`facerf evaluate`: the paper's comparisons, a verb for each protocol, on the user's own data."""
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.evaluation_options import (
+from facerf_cli.cli.items.evaluation_settings import (
     DATA,
     MEASURES,
     METHODS,
-    DatasetArgument,
     EvaluateOptions,
-    EveryOption,
-    JointFitOption,
-    PhotosOrDatasetArgument,
-    SplitOption,
-    measures_portraits,
-    no_part_of_preset,
-    only_dataset,
-    refuse_for_others,
-    refuse_without_field,
-    with_shared_options,
+    SplitOptions,
 )
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, Refine, RefineOption
 from facerf_cli.cli.options import (
@@ -30,7 +21,9 @@ from facerf_cli.cli.options import (
     FaceModelOption,
     InputColourspaceOption,
     NetworkAloneOption,
+    refuse_given,
     settings_of,
+    with_groups,
     with_machines,
 )
 from facerf_cli.cli.photo_options import (
@@ -41,22 +34,44 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
 )
 from facerf_cli.errors import UsageError
+from facerf_cli.option import Only
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
+
+_CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
+_BATCH = ("overwrite", "dry_run", "jobs")
+_GIVEN_LIGHTS = ("output", "reflectance", "against", "compare", "pictures", "space", "lpips", "vgg_weights")
+_GIVEN_IMAGES = ("output", "space", "lpips", "vgg_weights")  # no model is run
+
+DatasetArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="DATASET",
+        help="Folder of `facerf prepare-dataset`, with pairs of `facerf relight-dataset`.",
+        show_default=False,
+    ),
+]
+PhotosOrDatasetArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="PHOTO...|DATASET",
+        help="Images, folders, - for a list on standard input; or a folder of `facerf prepare-dataset`.",
+        show_default=False,
+    ),
+]
 
 
 def olat(
     context: typer.Context,
     dataset: DatasetArgument,
-    options: EvaluateOptions,
-    split: SplitOption = "test",
-    every: EveryOption = 1,
-    joint_fit: JointFitOption = False,
+    *,
+    data: SplitOptions,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
-) -> int:
+    options: EvaluateOptions,
+) -> None:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
     In each source of the split's pairs the face is found and fitted, as in any photo, and relit by the light
@@ -67,34 +82,19 @@ def olat(
     texture under the cosine of the light: the least that a method must beat. A second checkpoint, --against
     without_normals.safetensors, gives the paper's Table 3.
     """
-    no_part_of_preset(options, every)
-    refuse_without_field(context, options, "network_alone")
-    from facerf_cli.cli.items.evaluate_olat import run_olat
-
+    _check(options, data)
+    _refuse_without_field(context, options, "network_alone")
     photo = PhotoOptions(
         settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
     )
-    photo.check()
-    return run_olat(dataset, options, photo, split, every, joint_fit, network_alone)
-
-
-def _light_options(
-    photo: PhotoOptions, options: EvaluateOptions, non_negative: bool, refine: Refine
-) -> LightOptions:
-    """Options of the light of each image; V_f, if its weights are given, refines it."""
-    vgg_weights = options.vgg_weights if refine == "features" else None
-    light = LightOptions(photo, non_negative=non_negative, refine=refine, vgg_weights=vgg_weights)
-    light.check()
-    return light
+    _run("olat", [str(dataset)], dataset, options, data, photo, network_alone=network_alone)
 
 
 def reconstruction(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
-    options: EvaluateOptions,
-    split: SplitOption = "test",
-    every: EveryOption = 1,
-    joint_fit: JointFitOption = False,
+    *,
+    data: SplitOptions,
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
@@ -103,7 +103,8 @@ def reconstruction(
     face_model: FaceModelOption = "builtin",
     non_negative: NonNegativeOption = True,
     refine: RefineOption = "none",
-) -> int:
+    options: EvaluateOptions,
+) -> None:
     """Explain photos by reflectance and light, and render them again (the paper's Table 2).
 
     Each method estimates its own light and reflectance; the face is rendered alone into the photo's crop and
@@ -111,9 +112,9 @@ def reconstruction(
     makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
     light is known, so light_error_deg is the angle between the brightest single lights.
     """
-    no_part_of_preset(options, every)
-    folder = only_dataset(inputs)
-    refuse_for_others(context, photos=folder is None)
+    _check(options, data)
+    folder = _only_dataset(inputs)
+    _refuse_for_others(context, photos=folder is None)
     photo = PhotoOptions(
         settings_of(context),
         input_colourspace,
@@ -123,11 +124,7 @@ def reconstruction(
         geometry=geometry,
         landmarks_from=landmarks_from,
     )
-    photo.check()
-    light = _light_options(photo, options, non_negative, refine)
-    from facerf_cli.cli.items.evaluate_photos import run_reconstruction
-
-    return run_reconstruction(inputs, folder, options, photo, light, split, every, joint_fit)
+    _run("reconstruction", inputs, folder, options, data, photo, non_negative=non_negative, refine=refine)
 
 
 def transfer(
@@ -141,7 +138,7 @@ def transfer(
             show_default=False,
         ),
     ],
-    options: EvaluateOptions,
+    *,
     photos: Annotated[
         bool,
         typer.Option("--photos", help="Read photos, two of each person or in folders.", rich_help_panel=DATA),
@@ -154,9 +151,7 @@ def transfer(
             rich_help_panel=METHODS,
         ),
     ] = False,
-    split: SplitOption = "test",
-    every: EveryOption = 1,
-    joint_fit: JointFitOption = False,
+    data: SplitOptions,
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
@@ -164,16 +159,17 @@ def transfer(
     face_model: FaceModelOption = "builtin",
     non_negative: NonNegativeOption = True,
     refine: RefineOption = "none",
-) -> int:
+    options: EvaluateOptions,
+) -> None:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
     Image A is rendered from the reflectance that was read from B, turned to A's pose, under A's light; then B
     from A's. The same method estimates that light in the image with its own reflectance. Of a DATASET,
     couples are sources of one person with different cameras and different maps.
     """
-    no_part_of_preset(options, every)
-    refuse_for_others(context, photos)
-    refuse_without_field(context, options, "held_to_photo")
+    _check(options, data)
+    _refuse_for_others(context, photos)
+    _refuse_without_field(context, options, "held_to_photo")
     photo = PhotoOptions(
         settings_of(context),
         input_colourspace,
@@ -182,20 +178,17 @@ def transfer(
         geometry=geometry,
         landmarks_from=landmarks_from,
     )
-    photo.check()
-    light = _light_options(photo, options, non_negative, refine)
-    from facerf_cli.cli.items.evaluate_transfer import run_transfer
-
-    folder = None if photos else only_dataset(inputs)
+    folder = None if photos else _only_dataset(inputs)
     if not photos and folder is None:
         raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    return run_transfer(inputs, folder, options, photo, light, split, every, joint_fit, not held_to_photo)
+    alone = not held_to_photo
+    _run("transfer", inputs, folder, options, data, photo, alone, non_negative=non_negative, refine=refine)
 
 
 def geometry(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
-    options: EvaluateOptions,
+    *,
     mean_checkpoint: Annotated[
         Path | None,
         typer.Option(
@@ -206,27 +199,27 @@ def geometry(
             rich_help_panel=METHODS,
         ),
     ] = None,
-    split: SplitOption = "test",
-    every: EveryOption = 1,
+    data: Annotated[SplitOptions, Only("split", "every")],
     face: FaceOption = "largest",
     landmarks: LandmarksOption = None,
     geometry: GeometryOption = None,
     landmarks_from: LandmarksFromOption = "facerf",
     input_colourspace: InputColourspaceOption = None,
     face_model: FaceModelOption = "builtin",
-) -> int:
+    options: EvaluateOptions,
+) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
     Both are fitted to the same landmarks of one image, or with --geometry network regressed from the same
     crop, and compared where both show the face. The paper trained networks with the mean face: give them as
     --mean-checkpoint. --against does not apply.
     """
-    no_part_of_preset(options, every)
+    _check(options, data)
     if options.against:
         raise UsageError("--against: does not apply to geometry; give --checkpoint and --mean-checkpoint")
-    folder = only_dataset(inputs)
-    refuse_for_others(context, photos=folder is None)
-    refuse_without_field(context, options, "mean_checkpoint")
+    folder = _only_dataset(inputs)
+    _refuse_for_others(context, photos=folder is None)
+    _refuse_without_field(context, options, "mean_checkpoint")
     photo = PhotoOptions(
         settings_of(context),
         input_colourspace,
@@ -236,10 +229,7 @@ def geometry(
         geometry=geometry,
         landmarks_from=landmarks_from,
     )
-    photo.check()
-    from facerf_cli.cli.items.evaluate_photos import run_geometry
-
-    return run_geometry(inputs, folder, options, photo, split, every, mean_checkpoint)
+    _run("geometry", inputs, folder, options, data, photo, mean_checkpoint=mean_checkpoint)
 
 
 def yale_b(
@@ -252,7 +242,7 @@ def yale_b(
             show_default=False,
         ),
     ],
-    options: EvaluateOptions,
+    *,
     shifts: Annotated[
         Path | None,
         typer.Option(
@@ -289,7 +279,8 @@ def yale_b(
     landmarks_from: LandmarksFromOption = "facerf",
     network_alone: NetworkAloneOption = False,
     face_model: FaceModelOption = "builtin",
-) -> int:
+    options: Annotated[EvaluateOptions, Only(*_GIVEN_LIGHTS, *_BATCH)],
+) -> None:
     """Relight real people to real point lights and compare with their photos under these.
 
     Sources are an image under one flash and four soft lights summed from the subject's own images; targets
@@ -299,14 +290,16 @@ def yale_b(
     runs on the sources that --pictures keeps; its PNGs are read as given, too, and its colours are averaged.
     The database is for research and never trained on.
     """
-    refuse_without_field(context, options, "network_alone")
-    options = measures_portraits(context, options)
+    options.check()
+    _refuse_without_field(context, options, "network_alone")
+    if options.reflectance is None and not options.against:
+        options = replace(options, reflectance=["portrait"])
     from facerf_cli.cli.items.evaluate_images import run_yale_b
 
     photo = PhotoOptions(
         settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
     )
-    return run_yale_b(folder, options, photo, shifts, subjects or [], network_alone, room)
+    raise typer.Exit(run_yale_b(folder, options, photo, shifts, subjects or [], network_alone, room))
 
 
 def pairs(
@@ -329,7 +322,7 @@ def pairs(
             show_default=False,
         ),
     ],
-    options: EvaluateOptions,
+    *,
     masks: Annotated[
         Path | None,
         typer.Option(
@@ -359,28 +352,93 @@ def pairs(
             rich_help_panel=MEASURES,
         ),
     ] = False,
-) -> int:
+    options: Annotated[EvaluateOptions, Only(*_GIVEN_IMAGES, *_BATCH)],
+) -> None:
     """Measure folders of predictions against a folder of truths, image by image.
 
     Trees are mirrored; names must match, suffixes may differ. A missing, an additional or a differently sized
     prediction is an error: no table is made of what is left.
     """
+    options = replace(options, reflectance=[])
+    options.check()
     options.require_output_apart([*predictions, truth, *([] if masks is None else [masks])])
     from facerf_cli.cli.items.evaluate_images import run_pairs
 
-    return run_pairs(predictions, truth, options, settings_of(context), masks, facts, face_distance)
+    settings = settings_of(context)
+    raise typer.Exit(run_pairs(predictions, truth, options, settings, masks, facts, face_distance))
 
 
-# Each protocol, and the shared options that it has no use for.
-_PROTOCOLS: tuple[tuple[Callable[..., int], tuple[str, ...]], ...] = (
-    (olat, ()),
-    (reconstruction, ()),
-    (transfer, ()),
-    (geometry, ()),
-    (yale_b, ("keep_eyes", "preset")),  # the mask is one ellipse, and the paper has no such figures
-    (pairs, ("reflectance", "against", "compare", "keep_eyes", "pictures", "preset")),  # no model is run
-)
+for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
+    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_machines(with_groups(_protocol)))
 
-for _function, _left_out in _PROTOCOLS:
-    _command = with_machines(with_shared_options(_function, _left_out))
-    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(_command)
+
+def _check(options: EvaluateOptions, data: SplitOptions) -> None:
+    """Raise UsageError for options that would fail every item, or where `--every` would reduce a preset."""
+    options.check()
+    if options.preset and data.every > 1:
+        raise UsageError(
+            "--preset and --every exclude each other: a preset has a fixed number of images; leave one out"
+        )
+
+
+def _only_dataset(inputs: Sequence[str]) -> Path | None:
+    """The dataset of the inputs, or None for photos; raises UsageError for both, or for a capture."""
+    for path in map(Path, inputs):
+        if (path / _CAPTURE_FILE).is_file():
+            raise UsageError(
+                f"{path}: a capture, not a dataset; run prepare-dataset on it and give the result"
+            )
+    datasets = [path for path in map(Path, inputs) if (path / _DATASET_FILE).is_file()]
+    if datasets and len(inputs) > 1:
+        raise UsageError(f"{datasets[0]}: one dataset among several inputs; give it alone, or give photos")
+    return datasets[0] if datasets else None
+
+
+def _refuse_for_others(context: typer.Context, photos: bool) -> None:
+    """Raise UsageError for an option of datasets given with photos, or of photos given with a dataset."""
+    if photos:
+        refuse_given(context, ("split", "every", "joint_fit"), "is for a prepared dataset; leave it out here")
+    else:
+        refuse_given(context, ("face", "landmarks", "input_colourspace"), "is for photos; leave it out here")
+
+
+def _refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
+    """Raise UsageError for an option of the field if that is not among the methods."""
+    if not options.has_field:
+        refuse_given(context, (name,), "is for the field; give --reflectance field too, or leave it out")
+
+
+def _run(
+    protocol: Literal["olat", "reconstruction", "transfer", "geometry"],
+    inputs: Sequence[str],
+    folder: Path | None,
+    options: EvaluateOptions,
+    data: SplitOptions,
+    photo: PhotoOptions,
+    network_alone: bool = True,
+    non_negative: bool = True,
+    refine: Refine = "none",
+    mean_checkpoint: Path | None = None,
+) -> None:
+    """Run a protocol on a dataset's folder, or without one on photos, and exit.
+
+    Args:
+        protocol: The protocol's name.
+        inputs: The photos.
+        folder: The prepared dataset; None for photos.
+        options: What is measured and where it goes.
+        data: The split of the dataset.
+        photo: How faces are found and fitted.
+        network_alone: True to leave the photo's correction out of the field.
+        non_negative: True to estimate lights from 0 up.
+        refine: The refinement of the estimated light.
+        mean_checkpoint: The networks of the mean face.
+    """
+    photo.check()
+    LightOptions(photo, non_negative=non_negative, refine=refine).check()
+    from facerf_cli.cli.items.evaluate_faces import FaceSettings, run_on_people, run_on_photos
+
+    settings = FaceSettings(
+        protocol, options, photo, data, network_alone, non_negative, refine, mean_checkpoint
+    )
+    raise typer.Exit(run_on_photos(settings, inputs) if folder is None else run_on_people(settings, folder))

@@ -8,6 +8,7 @@ row of a name counts. With `--shard` each process writes an index of its own and
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -36,11 +37,17 @@ class Made:
 
 
 def read_row(path: Path) -> Row:
-    """A row of a file to be read: its state and its digest. Raises InputError if it cannot be read."""
-    require_regular(path)
+    """A row of a file or folder to be read: its state and its digest; InputError if it cannot be read.
+
+    A folder's digest is of the names, sizes and times of the files in it.
+    """
     try:
         state = os.stat(path)
-        digest = _digest(path, *_state(state).values())
+        if stat.S_ISDIR(state.st_mode):
+            digest = _listing_digest(path)
+        else:
+            require_regular(path)
+            digest = _digest(path, *_state(state).values())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
     return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
@@ -50,6 +57,15 @@ def read_row(path: Path) -> Row:
 def _digest(path: Path, *_: int) -> str:
     """SHA-256 of a file in a state: its size, time and inode."""
     return file_sha256(path)
+
+
+def _listing_digest(folder: Path) -> str:
+    facts = []
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            state = path.stat()
+            facts.append([path.relative_to(folder).as_posix(), state.st_size, state.st_mtime_ns])
+    return hashlib.sha256(json.dumps(facts).encode("utf-8", "backslashreplace")).hexdigest()
 
 
 class _Rows:
@@ -113,7 +129,9 @@ class FolderIndex:
         """SHA-256 of a file; an unchanged one that the index knows is not read. Raises InputError."""
         known = self._rows.files.get(os.path.abspath(path))
         try:
-            same = known is not None and _state(os.stat(path)).items() <= known.items()
+            state = os.stat(path)
+            is_file = not stat.S_ISDIR(state.st_mode)  # a folder's own state says nothing of its files
+            same = is_file and known is not None and _state(state).items() <= known.items()
         except OSError:
             same = False
         if known is None or not same:

@@ -1,18 +1,115 @@
-"""Rows of figures from a comparison, one for each method: the metrics that every protocol shares."""
+"""The images of a case and the figures of each method on them: the metrics that every protocol shares."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
-from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.errors import InputError
-from facerf_cli.evaluation.case import Comparison
-from facerf_cli.evaluation.perceptual import perceptual_metric
+from facerf_cli.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
+from facerf_cli.network.feature_networks import SMALLEST_PX, Lpips
+from facerf_cli.training.pretrained import load_vgg, read_tensors
+
+
+@dataclass(frozen=True)
+class Case:
+    """One image to be measured.
+
+    `name` is a path without suffix, unique in its run; predictions in files are found by it. `person` is
+    whose face it shows: intervals resample people. Facts that are text break the tables down
+    ('pose': 'same pose'); numbers go to the list of images only.
+    """
+
+    name: str
+    person: str
+    facts: Mapping[str, str | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A case with its images, scene-linear Rec.709 [H, W, 3], all in one frame.
+
+    They are compared inside the mask [H, W] in 0..1. `source` is the image that the methods were given, in
+    its own frame. landmarks_px [68, 2] are those of the truth, for the face-recognition distance; without
+    them it is not measured. `extra` holds each method's figures that only the protocol can compute
+    ('light_error_deg'). `grey_as_given` is that of `pairs.read_predictions`.
+    """
+
+    case: Case
+    truth: np.ndarray
+    mask: np.ndarray
+    predictions: Mapping[str, np.ndarray]  # by method
+    source: np.ndarray | None = None
+    landmarks_px: np.ndarray | None = None
+    extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by method
+    grey_as_given: bool = False
+
+
+_PACKAGE, _FILE = "lpips", "weights/v0.1/vgg.pth"  # Zhang et al., LPIPS v0.1, BSD 2-Clause
+_ADVICE = "give --lpips lpips/weights/v0.1/vgg.pth of the package lpips"
+# SHA-256 of the heads' values, float32 little-endian. Version 0.0 has heads of the same names and shapes.
+_DIGEST = "9153a2043dccf3b525d4f13db916e93ef040548ea923b6f2100de5ebac141a78"
+
+
+@cache
+def perceptual_metric(
+    heads: Path | None, vgg_weights: str | Path | None
+) -> Callable[[np.ndarray, np.ndarray], float]:
+    """Load LPIPS of two sRGB images [H, W, 3] in 0..1, once a process.
+
+    `heads` is the file of `--lpips` (None: that of the installed package), `vgg_weights` the value of
+    `--vgg-weights`. Raises UsageError or InputError for weights that are missing or others.
+    """
+    if vgg_weights is None:
+        raise UsageError(
+            "--lpips: needs the weights of VGG-16; give --vgg-weights imagenet (downloads 528 MiB once), or "
+            "--vgg-weights PATH of torchvision's vgg16-397923af.pth"
+        )
+    network = Lpips()
+    _load_heads(network, heads or _installed_heads())
+    load_vgg(vgg_weights, network.trunk)
+    network.eval().requires_grad_(False)
+
+    def distance(prediction_srgb: np.ndarray, truth_srgb: np.ndarray) -> float:
+        if min(truth_srgb.shape[:2]) < SMALLEST_PX:
+            raise InputError(f"LPIPS: needs images of {SMALLEST_PX} px a side; leave --vgg-weights out")
+        both = srgb_to_linear(np.stack([prediction_srgb, truth_srgb]))
+        tensors = torch.from_numpy(both).permute(0, 3, 1, 2)
+        return float(network(tensors[:1], tensors[1:]))
+
+    return distance
+
+
+def _installed_heads() -> Path:
+    """Find the heads' file of the package `lpips` without importing it, since that needs torchvision."""
+    spec = find_spec(_PACKAGE)
+    path = Path(spec.origin).parent / _FILE if spec and spec.origin else None
+    if path is None or not path.is_file():
+        raise UsageError(f"LPIPS: its own weights are missing; install the package {_PACKAGE}, or {_ADVICE}")
+    return path
+
+
+def _load_heads(network: Lpips, path: Path) -> None:
+    try:
+        network.load_heads(read_tensors(path, _ADVICE))
+    except ValueError as error:
+        raise InputError(f"{path}: no heads of LPIPS on VGG ({error}); {_ADVICE}") from None
+    if _digest(network) != _DIGEST:
+        raise InputError(f"{path}: not the published heads of LPIPS v0.1 on VGG; {_ADVICE}")
+
+
+def _digest(network: Lpips) -> str:
+    values = torch.cat([head.detach().flatten() for head in network.heads]).numpy().astype("<f4")
+    return hashlib.sha256(values.tobytes()).hexdigest()
+
 
 Space = Literal["linear", "display"]
 

@@ -1,39 +1,155 @@
-"""Faces that protocols measure: people of a prepared dataset, and users' photos, fitted as the verbs do."""
+"""Faces that protocols measure, and the methods that relight them: people of a dataset, and photos."""
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from facerf_cli.baselines import RelightKind
+from facerf_cli.baselines.base import Explained, Reflectance
+from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path
 from facerf_cli.dataset.relight import render_source
 from facerf_cli.dataset.weights import load_pairs, pair_weights, weights_path
-from facerf_cli.errors import InputError
-from facerf_cli.evaluation.crop_view import CropView
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.light.sphere import RigLight
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_of
 from facerf_cli.models import Models, Sides
-from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.pipeline import (
+    DEFAULT_ESTIMATOR,
+    Estimator,
+    composition_of,
+    explain,
+    find_for,
+    head_of,
+    reflectance_of,
+    relight,
+    relit_by,
+)
 from facerf_cli.portrait.find import LandmarksFrom
+from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import skin_albedo
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A reflectance model under the name of its figures; its images are those of `facerf relight`."""
+
+    name: str
+    kind: RelightKind
+    models: Models
+    estimator: Estimator = DEFAULT_ESTIMATOR
+
+    def explained(self, head: Head, network_alone: bool = True) -> Explained:
+        """Reflectance and light; a field with the photo's correction gives the photo back by construction."""
+        if self.kind == "portrait":
+            raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
+        return explain(self.models, head, self.kind, network_alone, self.estimator)
+
+    def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
+        """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
+        return relight(self.models, None, head, light, target, reflectance).pixels
+
+    def images(
+        self,
+        photo: np.ndarray | None,
+        head: Head,
+        directions: Tensor,
+        weights: Tensor,
+        target: Target,
+        network_alone: bool,
+    ) -> Iterator[np.ndarray]:
+        """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
+        reflectance = reflectance_of(self.models, head, self.kind, network_alone, photo=photo)
+        composition = composition_of(self.models, photo, head, reflectance, target)
+        relit = relit_by(composition, head, reflectance, directions, weights, target)
+        for of_row in relit:
+            yield composition.image(of_row).pixels
+
+
+LIGHTS_DEG = (0, 30, 60, 90, 180)  # between a light and the camera's axis
+TURNS_DEG = (0, 30, 60, 180)  # of the head, from the source's pose to the target's
+_NO_TURN_DEG = 0.5
+_MASK_SIDE = 256  # texels of the masks
+
+
+@dataclass(frozen=True, eq=False)
+class CropView:
+    """A fitted face in its crop [S, S]: the (u, v) of each pixel and the mask of the comparison.
+
+    `mask` [S, S] in 0..1 is the paper's M_t where the crop shows the photo. Eyes are left out of it unless
+    `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results').
+    """
+
+    fit: FaceFit
+    uv: Tensor
+    mask: np.ndarray
+
+    @staticmethod
+    def of(model: MorphableModel, fit: FaceFit, shown: np.ndarray, keep_eyes: bool = False) -> "CropView":
+        """View a fit of `model`; `shown` [S, S] in 0..1 is where the crop shows the photo.
+
+        Raises InputError where nothing of the face is visible.
+        """
+        vertices = fit.vertices_camera(model)
+        fragments = rasterize(vertices, grid_triangles(), fit.camera)
+        uv = interpolate(grid_uv(), grid_triangles(), fragments)
+        mask = interior_mask(vertices, fragments, uv, _MASK_SIDE)[0]
+        if not keep_eyes:
+            mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
+        inside = mask.numpy() * shown
+        if not inside.max() > 0:
+            raise InputError("nothing of the fitted face is visible in the image; give its --landmarks")
+        return CropView(fit, uv, inside)
+
+    def region(self, name: str) -> np.ndarray:
+        """The mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
+        return sample_texture(region_mask(name, _MASK_SIDE)[None], self.uv)[..., 0].numpy()
+
+
+def angle_of(rotation: Tensor) -> float:
+    """The angle in degrees of a rotation [3, 3]."""
+    return float((((rotation.trace() - 1) / 2).clamp(-1, 1).acos()).rad2deg())
+
+
+def angle_class(angle_deg: float) -> str:
+    """'0 to 30 deg' and so on, of the angle between a light and the camera's axis."""
+    return _class(angle_deg, LIGHTS_DEG)
+
+
+def turn_class(angle_deg: float) -> str:
+    """'none', '0 to 30 deg' and so on, of the angle by which a head is turned."""
+    return "none" if angle_deg < _NO_TURN_DEG else _class(angle_deg, TURNS_DEG)
+
+
+def _class(angle_deg: float, edges_deg: tuple[int, ...]) -> str:
+    return next(f"{low} to {high} deg" for low, high in pairwise(edges_deg) if angle_deg <= high)
+
 
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
-class Sitting:
-    """A portrait as one method's models see it: the head, and the view in which it is compared."""
+class FittedPortrait:
+    """A portrait fitted by one method's models: the head, and the view in which it is compared."""
 
     head: Head
     view: CropView
@@ -41,32 +157,44 @@ class Sitting:
 
 @dataclass(frozen=True, eq=False)
 class Portrait:
-    """One face of a photo; every method's own models fit or regress its head, in one crop.
+    """One face of a photo; every method's models fit or regress its head, in one crop.
 
     `face` is the face as it was found, or a fit that was made beforehand. The photo's alpha tells what is
-    neither compared nor used.
+    neither compared nor used. `name` is the photo's in errors.
     """
 
+    name: str
     photo: LinearImage
     face: FaceBox | FaceFit
     sides: Sides
     keep_eyes: bool = False
-    _sittings: dict[int, tuple[Models, Sitting]] = field(default_factory=dict)
+    _fitted: dict[int, tuple[Models, FittedPortrait]] = field(default_factory=dict)
 
-    def by(self, models: Models) -> Sitting:
+    def by(self, models: Models) -> FittedPortrait:
         """The portrait by a method's models; InputError where nothing of the face is visible."""
-        if id(models) not in self._sittings:
+        if id(models) not in self._fitted:
             head = self._head(models)
-            shown = _shown(head.fit.crop, self.photo)
-            view = CropView.of(models.face, head.fit, shown, self.keep_eyes)
-            self._sittings[id(models)] = models, Sitting(head.without(models.face, shown), view)
-        return self._sittings[id(models)][1]
+            inside, view = self._inside(head.fit.crop), self._view(models, head.fit)
+            self._fitted[id(models)] = models, FittedPortrait(head.without(models.face, inside), view)
+        return self._fitted[id(models)][1]
 
     def posed_as(self, fit: FaceFit, models: Models) -> CropView:
         """The view in which another fit's shape has this portrait's pose."""
         own = self.by(models).view.fit
         posed = replace(own, alpha=fit.alpha, beta=fit.beta)
-        return CropView.of(models.face, posed, _shown(posed.crop, self.photo), self.keep_eyes)
+        return self._view(models, posed)
+
+    def _view(self, models: Models, fit: FaceFit) -> CropView:
+        try:
+            return CropView.of(models.face, fit, self._inside(fit.crop), self.keep_eyes)
+        except InputError as error:
+            raise InputError(f"{self.name}: {error}") from None
+
+    def _inside(self, crop: Crop) -> np.ndarray:
+        """The share of the photo in each pixel of a crop [S, S], in 0..1."""
+        alpha = self.photo.alpha
+        inside = crop.valid(*self.photo.pixels.shape[:2]).astype(np.float32)
+        return inside if alpha is None else inside * crop.apply(alpha[..., None])[..., 0]
 
     def _head(self, models: Models) -> Head:
         if not isinstance(self.face, FaceFit):
@@ -98,20 +226,14 @@ class Person:
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
-    def portraits(self, pairs: Iterable[Pair]) -> Iterator[tuple[Pair, Portrait]]:
-        """Yield the pairs with their sources; those in which no face is found are named and left out."""
-        for pair in pairs:
-            try:
-                portrait = self.portrait(pair)
-            except InputError as error:
-                log.warning("%s; left out", error)
-            else:
-                yield pair, portrait
+    def face_of(self, pair: Pair) -> "SourceFace":
+        """The source of a pair; InputError where no face is found in it."""
+        case = Case(_name(pair), self.name, self.facts | {"map": pair.envmap})
+        return SourceFace(case, self.portrait(pair), (self, pair))
 
     def portrait(self, pair: Pair) -> Portrait:
-        """The source of a pair; InputError where no face is found in it."""
-        name = f"{pair.subject}/{pair.index:05d}"
-        return self._portrait(self.source(pair), pair.source_camera, name)
+        """The face in the source of a pair; InputError where none is found in it."""
+        return self._portrait(self.source(pair), pair.source_camera, _name(pair))
 
     def lit(self, camera: str) -> Portrait:
         """The person in a camera under all lights: under one light no detector finds a face."""
@@ -132,7 +254,7 @@ class Person:
             face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
         else:
             face = find_for(self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
-        return Portrait(LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
+        return Portrait(name, LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
 
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
@@ -173,6 +295,39 @@ class Person:
         return float(value)
 
 
+@dataclass(frozen=True, eq=False)
+class SourceFace:
+    """A face that is measured; of a dataset its person and the pair whose source it is, too."""
+
+    case: Case
+    portrait: Portrait
+    origin: tuple[Person, Pair] | None = None
+
+
+Compare = Callable[[Sequence[SourceFace]], Iterable[Comparison]]
+
+
+def compare_people(
+    person: Person, groups: Iterable[Sequence[Pair]], compare: Compare
+) -> Iterator[Comparison]:
+    """Compare the sources of each group of a person's pairs; the loop of every protocol over a dataset.
+
+    A group in which no face is found, or nothing of it is visible, is named and left out.
+    """
+    for pairs in groups:
+        try:
+            found = list(compare([person.face_of(pair) for pair in pairs]))
+        except InputError as error:
+            names = " and ".join(map(_name, pairs))
+            log.warning("%s: left out (%s)", names, error)
+        else:
+            yield from found
+
+
+def _name(pair: Pair) -> str:
+    return f"{pair.subject}/{pair.index:05d}"
+
+
 def _in_own_frame(fit: FaceFit) -> FaceFit:
     """The fit with its crop as a separate image: the crop's pixels are the photo's."""
     side_px = fit.crop.size_px
@@ -186,9 +341,3 @@ def evenly(groups: Mapping[str, Sequence[T]], most: int) -> dict[str, list[T]]:
     for place, name in rounds[:most]:
         chosen[name].append(groups[name][place])
     return {name: members for name, members in chosen.items() if members}
-
-
-def _shown(crop: Crop, photo: LinearImage) -> np.ndarray:
-    """The share of the photo in each pixel of its crop [S, S], in 0..1."""
-    inside = crop.valid(*photo.pixels.shape[:2]).astype(np.float32)
-    return inside if photo.alpha is None else inside * crop.apply(photo.alpha[..., None])[..., 0]

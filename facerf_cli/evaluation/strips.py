@@ -9,8 +9,7 @@ import numpy as np
 from PIL import Image
 
 from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.evaluation.case import Comparison
-from facerf_cli.evaluation.measure import Row
+from facerf_cli.evaluation.measure import Comparison, Row
 from facerf_cli.evaluation.summary import metric_named
 from facerf_cli.metrics import best_scale
 

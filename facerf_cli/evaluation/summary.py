@@ -13,9 +13,45 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.evaluation.measure import METRICS, Metric, Row
-from facerf_cli.evaluation.published import PublishedFigure
 from facerf_cli.logs import counted
 from facerf_cli.metrics import Interval, mean_interval
+
+
+@dataclass(frozen=True)
+class PublishedFigure:
+    """A published figure: mean and standard deviation over images of one metric of one method.
+
+    `group` is the fact and value of our figures that it is shown with ('pose', 'same pose'); None is all
+    images. `source` and `data` name where it was published and what it was measured on.
+    """
+
+    method: str
+    metric: str
+    mean: float
+    sd: float | None = None
+    group: tuple[str, str] | None = None
+    source: str = "the paper"
+    data: str = "other data than ours"
+    digits: int | None = None  # after the decimal point, as published; None: as ours
+
+    def shown(self, digits: int) -> tuple[str, str]:
+        """Format mean and standard deviation, with the published digits if they are known."""
+        digits = digits if self.digits is None else self.digits
+        return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
+
+
+_METHODS_OF_TABLE_2 = ("the paper's", "Smith et al.", "Schneider et al.", "Tewari et al.")
+
+
+def paper_table_2(
+    metric: str, data: str, figures: Sequence[tuple[float, float]]
+) -> tuple[PublishedFigure, ...]:
+    """A row of the paper's Table 2: mean and standard deviation of each method there."""
+    return tuple(
+        PublishedFigure(method, metric, mean, sd, None, "Table 2", data, 3)
+        for method, (mean, sd) in zip(_METHODS_OF_TABLE_2, figures, strict=True)
+    )
+
 
 ALL = "all images"
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal

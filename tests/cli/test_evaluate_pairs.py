@@ -1,15 +1,12 @@
 """`facerf evaluate pairs` from the command line, and the options that protocols share."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 
-from facerf_cli.cli.evaluate import _PROTOCOLS
-from facerf_cli.cli.evaluation_options import EvaluateOptions, with_shared_options
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.main import main
@@ -87,8 +84,11 @@ def test_a_link_is_a_method_of_its_own_name(folders: Path) -> None:
     assert main(line) == 0
     assert json.loads((folders / "out/summary.json").read_text())["methods"] == ["link"]
     (folders / "link").unlink()
-    (folders / "link").symlink_to("bad")  # as PNG: other files, which are not the ones that were measured
-    assert main(line) == 2
+    (folders / "link").symlink_to("bad")  # as PNG: other files, so they are measured again
+    before = json.loads((folders / "out/summary.json").read_text())["groups"]
+    assert main([*line, "--overwrite", "never"]) == 2
+    assert main(line) == 0
+    assert json.loads((folders / "out/summary.json").read_text())["groups"] != before
 
 
 def test_bad_lines(folders: Path, capsys: Said) -> None:
@@ -109,40 +109,17 @@ def test_bad_lines(folders: Path, capsys: Said) -> None:
         assert words in said and len(said.splitlines()) == 1, said
 
 
-@pytest.mark.parametrize(("function", "left_out"), _PROTOCOLS, ids=lambda x: getattr(x, "__name__", ""))
-def test_every_protocol_has_help_and_the_shared_options(
-    function: Callable[..., int], left_out: tuple[str, ...], capsys: Said
-) -> None:
-    name = function.__name__.replace("_", "-")
+@pytest.mark.parametrize("name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "pairs"])
+def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
     assert main(["evaluate", name, "--help"]) == 0
     out = capsys.readouterr().out
     assert "--output" in out and "--space" in out and "{options}" not in out
-    assert ("--reflectance" in out) == ("reflectance" not in left_out)
+    assert ("--reflectance" in out) == (name != "pairs") and ("--keep-eyes" in out) == (name[0] not in "yp")
 
 
-def test_shared_options_reach_the_protocol() -> None:
-    got: list[EvaluateOptions] = []
-
-    def toy(first: str, options: EvaluateOptions, second: int = 2) -> int:
-        """Toy."""
-        got.append(options)
-        return second
-
-    app = typer.Typer()
-    app.command()(with_shared_options(toy, ("preset",)))
-    line = [
-        "x",
-        "-o",
-        "out",
-        "--reflectance",
-        "prt",
-        "--reflectance",
-        "field",
-        "--keep-eyes",
-        "--second",
-        "3",
-    ]
-    assert app(line, standalone_mode=False) == 3
-    assert got == [EvaluateOptions(Path("out"), ("prt", "field"), keep_eyes=True)]
+def test_reflectance_models_are_named_and_files_are_there() -> None:
+    options = EvaluateOptions(Path("out"), ["prt", "field"])
+    assert options.kinds == ("prt", "field") and options.has_field
+    assert EvaluateOptions(Path("out")).kinds == ("field",) and not EvaluateOptions(Path("out"), []).kinds
     with pytest.raises(UsageError, match="no such file"):
-        app(["x", "-o", "out", "--against", "none.safetensors"], standalone_mode=False)
+        EvaluateOptions(Path("out"), against=[Path("none.safetensors")]).check()

@@ -14,12 +14,11 @@ import pytest
 from PIL import Image
 
 from facerf_cli import pipeline
-from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items import evaluate_photos, evaluate_transfer
-from facerf_cli.cli.items.evaluation import MethodOptions, load_methods, portraits
+from facerf_cli.cli.items import evaluate_faces
+from facerf_cli.cli.items.evaluate_faces import FaceSettings, faces_of, load_methods
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions, SplitOptions
 from facerf_cli.cli.items.photos import load_models_once
-from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
@@ -50,11 +49,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reconstructions by the photo's own texture, which no network delays."""
 
-    def load(options: MethodOptions) -> list[Double]:
-        return [Double("field", models=load_models_once(options.photo))]
+    def load(settings: FaceSettings) -> tuple[Double, ...]:
+        return (Double("field", models=load_models_once(settings.photo)),)
 
-    for module in (evaluate_photos, evaluate_transfer):
-        monkeypatch.setattr(module, "load_methods", load)
+    monkeypatch.setattr(evaluate_faces, "load_methods", load)
 
 
 def run(protocol: str, *words: str | Path) -> int:
@@ -155,8 +153,9 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(
     path = tmp_path / "half.png"
     Image.fromarray(np.dstack([photo, shown])).save(path)
     options = PhotoOptions(Settings(device="cpu"))
-    methods, models = MethodOptions.of(options, EvaluateOptions(tmp_path)), load_models_once(options)
-    (_, whole), (_, half) = (next(portraits(Item(x, x, x.stem), methods, False)) for x in (PHOTO, path))
+    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), options, SplitOptions())
+    models = load_models_once(options)
+    whole, half = (next(faces_of(Item(x, x, x.stem), settings)).portrait for x in (PHOTO, path))
     seen, part = whole.by(models), half.by(models)
     crop = part.view.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
@@ -231,10 +230,9 @@ def test_a_photo_without_a_face_fails_and_no_summary_is_written(
 def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Signed least squares, then features: it reaches every method, and the light of every image."""
     photo = PhotoOptions(Settings(device="cpu"))
-    light = LightOptions(photo, non_negative=False, refine="features")
-    methods = load_methods(MethodOptions.of(photo, EvaluateOptions(tmp_path), light))
-    (plain,) = load_methods(MethodOptions.of(photo, EvaluateOptions(tmp_path)))
-    (method,) = methods
+    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), photo, SplitOptions())
+    (method,) = load_methods(replace(settings, non_negative=False, refine="features"))
+    (plain,) = load_methods(settings)
     assert not method.estimator.non_negative and isinstance(method.estimator.features, LightNetwork)
     assert plain.estimator.non_negative and plain.estimator.features is None
     asked = []

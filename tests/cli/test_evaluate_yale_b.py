@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.yale_b import Flash, read_yale_b
-from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.items import evaluate_images
-from facerf_cli.cli.items.evaluation import MethodOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.evaluation.protocols import yale_b
+from facerf_cli.evaluation import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
 from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
@@ -35,7 +33,7 @@ def folder(tmp_path: Path) -> Path:
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    monkeypatch.setattr(evaluate_images, "load_methods", lambda _: (Lambert("field", models),))
+    monkeypatch.setattr(evaluate_images, "methods_of", lambda *_: (Lambert("field", models),))
     monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
 
 
@@ -119,7 +117,9 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
-    methods = MethodOptions.of(PhotoOptions(Settings()), EvaluateOptions(Path("out"), ("field", "prt")))
-    sent = pickle.loads(pickle.dumps(evaluate_images._YaleB(methods, read_yale_b(folder), False, 0.1)))
-    assert sent.room == 0.1 and sent.methods == methods and sent.database.flashes("yaleB07") == sorted(FEW)
+    photo = PhotoOptions(Settings())
+    work = evaluate_images._YaleB(photo, ("field", "prt"), (), None, False, 0.1, read_yale_b(folder))
+    sent = pickle.loads(pickle.dumps(work))
+    assert sent.room == 0.1 and sent.kinds == ("field", "prt")
+    assert sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

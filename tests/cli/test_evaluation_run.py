@@ -9,21 +9,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items import evaluation_run
-from facerf_cli.cli.items.evaluate_transfer import _Couple, _TransferPhotos
-from facerf_cli.cli.items.evaluation import MethodOptions
-from facerf_cli.cli.items.evaluation_key import evaluation_key, item_key
-from facerf_cli.cli.items.evaluation_run import keep_images
-from facerf_cli.cli.light_options import LightOptions
+from facerf_cli.cli.items import evaluate as evaluation_run
+from facerf_cli.cli.items.evaluate import keep_images
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, configure_logging
-from tests.evaluation.toy_protocol import HEIGHT, LAYOUT, NOISE, PEOPLE, WIDTH, Toy, comparison, evaluate
+from tests.evaluation.toy_protocol import (
+    HEIGHT,
+    LAYOUT,
+    NOISE,
+    PEOPLE,
+    WIDTH,
+    Toy,
+    comparison,
+    evaluate,
+    items,
+)
 
 Said = pytest.CaptureFixture[str]
 OUTPUTS = ("summary.json", "images.csv", "report.html")
@@ -67,49 +72,42 @@ def test_an_evaluation_goes_on_where_it_was_cut_off(tmp_path: Path, capsys: Said
         assert (out / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_items_evaluated_otherwise_are_refused(tmp_path: Path) -> None:
-    assert evaluate(tmp_path) == 0
+def test_items_evaluated_otherwise_are_measured_again(tmp_path: Path, capsys: Said) -> None:
+    out, notes = tmp_path / "out", tmp_path / "notes"
+    notes.mkdir()
+    assert evaluate(out) == 0
     for changed in ({"space": "display"}, {"toy": Toy(cases=3)}, {"keep_eyes": True}):
-        with pytest.raises(UsageError, match="--overwrite always, or another folder"):
-            evaluate(tmp_path, **changed)  # type: ignore[arg-type]
-    assert evaluate(tmp_path, jobs=1, dry_run=True) == 0
-    assert (tmp_path / "summary.json").exists()
-    assert evaluate(tmp_path, Toy(cases=3), overwrite="always") == 0
-    assert json.loads((tmp_path / "summary.json").read_text())["pictures"] == 9
+        with pytest.raises(UsageError, match="leave out --overwrite never, or give another folder"):
+            evaluate(out, overwrite="never", **changed)  # type: ignore[arg-type]
+    assert evaluate(out, jobs=1, dry_run=True) == 0 and (out / "summary.json").exists()
+    assert evaluate(out, Toy(cases=3, notes=notes)) == 0
+    assert "--cases is 3, was 4" in capsys.readouterr().err
+    assert len(list(notes.iterdir())) == len(PEOPLE)
+    assert json.loads((out / "summary.json").read_text())["pictures"] == 9
 
 
-def test_another_file_of_the_same_name_is_another_image(tmp_path: Path) -> None:
-    path = tmp_path / "anna.png"
-    path.write_bytes(b"one")
-    key = item_key("run", path)
-    assert key == item_key("run", path) != item_key("other", path)
-    path.write_bytes(b"another")
-    assert key != item_key("run", path)
-    theirs = tmp_path / "theirs"
-    theirs.mkdir()
-    options = EvaluateOptions(tmp_path, compare=(theirs,))
-    before = evaluation_key("toy", Toy(), options, Settings())
-    (theirs / "a.png").write_bytes(b"one")
-    assert before != evaluation_key("toy", Toy(), options, Settings())
+def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path) -> None:
+    out, notes, theirs = tmp_path / "out", tmp_path / "notes", tmp_path / "theirs"
+    notes.mkdir()
+    for person in PEOPLE:
+        for number in range(4):
+            write_exr(theirs / f"{person}/{number:02d}.exr", comparison(person, number).truth)
+    assert evaluate(out, Toy(notes=notes), compare=[theirs]) == 0
 
+    def asked() -> list[str]:
+        for note in notes.iterdir():
+            note.unlink()
+        work = Toy(notes=notes)
+        options = EvaluateOptions(out, [], compare=[theirs])
+        assert evaluation_run.run_protocol(LAYOUT, inputs, work, options, Settings()) == 0
+        return sorted(note.stem for note in notes.iterdir())
 
-def test_a_key_is_of_what_a_path_leads_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "theirs").mkdir()
-    Path("theirs/a.npz").write_bytes(b"one")
-
-    def key(folder: str) -> str:
-        photo = PhotoOptions(Settings(), face_model=f"{folder}/a.npz", landmarks=Path(folder))
-        item = Item(Path(f"{folder}/a.npz"), Path(f"{folder}/out/a"), "a")
-        couples = {item: _Couple("ann", item, item)}
-        methods = MethodOptions(photo, ("field",), (Path(f"{folder}/a.npz"),), LightOptions(photo))
-        options = EvaluateOptions(Path("out"), (), compare=(Path(folder),))
-        return evaluation_key("toy", _TransferPhotos(methods, couples, False, False), options, Settings())
-
-    first = key("theirs")
-    assert first == key(str(tmp_path / "theirs")) == key("theirs/../theirs")
-    Path("theirs/a.npz").write_bytes(b"two, another model")
-    assert first != key("theirs")
+    inputs = items(out)
+    assert asked() == []
+    inputs[0].input_path.write_text("another anna")
+    assert asked() == ["anna"]
+    write_exr(theirs / "bea/01.exr", 2 * comparison("bea", 1).truth)
+    assert asked() == list(PEOPLE)
 
 
 def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, capsys: Said) -> None:
@@ -117,7 +115,7 @@ def test_a_missing_prediction_is_an_error_that_names_every_case(tmp_path: Path, 
     for person in PEOPLE:
         for number in range(4):
             write_exr(theirs / f"{person}/{number:02d}.exr", comparison(person, number).truth)
-    options = {"compare": (theirs,)}
+    options = {"compare": [theirs]}
     assert evaluate(tmp_path / "out", **options) == 0
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     assert summary["methods"] == [*NOISE, "theirs"]
@@ -159,7 +157,7 @@ def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -
     assert guess.metadata["facerf:synthetic"] == 1 and "facerf:synthetic" not in truth.metadata
     assert "facerf:face_model" not in guess.metadata  # these are made without one
     # What was kept can be compared with itself.
-    assert evaluate(tmp_path / "again", compare=(tmp_path / "pictures/truth",)) == 0
+    assert evaluate(tmp_path / "again", compare=[tmp_path / "pictures/truth"]) == 0
 
 
 def test_images_and_summary_name_the_face_model(tmp_path: Path) -> None:
@@ -205,13 +203,13 @@ def test_names_that_lead_out_of_the_folder(tmp_path: Path) -> None:
 
 
 def test_two_methods_of_one_name(tmp_path: Path) -> None:
-    options = EvaluateOptions(tmp_path, against=(tmp_path / "field.safetensors",))
+    options = EvaluateOptions(tmp_path, against=[tmp_path / "field.safetensors"])
     with pytest.raises(UsageError, match="two methods have the name 'field'"):
         options.check()
     with pytest.raises(UsageError, match="nothing to evaluate"):
-        evaluation_run.run_protocol(LAYOUT, [], Toy(), EvaluateOptions(tmp_path, reflectance=()), Settings())
+        evaluation_run.run_protocol(LAYOUT, [], Toy(), EvaluateOptions(tmp_path, reflectance=[]), Settings())
 
 
 def test_the_work_goes_to_other_processes() -> None:
-    work = evaluation_run._Measure("si_mse", Toy(), EvaluateOptions(Path("out")), Settings(), None, "key")
+    work = evaluation_run._Measure("si_mse", Toy(), EvaluateOptions(Path("out")), Settings(), None)
     assert pickle.loads(pickle.dumps(work)) == work

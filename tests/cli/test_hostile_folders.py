@@ -15,7 +15,7 @@ from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import Shard
 from facerf_cli.cli.report import report_name
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.case import read_array
+from facerf_cli.evaluation.pairs import read_array
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.decoding import decode

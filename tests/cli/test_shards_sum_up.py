@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli.evaluation_options import EvaluateOptions
-from facerf_cli.cli.items.evaluation_run import run_protocol
+from facerf_cli.cli.items.evaluate import run_protocol
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.cli.options import Settings, Shard
 from facerf_cli.logs import configure_logging
 from facerf_cli.main import main
@@ -29,7 +29,7 @@ def tree(folder: Path) -> dict[str, str]:
 def test_evaluate(tmp_path: Path) -> None:
     configure_logging()
     assert evaluate(tmp_path / "whole") == 0
-    options = EvaluateOptions(tmp_path / "shards", reflectance=())
+    options = EvaluateOptions(tmp_path / "shards", reflectance=[])
     for number in (2, 1):
         assert not (options.output / "summary.json").exists()
         settings = Settings(shard=Shard(number, 2))

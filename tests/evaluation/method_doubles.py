@@ -11,8 +11,7 @@ from torch import Tensor
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
 from facerf_cli.composite import Target
-from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.people import Person, Portrait
+from facerf_cli.evaluation.people import Method, Person, Portrait
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.case import Others, read_array
+from facerf_cli.evaluation.pairs import read_array, read_predictions
 from facerf_cli.files.images import write_display, write_exr
 
 SHAPE = (6, 9, 3)
@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("case", ["a/00", "a/01", "a/02"])
 def test_every_kind_of_file_is_linear_light(folder: Path, case: str) -> None:
-    (found,) = Others((folder,)).predictions(case, SHAPE).items()
+    (found,) = read_predictions((folder,), case, SHAPE).items()
     assert found[0] == "theirs" and found[1].shape == SHAPE
     np.testing.assert_allclose(found[1], 0.25, atol=2e-3)
 
@@ -31,16 +31,16 @@ def test_every_kind_of_file_is_linear_light(folder: Path, case: str) -> None:
 def test_all_that_is_missing_is_named(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError) as error:
-        Others((folder, tmp_path / "empty")).predictions("a/03", SHAPE)
+        read_predictions((folder, tmp_path / "empty"), "a/03", SHAPE)
     assert all(part in str(error.value) for part in (str(folder), "empty", "case a/03", ".npy"))
 
 
 def test_a_wrong_size_and_two_files_of_a_case(folder: Path) -> None:
     with pytest.raises(InputError, match="9 x 6 pixels, the truth has 6 x 9"):
-        Others((folder,)).predictions("a/00", (9, 6, 3))
+        read_predictions((folder,), "a/00", (9, 6, 3))
     write_exr(folder / "a/02.exr", np.zeros(SHAPE, np.float32))
     with pytest.raises(InputError, match=r"02.exr and 02.npy; remove all but one"):
-        Others((folder,)).predictions("a/02", SHAPE)
+        read_predictions((folder,), "a/02", SHAPE)
 
 
 @pytest.mark.parametrize(

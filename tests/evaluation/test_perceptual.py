@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation import perceptual
-from facerf_cli.evaluation.perceptual import perceptual_metric
+from facerf_cli.evaluation import measure as perceptual
+from facerf_cli.evaluation.measure import perceptual_metric
 from facerf_cli.network.feature_networks import Lpips
 
 

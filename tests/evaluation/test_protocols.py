@@ -4,7 +4,9 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,13 +17,20 @@ from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people
-from facerf_cli.evaluation.case import Case
-from facerf_cli.evaluation.crop_view import CropView, angle_class, angle_of, turn_class
-from facerf_cli.evaluation.people import Person, evenly
-from facerf_cli.evaluation.protocols.geometry import FULL, MEAN, compare_geometries
-from facerf_cli.evaluation.protocols.olat import LAMBERT, compare_olats
-from facerf_cli.evaluation.protocols.reconstruction import brightest, reconstruct
-from facerf_cli.evaluation.protocols.transfer import Side, couples_of, transfer
+from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.olat import LAMBERT, compare_olats
+from facerf_cli.evaluation.people import (
+    CropView,
+    Person,
+    SourceFace,
+    angle_class,
+    angle_of,
+    compare_people,
+    evenly,
+    turn_class,
+)
+from facerf_cli.evaluation.reconstruction import FULL, MEAN, brightest, compare_geometries, reconstruct
+from facerf_cli.evaluation.transfer import couples_of, transfer
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.landmarks import Face, face_at
@@ -59,6 +68,13 @@ def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
     return Double("unlit", models=models, gain=gain)
 
 
+def olats(
+    person: Person, pairs: list[Pair], methods: list[Double], network_alone: bool = False
+) -> Iterator[Comparison]:
+    compare = partial(compare_olats, methods=methods, network_alone=network_alone)
+    return compare_people(person, [(pair,) for pair in pairs], compare)
+
+
 def side_light(person: Person, camera: str) -> int:
     """A light from the side that the camera sees."""
     directions = person.header(camera).directions
@@ -68,7 +84,7 @@ def side_light(person: Person, camera: str) -> int:
 @pytest.mark.parametrize("target", ["C0", "C1"])
 def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, target: str) -> None:
     asked = pair(3, "C0", target, side_light(person, target))
-    (found,) = compare_olats(person, [asked], [unlit()], network_alone=False)
+    (found,) = olats(person, [asked], [unlit()])
     truth, mask = found.truth, found.mask
     right = si_mse(found.predictions[LAMBERT], truth, mask)
     wrong = si_mse(found.predictions["unlit"], truth, mask)
@@ -80,6 +96,7 @@ def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, ta
         "none" if same else "30 to 60 deg"
     )  # the fixture's -15 and 20 degrees
     assert found.case.facts["tone"] == "unknown" and not found.extra
+    assert found.case.facts["map"] == "a"
 
 
 def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, dataset: Dataset) -> None:
@@ -87,7 +104,7 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, d
     known = person_of(replace(dataset, traits={"0000": traits}))
     front = int(known.header("C0").directions[:, 2].argmax())
     asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
-    near, aside = compare_olats(known, asked, [unlit()], network_alone=True)
+    near, aside = olats(known, asked, [unlit()], network_alone=True)
     assert near.case.facts["tone"] == "intermediate"
     assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
     assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
@@ -100,8 +117,11 @@ def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) 
     asked = pair(0, "C0", "C0", 0)
     image = person.source(asked)
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
-    portrait = person.portrait(asked)
-    found = reconstruct(Case("a", "0000"), portrait, [unlit(0.5)], truth)
+    face = person.face_of(asked)
+    assert face.origin is not None
+    lit: Any = SimpleNamespace(light=lambda _: truth)
+    (found,) = reconstruct([replace(face, origin=(lit, asked))], [unlit(0.5)])
+    portrait = face.portrait
     error = si_mse(found.predictions["unlit"], image, found.mask)
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
@@ -114,8 +134,9 @@ def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
     sides = []
     for camera in ("C0", "C1"):
         asked = pair(0, camera, camera, 0)
-        sides.append(Side(Case(f"by {camera}", "0000"), person.portrait(asked)))
-    first, second = transfer((sides[0], sides[1]), [method])
+        sides.append(SourceFace(Case(f"by {camera}", "0000"), person.portrait(asked)))
+    first, second = transfer(sides, [method], network_alone=True)
+    assert first.case.name == "by C0_by_by C1"
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
     assert torch.equal(light_of_a[0], a.light.weights)
@@ -140,15 +161,17 @@ def test_the_mean_face_is_compared_where_both_see_the_face(
 ) -> None:
     person = found_by_truth(dataset, monkeypatch)
     mean = FaceModelOnly(FACE_ONLY.face.pose_only())
-    portrait = person.portrait(pair(0, "C1", "C1", 0))
+    face = person.face_of(pair(0, "C1", "C1", 0))
+    portrait = face.portrait
     views = [portrait.by(models).view for models in (FACE_ONLY, mean)]
     assert views[0].fit.alpha.any() and not views[1].fit.alpha.any()
     forms = {FULL: [unlit()], MEAN: [unlit(models=mean)]}
-    found = compare_geometries(Case("a", "0000"), portrait, forms)
+    (found,) = compare_geometries([face], forms)
     assert list(found.predictions) == [FULL, MEAN]
     assert np.array_equal(found.mask, np.minimum(views[0].mask, views[1].mask))
     two = {name: [replace(methods[0], name=method) for method in "xy"] for name, methods in forms.items()}
-    names = list(compare_geometries(Case("a", "0000"), portrait, two).predictions)
+    (of_two,) = compare_geometries([face], two)
+    names = list(of_two.predictions)
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
@@ -191,7 +214,7 @@ def test_monocular_predictions_lie_on_the_truth(
 ) -> None:
     person = found_by_truth(dataset, monkeypatch)
     asked = pair(2, "C0", target, side_light(person, target))
-    (found,) = compare_olats(person, [asked], [unlit()], network_alone=False)
+    (found,) = olats(person, [asked], [unlit()])
     right = si_mse(found.predictions[LAMBERT], found.truth, found.mask)
     wrong = si_mse(found.predictions["unlit"], found.truth, found.mask)
     assert found.truth.shape == found.predictions["unlit"].shape == (96, 96, 3)
@@ -215,7 +238,7 @@ def test_in_its_own_pose_the_image_is_that_of_relight_in_the_crop(
 
     light = side_light(person, "C0")
     records = Records("unlit", models=FACE_ONLY)
-    (found,) = compare_olats(person, [pair(0, "C0", "C0", light)], [records], network_alone=False)
+    (found,) = olats(person, [pair(0, "C0", "C0", light)], [records])
     assert found.source is not None
     inside = found.mask > 0.5
     np.testing.assert_allclose(found.predictions["unlit"][inside], found.source[inside], atol=2e-3)
@@ -242,7 +265,7 @@ def test_images_without_a_face_are_left_out_and_named(
     light = side_light(person, "C0")
     asked = [pair(0, "C0", "C0", light), pair(1, "C1", "C1", light), pair(2, "C0", "C1", light)]
     with caplog.at_level("WARNING"):
-        found = list(compare_olats(person, asked, [unlit()], network_alone=False))
+        found = list(olats(person, asked, [unlit()]))
     assert [comparison.case.name for comparison in found] == ["0000/00000"]
     assert sum("left out" in record.message for record in caplog.records) == 2
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.evaluation.case_files import KeptStrip
 from facerf_cli.evaluation.measure import Measures, Row, measure
-from facerf_cli.evaluation.report_html import (
+from facerf_cli.evaluation.report import (
     BEST,
     TYPICAL,
     WORST,
     About,
     Chosen,
+    KeptStrip,
     choose,
     page,
 )

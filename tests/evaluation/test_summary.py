@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 
 from facerf_cli.evaluation.measure import METRICS, Row
-from facerf_cli.evaluation.published import (
-    TABLE_1,
-    TABLE_2_RECONSTRUCTION,
-    TABLE_2_TRANSFER,
-    TABLE_3,
-    TABLE_4,
+from facerf_cli.evaluation.olat import TABLE_1, TABLE_3
+from facerf_cli.evaluation.reconstruction import TABLE_2_RECONSTRUCTION, TABLE_4
+from facerf_cli.evaluation.summary import (
+    Layout,
+    natural,
+    published_for,
+    summarise,
 )
-from facerf_cli.evaluation.summary import Layout, natural, published_for, summarise
+from facerf_cli.evaluation.transfer import TABLE_2_TRANSFER
 
 LAYOUT = Layout("toy", "Toy", ("si_mse", "psnr"), ("pose",), TABLE_1)
 ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}

@@ -1,19 +1,20 @@
 """A protocol of a few made-up images, to drive the evaluation without networks or faces."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.evaluation_run import run_protocol
+from facerf_cli.cli.items.evaluate import run_protocol
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.published import TABLE_1
+from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.olat import TABLE_1
 from facerf_cli.evaluation.summary import Layout
 
 PEOPLE = ("anna", "bea", "carl")
@@ -37,7 +38,7 @@ class Toy:
     """
 
     cases: int = 4
-    notes: Path | None = None
+    notes: Path | None = field(default=None, metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         if self.notes is not None:
@@ -69,7 +70,11 @@ def comparison(person: str, number: int) -> Comparison:
 
 
 def items(output: Path, people: tuple[str, ...] = PEOPLE) -> list[Item]:
-    return [Item(Path(person), output / person, person) for person in people]
+    folder = output.with_name(f"{output.name}.inputs")
+    folder.mkdir(exist_ok=True)
+    for person in people:
+        (folder / person).write_text(person)
+    return [Item(folder / person, output / person, person) for person in people]
 
 
 def evaluate(
@@ -79,5 +84,5 @@ def evaluate(
     photo: PhotoOptions | None = None,
     **options: object,
 ) -> int:
-    given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
+    given = EvaluateOptions(output, **{"reflectance": [], **options})  # type: ignore[arg-type]
     return run_protocol(layout, items(output), toy or Toy(), given, Settings(), photo)

@@ -2,23 +2,25 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from facerf_cli.baselines import RelightKind
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
-from facerf_cli.cli.evaluation_options import EvaluateOptions
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.evaluation import MethodOptions, load_methods, prepare_methods
-from facerf_cli.cli.items.evaluation_run import run_protocol
+from facerf_cli.cli.items.evaluate import run_protocol
+from facerf_cli.cli.items.evaluate_faces import methods_of
+from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
+from facerf_cli.cli.items.photos import prepare_photos
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
-from facerf_cli.evaluation.case import Comparison
-from facerf_cli.evaluation.protocols.pairs import ImagePair, collect_pairs, compare_pair
-from facerf_cli.evaluation.protocols.yale_b import compare_sitter, layout
+from facerf_cli.evaluation.measure import Comparison
+from facerf_cli.evaluation.pairs import ImagePair, collect_pairs, compare_pair
 from facerf_cli.evaluation.summary import Layout
+from facerf_cli.evaluation.yale_b import compare_sitter, layout
 
 _ITEMS_AT_MOST = 64
 
@@ -35,11 +37,15 @@ def run_yale_b(
     """Measure the subjects of Extended Yale B, all if none are named; the exit code."""
     database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
     chosen = _chosen(database, subjects)
-    methods = MethodOptions.of(photo, options)
-    work = _YaleB(methods, database, network_alone, room)
+    work = _YaleB(photo, options.kinds, options.checkpoints, shifts, network_alone, room, database)
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
+
+    def prepare() -> None:
+        prepare_photos(photo, with_networks=False)
+        if not options.dry_run:
+            methods_of(photo, options.kinds, options.checkpoints)
+
     tables = layout(database, chosen, network_alone, room)
-    prepare = partial(prepare_methods, methods, options)
     return run_protocol(tables, items, work, options, photo.settings, photo, prepare)
 
 
@@ -56,17 +62,20 @@ def _chosen(database: YaleB, given: Sequence[str]) -> list[str]:
 class _YaleB:
     """Compares one subject's cases."""
 
-    methods: MethodOptions
-    database: YaleB
+    photo: PhotoOptions
+    kinds: tuple[RelightKind, ...]
+    checkpoints: tuple[Path, ...]
+    shifts: Path | None
     network_alone: bool
     room: float
+    database: YaleB = field(metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
-        methods = load_methods(self.methods)
-        photo = self.methods.photo
-        geometry = photo.geometry or methods[0].models.default_geometry
+        methods = methods_of(self.photo, self.kinds, self.checkpoints)
+        geometry = self.photo.geometry or methods[0].models.default_geometry
+        landmarks_from = self.photo.landmarks_from
         return compare_sitter(
-            self.database, item.name, methods, self.network_alone, geometry, photo.landmarks_from, self.room
+            self.database, item.name, methods, self.network_alone, geometry, landmarks_from, self.room
         )
 
 
@@ -80,24 +89,30 @@ def run_pairs(
     face_distance: bool,
 ) -> int:
     """Measure folders of predictions against a folder of truths; the exit code."""
-    found = collect_pairs(predictions, truth, masks, facts)
-    by = dict.fromkeys(n for pair in found for n, value in pair.facts.items() if isinstance(value, str))
+    pairs = collect_pairs(predictions, truth, masks, facts)
+    by = dict.fromkeys(n for pair in pairs for n, value in pair.facts.items() if isinstance(value, str))
     asked = {"lpips": options.vgg_weights is not None, "face_distance": face_distance}
     metrics = ("si_mse", "mse", "psnr", "ssim", *(name for name, wanted in asked.items() if wanted))
     tables = Layout("pairs", f"Predictions against {folder_name(truth)}", metrics, tuple(by))
-    size = math.ceil(len(found) / _ITEMS_AT_MOST)
-    starts = range(0, len(found), size)
+    size = math.ceil(len(pairs) / _ITEMS_AT_MOST)
+    starts = range(0, len(pairs), size)
     items = [Item(truth, options.output / f"part-{n:02d}", f"part-{n:02d}") for n, _ in enumerate(starts)]
-    parts = {item.name: tuple(found[start : start + size]) for item, start in zip(items, starts, strict=True)}
-    return run_protocol(tables, items, _Pairs(parts, face_distance), options, settings)
+    parts = {item.name: tuple(pairs[start : start + size]) for item, start in zip(items, starts, strict=True)}
+    names = tuple(map(folder_name, predictions))
+    work = _Pairs(names, tuple(predictions), masks, facts, face_distance, parts)
+    return run_protocol(tables, items, work, options, settings)
 
 
 @dataclass(frozen=True)
 class _Pairs:
     """Reads an item's pairs."""
 
-    parts: Mapping[str, tuple[ImagePair, ...]]
+    names: tuple[str, ...]
+    predictions: tuple[Path, ...]
+    masks: Path | None
+    facts: Path | None
     face_distance: bool
+    parts: Mapping[str, tuple[ImagePair, ...]] = field(metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         for pair in self.parts[item.name]:

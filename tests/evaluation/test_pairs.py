@@ -9,7 +9,7 @@ from PIL import Image
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Measures, measure
-from facerf_cli.evaluation.protocols.pairs import collect_pairs, compare_pair
+from facerf_cli.evaluation.pairs import collect_pairs, compare_pair
 from facerf_cli.files.images import write_exr
 
 NAMES = ("anna/one", "anna/two", "bert/one")

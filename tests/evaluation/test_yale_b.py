@@ -17,16 +17,19 @@ from PIL import Image
 from facerf_cli import pipeline
 from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.case import Others
+from facerf_cli.evaluation import yale_b
 from facerf_cli.evaluation.measure import Measures, measure
-from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.protocols import yale_b
-from facerf_cli.evaluation.protocols.yale_b import FIGURES, compare_sitter, layout, published
-from facerf_cli.evaluation.protocols.yale_b_cases import (
+from facerf_cli.evaluation.pairs import read_predictions
+from facerf_cli.evaluation.people import Method
+from facerf_cli.evaluation.yale_b import (
+    FIGURES,
     Question,
     Sitter,
+    compare_sitter,
     environment_weights,
     face_mask,
+    layout,
+    published,
 )
 from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
@@ -232,7 +235,7 @@ def test_predictions_in_files_are_read_as_the_benchmark_reads_them(
     Image.fromarray(values[..., 0]).save(grey / f"{case}.png")
     Image.fromarray(values).save(colours / f"{case}.png")
     np.save(array / f"{case}.npy", values[..., 1] / np.float32(255))
-    found = Others((grey, colours, array), grey_as_given=True).predictions(case, (192, 168, 3))
+    found = read_predictions((grey, colours, array), case, (192, 168, 3), grey_as_given=True)
     for folder in (grey, colours, array):
         theirs = reference[1].load(str(next(folder.rglob("A+035*"))))
         np.testing.assert_allclose(found[folder.name], np.repeat(theirs[..., None], 3, -1), atol=1e-6)

@@ -10,16 +10,17 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.evaluation import folder_name
-from facerf_cli.evaluation.case import Case, Comparison, read_array
+from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.files.image_metadata import oiio_error, utf8_path
-from facerf_cli.files.images import LinearImage, read_image
-from facerf_cli.files.regular import is_regular
+from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
+from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
@@ -29,6 +30,10 @@ _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file
 _TURNED = 5  # from this Exif orientation on, width and height are exchanged
 _CSV_ADVICE = "begin with a header such as name,person,..."
+
+
+PREDICTION_SUFFIXES = (".exr", ".png", ".npy")  # of predictions in files
+_LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16  # limits of a .npy file
 
 
 @dataclass(frozen=True)
@@ -256,3 +261,61 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell))
     except ValueError:
         return False
+
+
+def read_predictions(
+    folders: Sequence[Path], case: str, shape: tuple[int, ...], grey_as_given: bool = False
+) -> dict[str, np.ndarray]:
+    """Read a case's predictions FOLDER/CASE.exr, .png or .npy by method, which is the folder's name.
+
+    They are linear Rec.709 [H, W, 3] of the truth's `shape`. With `grey_as_given` PNGs are read as linear
+    values, too, and the mean of the channels is compared. Raises InputError that lists all that are missing
+    or unfit: without its failures a method's mean improves.
+    """
+    found, wrong = {}, []
+    for folder in folders:
+        try:
+            found[folder_name(folder)] = _prediction(folder, case, shape, grey_as_given)
+        except InputError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise InputError("; ".join(wrong))
+    return found
+
+
+def _prediction(folder: Path, case: str, shape: tuple[int, ...], grey_as_given: bool) -> np.ndarray:
+    there = [path for suffix in PREDICTION_SUFFIXES if (path := folder / f"{case}{suffix}").is_file()]
+    if not there:
+        raise InputError(
+            f"{folder}: no prediction for case {case}; add it as {', '.join(PREDICTION_SUFFIXES)}"
+        )
+    if len(there) > 1:
+        names = " and ".join(path.name for path in there)
+        raise InputError(f"{folder}: case {case} has the files {names}; remove all but one")
+    space = "linear" if grey_as_given else None
+    pixels = read_array(there[0]) if there[0].suffix == ".npy" else read_image(there[0], space).pixels
+    if grey_as_given:
+        pixels = np.repeat(pixels.mean(-1, keepdims=True), 3, -1)
+    if pixels.shape[:2] != tuple(shape[:2]):
+        have, wanted = (f"{size[1]} x {size[0]}" for size in (pixels.shape, shape))
+        raise InputError(f"{there[0]}: {have} pixels, the truth has {wanted}; give an image in its frame")
+    return pixels
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Read an image [H, W, 3] float32 from a .npy of floats [H, W, 3] or [H, W], taken as linear Rec.709."""
+    require_regular(path, "give an image as .npy")
+    try:
+        if path.stat().st_size > PHOTO_LIMIT_PX * 3 * _LARGEST_NUMBER_BYTES + _HEADER_BYTES:
+            raise InputError(f"{path}: larger than any image that is read; give one image in a file")
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # a header may promise more than there is
+    except (OSError, ValueError, EOFError, SyntaxError, TokenError, OverflowError, TypeError) as error:
+        raise InputError(f"{path}: not an array of numbers ({error}); write one by numpy.save") from None
+    if values.ndim not in (2, 3) or values.shape[2:] not in ((), (3,)) or not math.prod(values.shape):
+        raise InputError(f"{path}: an array of shape {list(values.shape)}; give [height, width, 3]")
+    if values.dtype.kind != "f":
+        raise InputError(f"{path}: values of type {values.dtype}; give floats of linear light, or a PNG")
+    image = np.broadcast_to(values.reshape(*values.shape[:2], -1), (*values.shape[:2], 3)).astype(np.float32)
+    if not np.isfinite(image).all():
+        raise InputError(f"{path}: holds values that are NaN or infinite; give finite ones")
+    return image

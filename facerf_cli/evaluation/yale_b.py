@@ -1,39 +1,178 @@
-"""Real people relit to real point lights, next to their images under these lights (Extended Yale B).
+"""The cases of Extended Yale B: sources, targets and the mask, for real faces under real point lights.
 
-Each source is a user's photo: it is fitted, unwrapped, relit under all of its targets at once and composed
-into its own frame, as `facerf relight` does. The light is given here and not estimated.
-
-Figures of other methods are those of the README of the benchmark that the cases come from, of the same images
-of 21 subjects: Si-MSE and SSIM by kind of source and target, Si-MSE by the angle between flash and camera.
-DPR: Zhou et al., ICCV 2019. GeomConsistentFR: Hou et al., CVPR 2022.
+A source is an image under one flash, or under a soft light summed from the subject's own images; its targets
+are single flashes or environments. Images are close to linear in light and taken as linear. All definitions
+are those of the benchmark whose README publishes other methods' figures, so that figures can be compared;
+directions are in camera space (docs/design.md).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
 from itertools import pairwise
 
 import numpy as np
 import torch
 
-from facerf_cli.capture.yale_b import YaleB
+from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB
 from facerf_cli.composite import Target
-from facerf_cli.evaluation.case import Case, Comparison
-from facerf_cli.evaluation.methods import Method
-from facerf_cli.evaluation.protocols.yale_b_cases import (
-    ANGLES_DEG,
-    SETTINGS_SUBJECTS,
-    Question,
-    Sitter,
-    face_mask,
-)
-from facerf_cli.evaluation.published import PublishedFigure
-from facerf_cli.evaluation.summary import Layout
+from facerf_cli.errors import InputError
+from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.people import Method
+from facerf_cli.evaluation.summary import Layout, PublishedFigure
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
+
+SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
+ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
+FRONTAL = Flash(0, 0)
+SOFT_SOURCES = ("dome", "win_left", "win_right", "overhead")
+ENVIRONMENT_SOURCES = ("frontal", "win_left")
+ENVIRONMENTS = ("env_key_fill", "env_under", "env_two_side", "env_sky")
+_CORE = tuple(  # targets of the soft sources
+    Flash(*angles)
+    for angles in (
+        (0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (-70, 0), (70, 0), (-35, 40), (35, 40), (0, -35)
+    )
+)  # fmt: skip
+_WIDEST_DEG, _HIGHEST_DEG = 75, 40  # beyond these angles most of the face is dark
+_SPHERE_POINTS = 20_000  # samples of an environment
+_WHITE, _WHITE_PERCENTILE = 0.9, 99  # an environment's image is exposed so that bright skin has this value
+
+Radiance = Callable[[np.ndarray], np.ndarray]  # from directions [N, 3] to values [N]
+
+
+def _lobe(azimuth_deg: float, elevation_deg: float, sharpness: float) -> Radiance:
+    """A soft light around a direction, 1 at its centre."""
+    angles = torch.tensor([azimuth_deg, elevation_deg], dtype=torch.float64)
+    centre = azel_to_direction(angles[0], angles[1]).numpy()
+    return lambda directions: np.exp(sharpness * (directions @ centre - 1))
+
+
+def _ahead(directions: np.ndarray) -> np.ndarray:
+    return (directions[:, 2] > 0).astype(float)
+
+
+_RADIANCES: Mapping[str, tuple[tuple[float, Radiance], ...]] = {  # weighted sums, of any unit
+    "dome": ((1, _ahead),),
+    "win_left": ((1, _lobe(-60, 15, 8)), (0.06, _ahead)),
+    "win_right": ((1, _lobe(60, 15, 8)), (0.06, _ahead)),
+    "overhead": ((1, _lobe(0, 65, 6)), (0.06, _ahead)),
+    "env_key_fill": ((1, _lobe(-45, 30, 20)), (0.25, _lobe(50, 5, 12)), (0.02, _ahead)),
+    "env_under": ((1, _lobe(15, -35, 12)), (0.04, _ahead)),
+    "env_two_side": ((1, _lobe(-80, 5, 12)), (0.7, _lobe(80, 5, 12)), (0.02, _ahead)),
+    "env_sky": ((1, lambda directions: directions[:, 1].clip(0)), (0.25, lambda d: np.ones(len(d)))),
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """A source and its target light, each by name; `column` is that of the tables."""
+
+    column: str  # 'frontal', 'soft' or 'environment'
+    source: str
+    light: str  # a flash or an environment
+
+    @property
+    def angle_deg(self) -> float | None:
+        """The angle between the flash and the camera's axis; None for an environment."""
+        flash = Flash.named(self.light)
+        return None if flash is None else flash.angle_deg
+
+    @property
+    def angle_bin(self) -> str | None:
+        """The class of the angle, for a single flash from the frontal source; else None."""
+        if self.column != "frontal" or self.angle_deg is None:
+            return None
+        bins = (f"{low}-{high} deg" for low, high in pairwise(ANGLES_DEG) if low <= self.angle_deg < high)
+        return next(bins, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Sitter:
+    """A subject of the database: its images under flashes, and the sums of these. Grey, in 0..1."""
+
+    database: YaleB
+    name: str
+
+    @cached_property
+    def flashes(self) -> list[Flash]:
+        """The flashes with an undamaged image of the subject."""
+        return self.database.flashes(self.name)
+
+    @cached_property
+    def olats(self) -> np.ndarray:
+        """The subject's images under each of the flashes [L, 192, 168]."""
+        return self.database.images(self.name)
+
+    def image(self, light: str) -> np.ndarray:
+        """The subject's image [192, 168], float32, under a flash by name, 'frontal', or an environment.
+
+        Raises InputError for a flash without an undamaged image.
+        """
+        flash = FRONTAL if light == "frontal" else Flash.named(light)
+        if flash is None:
+            return self._exposed(light)
+        if flash not in self.flashes:
+            raise InputError(
+                f"{self.database.folder / self.name}: no undamaged image under {flash.name}; leave it out"
+            )
+        return self.olats[self.flashes.index(flash)]
+
+    def _exposed(self, environment: str) -> np.ndarray:
+        """The images' weighted sum under an environment, bright skin at 0.9, clipped at white."""
+        total = np.einsum("l,lij->ij", self.weights(environment), self.olats)
+        white = np.percentile(total[face_mask()], _WHITE_PERCENTILE)
+        return (total * _WHITE / white).clip(0, 1).astype(np.float32)
+
+    def weights(self, light: str) -> np.ndarray:
+        """The weight [L] of each flash in a target, which is a flash or an environment; they sum to 1."""
+        if light in _RADIANCES:
+            return environment_weights(light, tuple(self.flashes))
+        return np.array([float(flash.name == light) for flash in self.flashes])
+
+    def questions(self) -> Iterator[Question]:
+        """Yield every case of the subject."""
+        for flash in self.flashes:
+            within = abs(flash.azimuth_deg) <= _WIDEST_DEG and abs(flash.elevation_deg) <= _HIGHEST_DEG
+            if within and flash != FRONTAL:
+                yield Question("frontal", "frontal", flash.name)
+        for source in SOFT_SOURCES:
+            yield from (Question("soft", source, flash.name) for flash in _CORE if flash in self.flashes)
+        for source in ENVIRONMENT_SOURCES:
+            yield from (Question("environment", source, environment) for environment in ENVIRONMENTS)
+
+
+@cache
+def environment_weights(name: str, flashes: tuple[Flash, ...]) -> np.ndarray:
+    """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
+    directions = _spiral(_SPHERE_POINTS)
+    nearest = np.argmax(directions @ np.stack([flash.direction for flash in flashes]).T, 1)
+    radiance = sum(share * part(directions) for share, part in _RADIANCES[name])
+    summed = np.bincount(nearest, weights=radiance, minlength=len(flashes))
+    return summed / summed.sum()
+
+
+def _spiral(points: int) -> np.ndarray:
+    """Directions [N, 3] on a golden spiral about +y, as in the benchmark: the cells depend on them."""
+    index = np.arange(points) + 0.5
+    y = 1 - 2 * index / points
+    ring, angle = np.sqrt(1 - y * y), np.pi * (1 + 5**0.5) * index
+    return np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], 1)
+
+
+@cache
+def face_mask() -> np.ndarray:
+    """The mask of the comparison, bool [192, 168]: one ellipse for all images."""
+    y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX] + 0.5
+    return ((x - 84) / 70) ** 2 + ((y - 98) / 88) ** 2 <= 1
+
 
 COLUMNS = ("frontal", "soft", "environment")
 PEERS = ("DPR", "GeomConsistentFR")
