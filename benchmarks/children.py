@@ -30,7 +30,6 @@ from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
-from facerf_cli.strips import whole
 from facerf_cli.synth.portraits import bake_portrait, photograph
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
@@ -177,7 +176,7 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
         for name in ("skin", "hair", "ears"):
             truth = photo.classes[CLASSES.index(name)].numpy()
             if (truth > 0.5).sum() >= LEAST_PX:
-                scores[f"IoU {name}"] = overlap(whole(found.layer(name)), truth)
+                scores[f"IoU {name}"] = overlap(found.layer(name), truth)
         cut = display * found.matte[..., None] + (1 - found.matte[..., None]) * np.array([255, 0, 220])
         shown[1] = cut.astype(np.uint8)
         for x, y in face.landmarks_px.astype(int).clip(0, SIDE_PX - 2):

@@ -40,7 +40,6 @@ from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.parse import parsing_network
 from facerf_cli.portrait.segment import segment
-from facerf_cli.strips import whole
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
 from facerf_cli.training.objective import seeded
@@ -181,9 +180,7 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
                 print(f"{path.name}: no face found")
                 continue
             found = segment(image, max(faces, key=lambda face: face.area_px).landmarks_px)
-            shares = {
-                name: sum(whole(found.layer(of)) for of in classes) for name, classes in REGIONS.items()
-            }
+            shares = {name: sum(found.layer(of) for of in classes) for name, classes in REGIONS.items()}
             for name, mask in outlines(drawn, (image.shape[1], image.shape[0])):
                 got = {of: float((share[mask] > 0.5).mean()) for of, share in shares.items()}
                 matte = float((found.matte[mask] > 0.5).mean())

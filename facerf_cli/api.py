@@ -28,7 +28,7 @@ from facerf_cli.models import load_models as load
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.strips import whole
+from facerf_cli.strips import filled
 
 Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"]
@@ -119,8 +119,8 @@ def segment(photo: np.ndarray, landmarks_px: np.ndarray | None = None) -> dict[s
     photo = _checked(photo)
     if landmarks_px is None:
         landmarks_px = find_faces(photo, "photo")[0].landmarks_px
-    layers = segment_image(to_display(photo), check_landmarks(landmarks_px)).layers()
-    return {name: whole(layer) for name, layer in layers.items()}
+    found = segment_image(to_display(photo), check_landmarks(landmarks_px))
+    return {"person.A": found.matte, **filled(found.layers(), *found.matte.shape)}
 
 
 def fit_photo(

@@ -15,7 +15,7 @@ the surround, which is clipped, and for the photo's background, which no light c
 negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -37,7 +37,7 @@ from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
-from facerf_cli.strips import Computed, Rows, whole
+from facerf_cli.strips import Band, Layer, filled
 
 _DARK = 0.08  # e above, a share of the source's mean
 _NOISY = 2.0  # times e: the luminance below which colours of pixels are noise
@@ -52,6 +52,7 @@ _REACH = 0.22  # of that change to the side, in crop sides; beyond it all follow
 _DARKER, _BRIGHTER = 12.0, 1.6  # that change is at most so far below and above the mean change of a light
 _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and below are hair and neck
 
+Pixels = np.ndarray | PersonColours  # [H, W, 3], read by rows
 Background = Literal["photo", "none", "given"]
 FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
 PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
@@ -104,18 +105,6 @@ class RelitImage:
     alpha: np.ndarray | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class RelitRows:
-    """A `RelitImage` whose rows are computed when they are read."""
-
-    pixels: Rows
-    alpha: Rows | None = None
-
-    def whole(self) -> RelitImage:
-        """The image as arrays."""
-        return RelitImage(whole(self.pixels), None if self.alpha is None else whole(self.alpha))
-
-
 class AroundFace(Protocol):
     """Surroundings of the face that are relit: `Surround`, or the whole person of a portrait field."""
 
@@ -123,7 +112,7 @@ class AroundFace(Protocol):
     def nbytes(self) -> int:
         """Size of one light's tensor."""
 
-    def over_photo(self, photo: Rows, lit: Tensor, display_ev: float) -> Rows:
+    def over_photo(self, photo: Pixels, lit: Tensor, display_ev: float) -> Band:
         """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]; `display_ev` shows it well."""
 
 
@@ -131,9 +120,9 @@ class PersonAround(AroundFace, Protocol):
     """A photo's person under sums of lights: `WholePerson`."""
 
     matte: np.ndarray  # the person's share of the photo [H, W]
-    bare_face: Rows  # share [H, W] of the pixels that show the face itself, without hair or a hand before it
+    bare_face: Band  # share [H, W] of the pixels that show the face itself, without hair or a hand before it
 
-    def layer(self, name: str, lit: Tensor) -> dict[str, Rows]:
+    def layer(self, name: str, lit: Tensor) -> dict[str, Layer]:
         """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
@@ -161,7 +150,7 @@ class Composition:
         crop = Crop(0.0, 0.0, float(fit.crop.size_px), fit.crop.size_px) if photo is None else fit.crop
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
         self._photo = photo if target.composite == "photo" else None
-        self.own: Rows
+        self.own: Pixels
         self._face, self._target = head.face, target
         self.detail: PhotoDetail | None = None
         self.surround: AroundFace | None = None
@@ -177,82 +166,95 @@ class Composition:
             self.detail = PhotoDetail(head.face, self.view)
             self.surround = person or Surround(vertices, crop, head.face.texture, size_px[1])
 
-    def image(self, relit: Relit, ev: float = 0.0, behind: Rows | None = None) -> RelitImage:
-        """`rows` as arrays."""
-        return self.rows(relit, ev, behind).whole()
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the frame."""
+        return self.view.height_px, self.view.width_px
 
-    def rows(self, relit: Relit, ev: float = 0.0, behind: Rows | None = None) -> RelitRows:
-        """The head in its frame as relit, scene-linear.
+    def image(self, relit: Relit, ev: float = 0.0, behind: Band | None = None) -> RelitImage:
+        """The head in its frame as relit, scene-linear; see `bands`."""
+        arrays = filled(self.bands(relit, ev, behind), *self.size_px)
+        return RelitImage(arrays["rgb"], arrays.get("A"))
+
+    def bands(self, relit: Relit, ev: float = 0.0, behind: Band | None = None) -> dict[str, Layer]:
+        """The head in its frame as relit, scene-linear, by rows: rgb [H, W, 3], and A [H, W] if it has gaps.
 
         The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
         photo = self._photo
         if photo is None:
-            return RelitRows(self._rendered(relit), self._mask)
+            return {"rgb": self._rendered(relit), "A": self._mask}
         person = self._relit_person(relit)
         if self._target.background == "none":
-            return RelitRows(person, self.matte)
+            return {"rgb": person, "A": self.matte}
         gain = np.float32(2.0**-ev)
 
         def of(rows: slice) -> np.ndarray:
-            pixels, matte = person[rows], self.matte[rows][..., None]
+            pixels, matte = person(rows), self.matte[rows][..., None]
             if behind is not None:
-                below = behind[rows]
+                below = behind(rows)
                 return below + matte * (pixels - below)
             return (photo[rows] - matte * self.own[rows]) * gain + matte * pixels
 
-        return RelitRows(Computed(photo.shape, of))
+        return {"rgb": of}
 
-    def _rendered(self, relit: Relit) -> Rows:
+    def _rendered(self, relit: Relit) -> Band:
         return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
 
     @property
-    def _mask(self) -> Rows:
+    def _mask(self) -> Band:
         return self.view.in_frame(lambda rows: self.view.mask[rows])
 
-    def _relit_person(self, relit: Relit) -> Rows:
-        """Pixels [H, W, 3] of the person, also where the matte leaves none of them."""
+    def _relit_person(self, relit: Relit) -> Band:
+        """Pixels [H, W, 3], by rows, of the person, also where the matte leaves none of them."""
         assert self.surround is not None and self.detail is not None and relit.surround is not None
         around = self.surround.over_photo(self.own, relit.surround, self.guide_ev)
         detail, view = self.detail.relit(self.own, relit.texture), self.view
 
         def of(rows: slice) -> np.ndarray:
-            person = around[rows]
+            person = around(rows)
             inside = view.rows_inside(rows)
             if inside.start < inside.stop:
                 part = person[view.rows_of(inside, rows), view.window[1]]
                 part += self.face_share(inside)[..., None] * (detail(inside) - part)
             return person
 
-        return Computed(around.shape, of)
+        return of
 
     def face_share(self, inside: slice) -> np.ndarray:
         """Share [h, w] of the face in rows of the view's window, without what is seen before it."""
         mask = self.view.mask[inside].numpy()
         if self._person is None:
             return mask
-        return np.asarray(mask * self._person.bare_face[self.view.in_photo(inside)][:, self.view.window[1]])
+        return np.asarray(mask * self._person.bare_face(self.view.in_photo(inside))[:, self.view.window[1]])
 
-    def person(self, relit: Relit) -> tuple[Rows, Rows]:
+    def person(self, relit: Relit) -> tuple[Band, Band]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
-        own = self._mask if self._person is None else self._person.matte
-        share = Computed(own.shape, lambda rows: np.minimum(self.matte[rows], own[rows]))
+        mask, person = self._mask, self._person
+
+        def share(rows: slice) -> np.ndarray:
+            own = mask(rows) if person is None else person.matte[rows]
+            return np.minimum(self.matte[rows], own)
+
         return self._relit_person(relit), share
 
-    def light_layer(self, relit: Relit) -> Rows:
+    def light_layer(self, relit: Relit) -> Band:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""
-        pixels, share = self._rendered(relit), self._mask
-        if self._photo is not None:
-            pixels, share = self._relit_person(relit), self.matte
-        return Computed(pixels.shape, lambda rows: pixels[rows] * share[rows][..., None])
+        if self._photo is None:
+            rendered, mask = self._rendered(relit), self._mask
+            return lambda rows: rendered(rows) * mask(rows)[..., None]
+        pixels = self._relit_person(relit)
+        return lambda rows: pixels(rows) * self.matte[rows][..., None]
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
 
         `names` are of `PERSON_LAYERS` where a whole person is relit; else, and for what only the face has, of
         `FACE_LAYERS`. Raises UsageError for others.
         """
-        found: dict[str, Rows] = {} if self._photo is None else {"person.A": self.matte}
+        found: dict[str, Layer] = {}
+        if self._photo is not None:
+            found["person.A"] = self.matte
         for name in names:
             if self._person is not None and relit.surround is not None and name in PERSON_LAYERS:
                 found |= self._person.layer(name, relit.surround)
@@ -262,7 +264,7 @@ class Composition:
                 raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
         return found
 
-    def _face_layer(self, name: str) -> dict[str, Rows]:
+    def _face_layer(self, name: str) -> dict[str, Layer]:
         if name == "face":
             return {"face.A": self._mask}
         view = self.view
@@ -301,7 +303,7 @@ class PhotoDetail:
         self._around_source = inpaint(face.texture, self.trusted).clamp(min=self.floor)
         self._source = torch.cat([face.texture, own[None]])
 
-    def relit(self, photo: Rows, texture: Tensor) -> Callable[[slice], np.ndarray]:
+    def relit(self, photo: Pixels, texture: Tensor) -> Band:
         """The photo's pixels in rows [h, w, 3] of the window under the light of a relit texture [3, T, T]."""
         mean_change = (_mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)).numpy()
         around = inpaint(texture, self.trusted) / self._around_source
@@ -366,8 +368,8 @@ class Surround:
         """Size of one change of light."""
         return 3 * self._mask.nbytes
 
-    def over_photo(self, photo: Rows, change: Tensor, display_ev: float) -> Rows:
-        """The photo [H, W, 3] under a change of light [3, s, s]."""
+    def over_photo(self, photo: Pixels, change: Tensor, display_ev: float) -> Band:
+        """The photo [H, W, 3], by rows, under a change of light [3, s, s]."""
 
         def of(rows: slice) -> np.ndarray:
             grid = _photo_grid(self._crop, rows, self._width_px)
@@ -377,7 +379,7 @@ class Surround:
             # bicubic weights undershoot a little
             return np.asarray(photo[rows] * over[0].permute(1, 2, 0).clamp(min=0).numpy())
 
-        return Computed(photo.shape, of)
+        return of
 
     def _mean_and_blur(self, textures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean colours [N, 3, 1, 1] of textures [N, 3, T, T] on the face, and their blur [N, 3, s, s]."""

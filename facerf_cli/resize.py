@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.face.head import Head
-from facerf_cli.strips import Computed, Rows, enlarged
+from facerf_cli.strips import Band, enlarged
 
 
 def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -19,15 +19,14 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.ascontiguousarray(plain[..., 0] if image.ndim == 2 else plain)
 
 
-def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Rows:
-    """`resized`; the rows of a larger image are computed as they are read."""
+def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Band:
+    """`resized`, by rows; those of a larger image are computed as they are asked for."""
     if size[0] < image.shape[0] or size[1] < image.shape[1]:
-        return resized(image, *size)
+        small = resized(image, *size)
+        return lambda rows: small[rows]
     maps = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
-    shape = (*size, *image.shape[2:])
-    return Computed(
-        shape, lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *shape[1:])
-    )
+    rest = (size[1], *image.shape[2:])
+    return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *rest)
 
 
 def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:

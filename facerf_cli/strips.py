@@ -1,8 +1,7 @@
 """Images in strips of rows, so that what is computed from a large photo takes little memory at a time."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+import mmap
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -10,34 +9,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 STRIP_PX = 1 << 18  # pixels of a strip, about
+_HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
 
-class Rows(Protocol):
-    """An image [H, W] or [H, W, C] that is read by rows: an array, or one that is computed as it is read."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The image's shape."""
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Some rows [h, W, ...] of it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Computed:
-    """An image whose rows are computed when they are read."""
-
-    shape: tuple[int, ...]
-    of: Callable[[slice], np.ndarray]
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        start, stop, _ = rows.indices(self.shape[0])
-        return self.of(slice(start, stop))
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """All rows, for numpy."""
-        return whole(self).astype(dtype or np.float32, copy=False)
+# Values [h, W, ...] of some rows of an image.
+Band = Callable[[slice], np.ndarray]
+Layer = Band | np.ndarray  # of an image [H, W, ...]: computed by rows, or whole already
 
 
 def strips(shape: Sequence[int], strip_px: int | None = None) -> Iterator[slice]:
@@ -48,14 +26,53 @@ def strips(shape: Sequence[int], strip_px: int | None = None) -> Iterator[slice]
         yield slice(first, min(height, first + step))
 
 
-def whole(rows: Rows) -> np.ndarray:
-    """All rows of an image as an array."""
-    if isinstance(rows, np.ndarray):
-        return rows
-    found = np.empty(rows.shape, np.float32)
-    for some in strips(rows.shape):
-        found[some] = rows[some]
-    return found
+def whole(band: Band, height_px: int, width_px: int) -> np.ndarray:
+    """All rows of an image, computed band by band."""
+    return filled({"": band}, height_px, width_px)[""]
+
+
+def filled(
+    layers: Mapping[str, Layer],
+    height_px: int,
+    width_px: int,
+    empty: Callable[[str, tuple[int, ...]], np.ndarray] = lambda _, shape: np.empty(shape, np.float32),
+) -> dict[str, np.ndarray]:
+    """Arrays [H, W, ...] of an image's layers: the one loop over bands.
+
+    `empty` makes the array of a layer, by its name and shape.
+    """
+    found = {name: layer for name, layer in layers.items() if isinstance(layer, np.ndarray)}
+    bands = {name: layer for name, layer in layers.items() if not isinstance(layer, np.ndarray)}
+    for rows in strips((height_px, width_px)):
+        for name, band in bands.items():
+            values = band(rows)
+            if name not in found:
+                found[name] = empty(name, (height_px, *values.shape[1:]))
+            if found[name].dtype == np.float16:
+                values = values.clip(-_HALF_MAX, _HALF_MAX)
+            found[name][rows] = values
+            release(found[name])
+    return {name: found[name] for name in layers}
+
+
+def by_rows(layer: Layer) -> Band:
+    """A layer as a function of rows."""
+    return layer.__getitem__ if isinstance(layer, np.ndarray) else layer
+
+
+def rows_of(array: np.ndarray, rows: slice) -> np.ndarray:
+    """Some rows of an array; a copy where a file holds it, so that its pages do not stay in memory."""
+    if not isinstance(array, np.memmap):
+        return array[rows]
+    values = np.array(array[rows])
+    release(array)
+    return values
+
+
+def release(array: np.ndarray) -> None:
+    """Take the pages of an array that a file holds out of memory; other arrays stay as they are."""
+    if isinstance(array, np.memmap) and hasattr(mmap, "MADV_DONTNEED"):
+        array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
 
 def block_means(image: np.ndarray, block: int) -> np.ndarray:

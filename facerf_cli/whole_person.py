@@ -4,7 +4,6 @@ The field's maps are coarse. Its gain is enlarged with the photo as a guide, so 
 light keeps every pore and hair; shading and highlights of a light are smooth and enlarged as they are.
 """
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -15,12 +14,12 @@ from torch import Tensor
 from facerf_cli.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.matte import local_lines
+from facerf_cli.portrait.matte import PersonColours, local_lines
 from facerf_cli.portrait.occluders import uncovered_rows
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Band, Layer
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
@@ -50,8 +49,8 @@ class WholePerson:
         """Size of one light's maps."""
         return 3 * self._field.person.image.nbytes
 
-    def over_photo(self, photo: Rows, lit: Tensor, display_ev: float) -> Rows:
-        """The pixels [H, W, 3] of the photo under shading and highlights, the first of the maps [9, S, S].
+    def over_photo(self, photo: np.ndarray | PersonColours, lit: Tensor, display_ev: float) -> Band:
+        """The photo's pixels [H, W, 3], by rows, under shading and highlights, the first of maps [9, S, S].
 
         `display_ev` is the exposure at which the photo is shown to the guided filter.
         """
@@ -69,7 +68,7 @@ class WholePerson:
             beyond = torch.from_numpy(pixels.clip(min=0)).permute(2, 0, 1) * change
             return torch.lerp(beyond, radiance, inside).permute(1, 2, 0).numpy()
 
-        return Computed(photo.shape, of)
+        return of
 
     def _change(self, lit: Tensor) -> Tensor:
         """Smooth change of light [3, S, S] from the photo at the square's border, which goes on beyond it."""
@@ -105,7 +104,7 @@ class WholePerson:
         """The person in the square [3, S, S], as coarse as the maps."""
         return (self._field.maps.albedo[0] * lit[:3] + lit[3:6]) * self._field.exposure
 
-    def layer(self, name: str, lit: Tensor) -> dict[str, Rows]:
+    def layer(self, name: str, lit: Tensor) -> dict[str, Layer]:
         """A layer of an image under the light of maps [9, S, S], by the name or names that it has in a file.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
@@ -113,8 +112,7 @@ class WholePerson:
         shares. All are 0 off the person. Beyond the square what is at its border goes on, as the light does.
         """
         if name == "classes":
-            layers = self._field.person.segmentation.layers()
-            return {key: layers[key] for key in layers if key.startswith("class.")}
+            return {**self._field.person.segmentation.layers()}
         if name == "albedo":
             return {name: self._masked(self._albedo_map)}
         person = self._field.person
@@ -137,12 +135,11 @@ class WholePerson:
                 wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
             return wide
 
-        return {name: self._masked(of, len(maps))}
+        return {name: self._masked(of)}
 
-    def _masked(self, of: Callable[[slice], np.ndarray], channels: int = 3) -> Rows:
-        """A layer [H, W, C] whose rows a function gives, without what lies off the person."""
-        shape = (*self.matte.shape, channels)
-        return Computed(shape, lambda rows: of(rows) * (self.matte[rows] > 0)[..., None])
+    def _masked(self, of: Band) -> Band:
+        """A layer [H, W, C] without what lies off the person."""
+        return lambda rows: of(rows) * (self.matte[rows] > 0)[..., None]
 
     def _albedo_map(self, rows: slice) -> np.ndarray:
         unlit = torch.zeros(6, *self.own.shape).index_fill_(0, torch.arange(3), 1.0)

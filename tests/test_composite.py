@@ -174,7 +174,11 @@ def in_half(background: Background, ev: float, behind: np.ndarray | None = None)
     composition = composed(photo, source, seen, Target(matte=matte, background=background))
     assert isinstance(composition.surround, Surround)
     relit = scene().lit(OTHER)
-    return composition.image(Relit(relit, composition.surround.changes(relit[None])[0]), ev, behind)
+    return composition.image(
+        Relit(relit, composition.surround.changes(relit[None])[0]),
+        ev,
+        None if behind is None else behind.__getitem__,
+    )
 
 
 def test_the_photos_background_looks_as_it_was_at_any_exposure() -> None:
@@ -293,7 +297,8 @@ def test_what_is_before_the_face_is_not_of_it() -> None:
     composition = composed(photo, source, seen, FOLLOWING)
     rows = slice(0, len(composition.view.mask))
     whole = composition.face_share(rows)
-    covered = SimpleNamespace(bare_face=np.tile(np.arange(WIDTH_PX) < WIDTH_PX // 2, (HEIGHT_PX, 1)))
+    half = np.tile(np.arange(WIDTH_PX) < WIDTH_PX // 2, (HEIGHT_PX, 1))
+    covered = SimpleNamespace(bare_face=half.__getitem__)
     composition._person = cast(PersonAround, covered)
     left, columns = composition.view.window[1].start, np.arange(whole.shape[1])
     np.testing.assert_array_equal(composition.face_share(rows), whole * (left + columns < WIDTH_PX // 2))

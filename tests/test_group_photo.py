@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.composite import RelitRows
 from facerf_cli.group_photo import GroupComposition
-from facerf_cli.strips import whole
+from facerf_cli.strips import Band, Layer, filled, whole
 
 SIZE = (4, 6)
 
@@ -25,21 +24,22 @@ class Plain:
         matte[:, self.columns] = self.share
         return matte
 
-    def person(self, relit: float) -> tuple[np.ndarray, np.ndarray]:
-        return np.full((*SIZE, 3), relit), self.matte()
+    size_px = SIZE
 
-    def rows(self, relit: float, ev: float, behind: Any) -> RelitRows:
-        person, matte = self.person(relit)
+    def person(self, relit: float) -> tuple[Band, Band]:
+        return np.full((*SIZE, 3), relit).__getitem__, self.matte().__getitem__
+
+    def bands(self, relit: float, ev: float, behind: Any) -> dict[str, Layer]:
+        person, matte = np.full((*SIZE, 3), relit), self.matte()
         if self.keeps_alpha:
-            return RelitRows(person, matte)
+            return {"rgb": person, "A": matte}
         share = matte[..., None]
-        return RelitRows(share * person + (1 - share) * 0.5 * 2**-ev)
+        return {"rgb": share * person + (1 - share) * 0.5 * 2**-ev}
 
-    def light_layer(self, relit: float) -> np.ndarray:
-        person, matte = self.person(relit)
-        return person * matte[..., None]
+    def light_layer(self, relit: float) -> Band:
+        return (relit * self.matte()[..., None].repeat(3, -1)).__getitem__
 
-    def layers(self, names: Any, relit: float) -> dict[str, np.ndarray]:
+    def layers(self, names: Any, relit: float) -> dict[str, Layer]:
         return {
             "person.A": self.matte(),
             "albedo": np.full((*SIZE, 3), relit) * (self.matte() > 0)[..., None],
@@ -55,28 +55,28 @@ def group(keeps_alpha: bool = False) -> Any:
 
 
 def test_each_person_is_relit_and_the_background_is_the_first_ones() -> None:
-    image = group().rows([2.0, 8.0], 1.0, None).whole()
-    assert image.alpha is None
-    np.testing.assert_allclose(image.pixels[0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
+    image = filled(group().bands([2.0, 8.0], 1.0, None), *SIZE)
+    assert set(image) == {"rgb"}
+    np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
 
 
 def test_alpha_holds_all_people() -> None:
-    image = group(keeps_alpha=True).rows([2.0, 8.0], 0.0, None).whole()
-    np.testing.assert_allclose(image.alpha[0], [1, 1, 0, 0.5, 0.5, 0])
-    np.testing.assert_allclose((image.pixels * image.alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
-    assert image.pixels[0, 3, 0] == 8  # not premultiplied
+    image = filled(group(keeps_alpha=True).bands([2.0, 8.0], 0.0, None), *SIZE)
+    np.testing.assert_allclose(image["A"][0], [1, 1, 0, 0.5, 0.5, 0])
+    np.testing.assert_allclose((image["rgb"] * image["A"][..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
+    assert image["rgb"][0, 3, 0] == 8  # not premultiplied
 
 
 def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
     people = group()
-    apart = whole(people.light_layer([1.0, 3.0])) + whole(people.light_layer([1.0, 5.0]))
-    np.testing.assert_allclose(apart, people.light_layer([2.0, 8.0]))
+    one, other, both = (whole(people.light_layer(lit), *SIZE) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
+    np.testing.assert_allclose(one + other, both)
 
 
 def test_layers_hold_all_people() -> None:
-    layers = group().layers(["albedo"], [2.0, 8.0])
-    np.testing.assert_allclose(whole(layers["person.A"])[0], [1, 1, 0, 0.5, 0.5, 0])
-    np.testing.assert_allclose(whole(layers["albedo"])[0, :, 0], [2, 2, 0, 4, 4, 0])
+    layers = filled(group().layers(["albedo"], [2.0, 8.0]), *SIZE)
+    np.testing.assert_allclose(layers["person.A"][0], [1, 1, 0, 0.5, 0.5, 0])
+    np.testing.assert_allclose(layers["albedo"][0, :, 0], [2, 2, 0, 4, 4, 0])
 
 
 def test_the_exposure_is_the_first_ones() -> None:

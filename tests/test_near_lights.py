@@ -57,7 +57,7 @@ class Person:
     def _shown(self, directions: Tensor, weights: Tensor, near: NearLights | None) -> np.ndarray:
         given = (self.composition, self.head, self.field, directions, weights, TARGET, near)
         relit = next(relit_by(*given))
-        return whole(self.composition.light_layer(relit))
+        return whole(self.composition.light_layer(relit), *self.composition.size_px)
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def test_other_models_have_near_lights_too(person: Person, kind: str) -> None:
     def image(*lights: StudioLight) -> np.ndarray:
         near = NearLights(lights, torch.ones(1, len(lights), 3))
         relit = next(relit_by(composition, person.head, reflectance, *DARK, TARGET, near))
-        return whole(composition.light_layer(relit))
+        return whole(composition.light_layer(relit), *composition.size_px)
 
     both, key, rim = image(KEY, RIM), image(KEY), image(RIM)
     np.testing.assert_allclose(

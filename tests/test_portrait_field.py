@@ -21,7 +21,7 @@ from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relig
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, maps_of, portrait_network
-from facerf_cli.strips import strips, whole
+from facerf_cli.strips import filled, strips
 from facerf_cli.whole_person import WholePerson
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
@@ -144,10 +144,9 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     composition = composition_of(models, photo, head, field)
     relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
-    layers = composition.layers(names, relit)
+    layers = filled(composition.layers(names, relit), *composition.size_px)
     assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
-    for name, rows in layers.items():
-        layer = whole(rows)
+    for name, layer in layers.items():
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= -0.01  # the correction may darken a highlight
     assert composition.image(relit).pixels.min() >= -0.01
@@ -166,7 +165,8 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     def shown() -> list[np.ndarray]:
         composition = composition_of(models, photo, head, field)
         relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
-        return [composition.image(relit).pixels, *map(whole, composition.layers(names, relit).values())]
+        layers = filled(composition.layers(names, relit), *composition.size_px)
+        return [composition.image(relit).pixels, *layers.values()]
 
     at_once = shown()
     monkeypatch.setattr("facerf_cli.strips.STRIP_PX", 1)
@@ -182,7 +182,7 @@ def test_a_lit_shoulder_changes_nothing_beyond_the_square(photo: np.ndarray, fie
     shoulder = even.clone()
     shoulder[:3, side - 50 : side - 20, 40:150] = 20
     person = WholePerson(photo, field)
-    one, other = (person.over_photo(photo, lit, 0.0)[below] for lit in (even, shoulder))
+    one, other = (person.over_photo(photo, lit, 0.0)(below) for lit in (even, shoulder))
     assert one.size > 0 and np.array_equal(one, other)
 
 
@@ -197,7 +197,7 @@ def test_a_streak_at_the_border_is_none_in_the_layers_beyond_the_square(
     even = torch.ones(9, side, side)
     for name in ("albedo", "shadow"):
         streaked, plain = (
-            whole(WholePerson(photo, one).layer(name, lit)[name])[below].mean(-1)
+            WholePerson(photo, one).layer(name, lit)[name](below).mean(-1)
             for one, lit in ((replace(field, maps=maps), even * streak), (field, even))
         )
         change = np.where(plain > 1e-3, streaked / np.maximum(plain, 1e-3), np.nan)

@@ -1,5 +1,6 @@
-"""Images in strips: rows that are computed when they are read, and never many of them at once."""
+"""Images in strips: layers that are computed by rows, never many of them at once, as at once."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch.nn.functional as F
 from facerf_cli import strips as module
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.portrait.matte import PersonColours, refine_matte, shrunk
-from facerf_cli.strips import Computed, enlarged, strips, whole
+from facerf_cli.strips import enlarged, filled, strips, whole
 from tests.oracles.person_colours import slow_person_colours
 
 HEIGHT, WIDTH = 150, 70
@@ -29,17 +30,6 @@ def test_strips_cover_all_rows_once() -> None:
     assert [part.start for part in parts] == [0, 64, 128]
 
 
-class Watched:
-    """Rows of an image that notes how many are read at once."""
-
-    def __init__(self, image: np.ndarray) -> None:
-        self.image, self.shape, self.most = image, image.shape, 0
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        self.most = max(self.most, rows.stop - rows.start)
-        return self.image[rows]
-
-
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.jpg", "a.tif"])
 def test_files_are_written_by_strips_as_by_one(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -47,21 +37,26 @@ def test_files_are_written_by_strips_as_by_one(
     pixels = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
     alpha, normals = DRAW.random((HEIGHT, WIDTH), np.float32), DRAW.random((HEIGHT, WIDTH, 3), np.float32)
 
-    def write(path: Path) -> list[Watched]:
-        watched = [Watched(pixels), Watched(alpha), Watched(normals)]
+    def write(path: Path, of: Callable[[np.ndarray], np.ndarray] = np.asarray) -> bytes:
         if name == "a.exr":
-            write_exr(path, *watched[:2], {"normal": watched[2], "person.A": watched[1]})
+            write_exr(path, of(pixels), of(alpha), {"normal": of(normals), "person.A": of(alpha)})
         elif name == "a.tif":
-            write_tiff(path, *watched[:2])
+            write_tiff(path, of(pixels), of(alpha))
         else:
-            write_display(path, watched[0], 0.5, watched[1])
-        return watched
+            write_display(path, of(pixels), 0.5, of(alpha))
+        return path.read_bytes()
 
-    watched = write(tmp_path / name)
-    assert max(one.most for one in watched) == 64
+    def mapped(values: np.ndarray) -> np.ndarray:
+        found = np.memmap(
+            tmp_path / f"{values.ndim}{values.sum()}.values", values.dtype, "w+", shape=values.shape
+        )
+        found[:] = values
+        return found
+
+    by_strips = write(tmp_path / name)
+    assert write(tmp_path / f"mapped{name}", mapped) == by_strips
     monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
-    write(tmp_path / f"whole{name}")
-    assert (tmp_path / name).read_bytes() == (tmp_path / f"whole{name}").read_bytes()
+    assert write(tmp_path / f"whole{name}") == by_strips
     if name == "a.exr":
         with_alpha = pixels * alpha[..., None]
         np.testing.assert_allclose(
@@ -79,17 +74,24 @@ def test_a_read_does_not_depend_on_strips(tmp_path: Path, monkeypatch: pytest.Mo
     assert (found.pixels == at_once.pixels).all() and (found.alpha == at_once.alpha).all()
 
 
-def test_computed_rows_are_asked_for_by_their_numbers() -> None:
+def test_layers_are_filled_band_by_band(tmp_path: Path) -> None:
     asked: list[slice] = []
 
-    def of(rows: slice) -> np.ndarray:
-        asked.append(rows)
-        return np.repeat(np.arange(rows.start, rows.stop, dtype=np.float32)[:, None], WIDTH, 1)
+    def rows(band: slice) -> np.ndarray:
+        asked.append(band)
+        return np.repeat(np.arange(band.start, band.stop, dtype=np.float32)[:, None], WIDTH, 1)
 
-    image = Computed((HEIGHT, WIDTH), of)
-    assert (whole(image)[:, 0] == np.arange(HEIGHT)).all() and len(asked) == 3
-    assert len(image[140:]) == 10 and asked[-1] == slice(140, 150)
-    assert np.asarray(image).shape == (HEIGHT, WIDTH)
+    assert (whole(rows, HEIGHT, WIDTH)[:, 0] == np.arange(HEIGHT)).all()
+    assert asked == [slice(0, 64), slice(64, 128), slice(128, 150)]
+    ready = np.ones((HEIGHT, WIDTH), np.float32)
+
+    def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        return np.memmap(tmp_path / name, np.float16, "w+", shape=shape)
+
+    layers = {"bright": lambda band: 1e3 * rows(band), "ready": ready}
+    found = filled(layers, HEIGHT, WIDTH, empty)
+    assert list(found) == ["bright", "ready"] and found["ready"] is ready
+    np.testing.assert_allclose(found["bright"][:, 0], (1e3 * np.arange(HEIGHT)).clip(max=65504), rtol=1e-3)
 
 
 def test_maps_are_enlarged_and_shrunk_as_by_torch() -> None:
@@ -112,8 +114,8 @@ def test_colours_of_a_person_are_those_of_the_whole_image(
     photo = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
     matte = (DRAW.random((HEIGHT, WIDTH), np.float32) * 3 - 1).clip(0, 1)
     colours = PersonColours(photo, matte)
-    np.testing.assert_allclose(whole(colours), slow_person_colours(photo, matte, most_px), atol=2e-6)
-    assert (colours[33:40] == whole(colours)[33:40]).all()
+    np.testing.assert_allclose(colours[:], slow_person_colours(photo, matte, most_px), atol=2e-6)
+    assert (colours[33:40] == colours[:][33:40]).all()
 
 
 def test_a_matte_is_refined_by_strips_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

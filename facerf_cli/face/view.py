@@ -15,7 +15,7 @@ from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
-from facerf_cli.strips import Computed, Rows, strips, whole
+from facerf_cli.strips import Band, strips
 
 _TINY = 1e-8
 _FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
@@ -56,9 +56,9 @@ class FaceView:
 
     def full(self, window: Tensor) -> np.ndarray:
         """Place values of the window [h, w, ...] in the photo [H, W, ...], zero elsewhere."""
-        return whole(self.in_frame(lambda rows: window[rows], *window.shape[2:]))
+        return self.in_frame(lambda rows: window[rows], *window.shape[2:])(slice(0, self.height_px))
 
-    def in_frame(self, of: Callable[[slice], Tensor], *channels: int) -> Rows:
+    def in_frame(self, of: Callable[[slice], Tensor], *channels: int) -> Band:
         """An image [H, W, ...] in the photo's frame from values of rows of the window; zero elsewhere."""
 
         def in_photo(rows: slice) -> np.ndarray:
@@ -68,7 +68,7 @@ class FaceView:
                 frame[self.rows_of(inside, rows), self.window[1]] = of(inside).numpy()
             return frame
 
-        return Computed((self.height_px, self.width_px, *channels), in_photo)
+        return in_photo
 
     def rows_inside(self, rows: slice) -> slice:
         """The window's rows, counted from its own first one, among rows of the photo."""

@@ -42,26 +42,34 @@ def atomic_path(path: Path) -> Iterator[Path]:
     a search does not take it for an input. Missing parent folders are created. What a killed process left in
     the folder is removed. Several machines may write the same output at once.
     """
+    try:
+        with hidden_folder(path) as room:
+            temporary = room / path.name
+            yield temporary
+            end_again()  # what was written may lack what a library left out
+            if not temporary.exists():
+                raise FacerfError(f"{path}: could not be written")
+            _sync_all(temporary)
+            if temporary.is_dir() and path.is_dir() and not path.is_symlink():
+                os.replace(path, room / f"{path.name}.old")
+            os.replace(temporary, path)
+            for written in _watched:
+                written.append(path)
+            _sync_folder(path.parent)
+    except OSError as error:
+        raise FacerfError(f"{path}: cannot write: {error.strerror or error}") from error
+
+
+@contextmanager
+def hidden_folder(path: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside an output, of this process alone, which goes with the block."""
     room = path.with_name(_room_name(path.stem))
-    temporary = room / path.name
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep_once(path.parent)
         room.mkdir(mode=0o700)
         _open.add(room)
-        yield temporary
-        end_again()  # what was written may lack what a library left out
-        if not temporary.exists():
-            raise FacerfError(f"{path}: could not be written")
-        _sync_all(temporary)
-        if temporary.is_dir() and path.is_dir() and not path.is_symlink():
-            os.replace(path, room / f"{path.name}.old")
-        os.replace(temporary, path)
-        for written in _watched:
-            written.append(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        raise FacerfError(f"{path}: cannot write: {error.strerror or error}") from error
+        yield room
     finally:
         shutil.rmtree(room, ignore_errors=True)
         _open.discard(room)

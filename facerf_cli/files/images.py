@@ -45,7 +45,7 @@ from facerf_cli.files.image_metadata import (
     utf8_path,
 )
 from facerf_cli.logs import LOGGER_NAME, one_line
-from facerf_cli.strips import Rows, strips, whole
+from facerf_cli.strips import rows_of, strips
 
 PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
@@ -150,9 +150,9 @@ def _say_non_finite(path: Path, count: int, total: int, non_finite: str) -> None
 
 def write_exr(
     path: Path,
-    pixels: Rows,
-    alpha: Rows | None = None,
-    layers: Mapping[str, Rows] | None = None,
+    pixels: np.ndarray,
+    alpha: np.ndarray | None = None,
+    layers: Mapping[str, np.ndarray] | None = None,
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
     compression: str = "zip",
@@ -205,18 +205,20 @@ class _ExrPart:
     alpha_channel: int = -1
 
 
-def _exr_image(pixels: Rows, alpha: Rows | None, space: ColourSpace) -> _ExrPart:
+def _exr_image(pixels: np.ndarray, alpha: np.ndarray | None, space: ColourSpace) -> _ExrPart:
     """Return the image itself, R, G, B and A, premultiplied."""
     if alpha is None:
-        return _ExrPart("rgba", "half", list("RGB"), [lambda rows: from_linear_rec709(pixels[rows], space)])
+        return _ExrPart("rgba", "half", list("RGB"), [_in_space(pixels, space)])
+
+    straight = _in_space(pixels, space)
 
     def colour(rows: slice) -> np.ndarray:
-        return from_linear_rec709(pixels[rows], space) * alpha[rows][..., None]
+        return straight(rows) * rows_of(alpha, rows)[..., None]
 
-    return _ExrPart("rgba", "half", list("RGBA"), [colour, lambda rows: alpha[rows]], alpha_channel=3)
+    return _ExrPart("rgba", "half", list("RGBA"), [colour, _in_space(alpha, None)], alpha_channel=3)
 
 
-def _exr_layers(layers: Mapping[str, Rows], space: ColourSpace) -> Iterator[_ExrPart]:
+def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterator[_ExrPart]:
     """Yield a part for the layers of each name before the dot; colours are converted to the space."""
     grouped: dict[str, _ExrPart] = {}
     for layer, values in layers.items():
@@ -229,11 +231,11 @@ def _exr_layers(layers: Mapping[str, Rows], space: ColourSpace) -> Iterator[_Exr
     yield from grouped.values()
 
 
-def _in_space(values: Rows, space: ColourSpace | None) -> Callable[[slice], np.ndarray]:
+def _in_space(values: np.ndarray, space: ColourSpace | None) -> Callable[[slice], np.ndarray]:
     """Rows of colours in a space, or as they are."""
     if space is None:
-        return lambda rows: values[rows]
-    return lambda rows: from_linear_rec709(values[rows], space)
+        return lambda rows: rows_of(values, rows)
+    return lambda rows: from_linear_rec709(rows_of(values, rows).astype(np.float32, copy=False), space)
 
 
 def _exr_data(path: Path, part: _ExrPart, rows: slice) -> tuple[np.ndarray, int]:
@@ -254,8 +256,8 @@ def _require_finite(path: Path, values: np.ndarray) -> None:
 
 def write_tiff(
     path: Path,
-    pixels: Rows,
-    alpha: Rows | None = None,
+    pixels: np.ndarray,
+    alpha: np.ndarray | None = None,
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
 ) -> None:
@@ -265,9 +267,11 @@ def write_tiff(
     """
 
     def values(_: int, rows: slice) -> np.ndarray:
-        colour = from_linear_rec709(pixels[rows], space)
+        colour = from_linear_rec709(rows_of(pixels, rows), space)
         _require_finite(path, colour)
-        return np.dstack([colour] if alpha is None else [colour, alpha[rows]]).astype(np.float32, copy=False)
+        return np.dstack([colour] if alpha is None else [colour, rows_of(alpha, rows)]).astype(
+            np.float32, copy=False
+        )
 
     spec = _spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
     spec.attribute("compression", "zip")
@@ -280,12 +284,12 @@ def write_tiff(
 
 def write_display(
     path: Path,
-    pixels: Rows,
+    pixels: np.ndarray,
     exposure: float | Literal["auto"] = 0.0,
-    alpha: Rows | None = None,
+    alpha: np.ndarray | None = None,
     metadata: Attributes | None = None,
     view: View = PLAIN_VIEW,
-    share: Rows | None = None,
+    share: np.ndarray | None = None,
     bits: Literal[8, 16] = 8,
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
@@ -294,21 +298,17 @@ def write_display(
     is not premultiplied; JPEG has no alpha and shows the image over black. `view` and `share` are those of
     `colour.encode_display`; `bits` are of a PNG.
     """
-    if exposure == "auto":
-        pixels, mask = whole(pixels), None if alpha is None else whole(alpha)
-        chosen_ev = auto_exposure_ev(pixels, mask)
-    else:
-        chosen_ev = float(exposure)
+    chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
 
     def values(_: int, rows: slice) -> np.ndarray:
-        seen = pixels[rows]
+        seen, opaque = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
         _require_finite(path, seen)
-        if alpha is not None and jpeg:
-            seen = seen * alpha[rows][..., None]
+        if opaque is not None and jpeg:
+            seen = seen * opaque[..., None]
         exposed = np.nan_to_num(seen * np.float32(2.0**chosen_ev))
-        data = encode_display(exposed, view, None if share is None else share[rows])
-        return data if alpha is None or jpeg else np.dstack([data, alpha[rows].astype(np.float32)])
+        data = encode_display(exposed, view, None if share is None else rows_of(share, rows))
+        return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
 
     spec = _spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")
     spec.attribute("oiio:UnassociatedAlpha", 1)

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.light.envmap import look_up, mean_radiance
-from facerf_cli.strips import Computed, Rows, enlarged, whole
+from facerf_cli.strips import Band, enlarged, whole
 
 _SHARP_PX = 3.0  # standard deviation of a blur up to which an image is drawn at its full size
 _TURN = 2 * math.pi
@@ -21,8 +21,8 @@ def backdrop(
     rays: Callable[[tuple[int, int], slice], Tensor],
     rotate_deg: float = 0.0,
     blur: float = 0.0,
-) -> Rows:
-    """The map [H, W, 3] in a frame of a size: radiance [h, w, 3], whose rows are computed as they are read.
+) -> Band:
+    """The map [H, W, 3] in a frame of a size, by rows: radiance.
 
     `rays` gives viewing rays of any length, camera space, of some rows of the frame at another size.
     `rotate_deg` is added to every azimuth of the map; `blur` is the standard deviation of a lens's blur as a
@@ -43,10 +43,9 @@ def backdrop(
         directions = towards(rows)
         return look_up(mean, directions.reshape(-1, 3)).view(directions.shape).numpy()
 
-    sharp = Computed((*small, 3), drawn)
     if not sigma_px:
-        return sharp
+        return drawn
     sigma = sigma_px * small[1] / size[1]
-    soft = gaussian_filter(whole(sharp), (sigma, sigma, 0), mode="nearest")
+    soft = gaussian_filter(whole(drawn, *small), (sigma, sigma, 0), mode="nearest")
     maps = soft.transpose(2, 0, 1)
-    return Computed((*size, 3), lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1))
+    return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
 
-from facerf_cli.strips import Rows, between, enlarged, strips
+from facerf_cli.strips import between, enlarged, strips
 
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
@@ -109,7 +109,7 @@ def _looked_up(maps: np.ndarray, y: np.ndarray, x: np.ndarray, size: tuple[int, 
     return np.asarray(above + down[:, None] * (below - above))
 
 
-def shrunk(image: Rows, size: tuple[int, int]) -> np.ndarray:
+def shrunk(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Means of the pixels of an image [H, W] or [H, W, C] at another size, float32."""
     across, down = (_averages(*pair) for pair in zip(image.shape, size, strict=False))
     flat = np.zeros((size[0], math.prod(image.shape[1:])), np.float32)

@@ -9,7 +9,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Computed, Rows, enlarged
+from facerf_cli.strips import Band, enlarged
 
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered
@@ -28,10 +28,10 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
     return _shown(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
-def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Rows:
+def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Band:
     """The same share [H, W] of the photo's own pixels, by the classes [C, h, w] of the whole photo."""
     covered = _covering(classes)[None].numpy()
-    return Computed(size_px, lambda rows: _share_shown(enlarged(covered, size_px, rows)[0]))
+    return lambda rows: _share_shown(enlarged(covered, size_px, rows)[0])
 
 
 def _places(crop: Crop) -> np.ndarray:

@@ -4,9 +4,8 @@ The Parsing Network looks at the whole body and, for detail, at head and chest a
 sizes around the head.
 """
 
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -21,7 +20,7 @@ from facerf_cli.portrait.outline import with_outline
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.portrait.regions import depth_px, joined_to
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Computed, Rows, enlarged
+from facerf_cli.strips import Band, enlarged
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
@@ -34,7 +33,6 @@ _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
 # Shares of the person below which a pixel is background, and above which it is whole; of all, and of clothes.
 _PERSON, _CLOTH = (0.5, 0.8), (0.3, 0.7)
-_MATTE = "person.A"
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
 # Lengths in extents of the landmarks: the line from the middle of the face down to the chest, and how far
@@ -56,10 +54,10 @@ class Segmentation:
         """The person without what the photo's own alpha [H, W] leaves out; None leaves out nothing."""
         return self if alpha is None else replace(self, matte=self.matte * alpha)
 
-    def layer(self, name: str) -> Rows:
-        """Share [H, W] float32 of a class; those of all classes but the background sum to the matte."""
-        share, size = self._shares[class_index(name) - 1][None].numpy(), self.matte.shape
-        return Computed(size, lambda rows: enlarged(share, size, rows)[0] * self.matte[rows])
+    def layer(self, name: str, rows: slice = slice(None)) -> np.ndarray:
+        """Share [h, W] float32 of a class; those of all classes but the background sum to the matte."""
+        share = self._shares[class_index(name) - 1][None].numpy()
+        return np.asarray(enlarged(share, self.matte.shape, rows)[0] * self.matte[rows])
 
     @cached_property
     def _shares(self) -> Tensor:
@@ -69,26 +67,9 @@ class Segmentation:
         person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
         return person / person.sum(0).clamp_min(1e-6)
 
-    def layers(self) -> Mapping[str, Rows]:
-        """The matte and all classes of the person by the names that they have in an EXR file."""
-        return _Layers(self)
-
-
-@dataclass(frozen=True, eq=False)
-class _Layers(Mapping[str, Rows]):
-    """Layers by name, each made when it is asked for."""
-
-    of: Segmentation
-
-    def __getitem__(self, name: str) -> Rows:
-        return self.of.matte if name == _MATTE else self.of.layer(name.removeprefix("class."))
-
-    def __iter__(self) -> Iterator[str]:
-        yield _MATTE
-        yield from (f"class.{name}" for name in CLASSES[1:])
-
-    def __len__(self) -> int:
-        return len(CLASSES)
+    def layers(self) -> dict[str, Band]:
+        """All classes of the person, by rows, by the names that they have in an EXR file."""
+        return {f"class.{name}": partial(self.layer, name) for name in CLASSES[1:]}
 
 
 def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:

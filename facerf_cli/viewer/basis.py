@@ -28,6 +28,7 @@ from facerf_cli.pipeline import composition_of, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.resize import fitted, resized, shrunk_photo
+from facerf_cli.strips import whole
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
@@ -157,15 +158,15 @@ def basis_of_photo(
     mean: Relit | None = None
     for relit in _single(composition, head, field, rig):
         assert relit.surround is not None
-        images.append(small.light_layer(relit)[:].astype(np.float16))
+        images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
         part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
         coarse.append((part * field.exposure).flatten(1).T.numpy().astype(np.float16))
         mean = relit if mean is None else mean.plus(torch.ones(1), relit.texture, relit.surround)
     assert mean is not None and mean.surround is not None
     mean = Relit(mean.texture / len(rig), mean.surround / len(rig))
-    whole = composition.light_layer(mean)[:]
+    shown = whole(composition.light_layer(mean), *composition.size_px)
     samples = _samples(np.stack(coarse), field)
-    return Basis.of(rig.numpy(), np.stack(images), whole, composition.matte, samples)
+    return Basis.of(rig.numpy(), np.stack(images), shown, composition.matte, samples)
 
 
 def _samples(coarse: np.ndarray, field: PortraitField) -> Samples:

@@ -13,7 +13,7 @@ from facerf_cli.strips import whole
 
 def seen(envmap: torch.Tensor, rotate_deg: float = 0.0, blur: float = 0.0) -> np.ndarray:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
-    return whole(backdrop(envmap, (40, 60), partial(rays_of_rows, camera), rotate_deg, blur))
+    return whole(backdrop(envmap, (40, 60), partial(rays_of_rows, camera), rotate_deg, blur), 40, 60)
 
 
 def dot(direction: tuple[float, float, float]) -> torch.Tensor:
@@ -64,4 +64,4 @@ def test_rows_of_a_background_are_those_of_the_whole() -> None:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
     for blur in (0.0, 0.02, 0.1):
         rows = backdrop(dot((0.0, 0.0, -1.0)), (40, 60), partial(rays_of_rows, camera), blur=blur)
-        np.testing.assert_allclose(rows[8:21], whole(rows)[8:21], rtol=1e-6)
+        np.testing.assert_allclose(rows(slice(8, 21)), whole(rows, 40, 60)[8:21], rtol=1e-6)

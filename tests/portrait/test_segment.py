@@ -10,7 +10,7 @@ from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen, Square
 from facerf_cli.portrait.segment import Segmentation, segment
-from facerf_cli.strips import whole
+from facerf_cli.strips import filled
 from tests.portrait.seen import places, seen_of
 
 HEIGHT, WIDTH = 240, 320
@@ -56,16 +56,16 @@ def photo() -> np.ndarray:
 def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
     found = segment(photo(), FACE)
     assert found.matte.shape == (HEIGHT, WIDTH)
-    assert whole(found.layer("hair"))[45, 160] > 0.9 and whole(found.layer("skin"))[85, 160] > 0.9
-    assert whole(found.layer("garment"))[200, 160] > 0.9 and found.matte[200, 230] < 0.1
-    layers = found.layers()
-    total = sum(whole(layers[f"class.{name}"]) for name in CLASSES[1:])
+    assert found.layer("hair")[45, 160] > 0.9 and found.layer("skin")[85, 160] > 0.9
+    assert found.layer("garment")[200, 160] > 0.9 and found.matte[200, 230] < 0.1
+    layers = filled(found.layers(), *found.matte.shape)
+    total = sum(layers[f"class.{name}"] for name in CLASSES[1:])
     assert np.abs(total - layers["person.A"]).max() < 1e-5
 
 
 def test_another_person_is_left_out(squares: list[Square]) -> None:
     found = segment(photo(), FACE)
-    assert found.matte[120, 30] < 0.05 and whole(found.layer("hand")).max() < 0.05
+    assert found.matte[120, 30] < 0.05 and found.layer("hand").max() < 0.05
 
 
 def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(squares: list[Square]) -> None:
@@ -84,8 +84,8 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
     classes[:, :, 4:] = 0
     classes[CLASSES.index("hair"), :, 4:] = 1
     found = Segmentation(classes, np.full((16, 16), 0.5, np.float32))
-    total = sum(whole(found.layer(name)) for name in CLASSES[1:])
-    assert np.allclose(total, 0.5, atol=1e-6) and whole(found.layer("hair")).min() > 0.4
+    total = sum(found.layer(name) for name in CLASSES[1:])
+    assert np.allclose(total, 0.5, atol=1e-6) and found.layer("hair").min() > 0.4
 
 
 def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(

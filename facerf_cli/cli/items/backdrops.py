@@ -13,7 +13,7 @@ from facerf_cli.cli.lights import LightSetup
 from facerf_cli.files.images import read_image
 from facerf_cli.light.backdrop import backdrop
 from facerf_cli.raster.camera import Camera, rays_of_rows
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Band
 
 _HELD_BYTES = 24  # of a pixel of the photo: it, its matte and the view of its face
 _COVER_BYTES = 12  # of a pixel of the frame, which an image covers
@@ -26,7 +26,7 @@ class Backdrops:
         self._choice, self._blur, self._camera = choice, blur, camera
         self._fixed = _fixed(choice, camera)
 
-    def behind(self, setup: LightSetup, ev: float) -> Rows | None:
+    def behind(self, setup: LightSetup, ev: float) -> Band | None:
         """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
 
         A file and a colour look as they are at an exposure of `ev`. A map is as bright as its light; single
@@ -34,9 +34,10 @@ class Backdrops:
         """
         fixed, gain = self._fixed, np.float32(2.0**-ev)
         if self._choice.kind != "envmap":
-            return None if fixed is None else Computed(fixed.shape, lambda rows: fixed[rows] * gain)
+            return None if fixed is None else lambda rows: fixed[rows] * gain
         if setup.envmap is None:
-            return np.broadcast_to(np.float32(0), (self._camera.height_px, self._camera.width_px, 3))
+            width_px = self._camera.width_px
+            return lambda rows: np.zeros((rows.stop - rows.start, width_px, 3), np.float32)
         with memory.beside(_held_bytes(self._camera)):
             envmap = read_map(setup.envmap)
         size = self._camera.height_px, self._camera.width_px

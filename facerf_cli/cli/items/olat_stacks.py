@@ -38,7 +38,7 @@ from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.resize import resized, shrunk_photo
-from facerf_cli.strips import whole
+from facerf_cli.strips import filled, whole
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 _FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
@@ -116,12 +116,13 @@ def _of_person(
     alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
     target = Target(alpha=alpha, background="none")
     composition = composition_of(models, photo, head, reflectance, target)
+    size = composition.size_px
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
             single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
             relit = relit_by(composition, head, reflectance, some, single)
-            layers = np.stack([whole(composition.light_layer(one)) for one in relit])
+            layers = np.stack([whole(composition.light_layer(one), *size) for one in relit])
             batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
@@ -130,14 +131,14 @@ def _of_person(
 
     single = torch.eye(1)[..., None].expand(-1, -1, 3)
     relit = next(iter(relit_by(composition, head, reflectance, directions[:1], single)))
-    layers = composition.layers(("normal",), relit)
+    normals = filled(composition.layers(("normal",), relit), *size)["normal"]
     header = StackHeader(
         kind="photo",
         directions=directions.numpy(),
         rotation=head.fit.rotation.numpy(),
         source=photo,
-        seen=whole(layers["person.A"]),
-        normals=whole(layers["normal"]),
+        seen=composition.matte,
+        normals=normals,
         layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(head.fit),
         metadata=_metadata(item, work),

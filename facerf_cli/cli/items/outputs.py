@@ -2,9 +2,10 @@
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,12 +15,19 @@ from facerf_cli import memory
 from facerf_cli.cli.output_options import SUFFIXES, Format, OutputOptions
 from facerf_cli.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.errors import UsageError
+from facerf_cli.files.atomic import hidden_folder
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.logs import LOGGER_NAME
-from facerf_cli.strips import Rows, whole
 
 Exposure = float | Literal["auto"]
-_HELD = 1  # of an image: the photo; a writer of each format may hold as much as an image
+_FLOATS = (
+    "rgb",
+    "A",
+    "person.A",
+    "position",
+    "depth",
+    "uv",
+)  # layers that are not only written as half floats
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -30,10 +38,10 @@ class OutputImage:
     `share` [H, W] is how far a soft view applies to each pixel (`colour.encode_display`); None: to all.
     """
 
-    pixels: Rows
-    alpha: Rows | None = None
-    layers: Mapping[str, Rows] = field(default_factory=dict)
-    share: Rows | None = None
+    pixels: np.ndarray
+    alpha: np.ndarray | None = None
+    layers: Mapping[str, np.ndarray] = field(default_factory=dict)
+    share: np.ndarray | None = None
 
 
 def check_output(options: OutputOptions) -> None:
@@ -51,8 +59,6 @@ def write_output(
 ) -> None:
     """Write an image in every format, at the same time, under `path` with the suffix of each."""
     space, view = _space_of(options), _view_of(options)
-    if len(options.formats) > 1:
-        image = _held(image, len(options.formats))
 
     def write(name: Format) -> None:
         target = path.with_suffix(SUFFIXES[name])
@@ -65,15 +71,33 @@ def write_output(
             shown = {"facerf:view": view.name, **(metadata or {})}
             write_display(target, image.pixels, exposure, image.alpha, shown, view, image.share, bits)
 
-    at_once = len(options.formats) if isinstance(image.pixels, np.ndarray) else 1
+    at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(write, options.formats))
 
 
-def _held(image: OutputImage, formats: int) -> OutputImage:
-    """The image with its pixels computed once for all formats, where they and the writers fit the budget."""
-    needed = (_HELD + formats) * 4 * math.prod(image.pixels.shape)
-    return replace(image, pixels=whole(image.pixels)) if memory.limit_bytes() > needed else image
+@contextmanager
+def canvas(path: Path, held_bytes: int) -> Iterator[Callable[[str, tuple[int, ...]], np.ndarray]]:
+    """Yield a function that makes an array for a layer of an output, by its name and shape.
+
+    Arrays that do not fit the budget, with what is held already, are mapped to files in a hidden folder of
+    the output: the parts of an EXR are written one after the other. There layers that an EXR holds in half
+    floats are half floats.
+    """
+    with ExitStack() as stack:
+        left, folders = memory.limit_bytes() - held_bytes, list[Path]()
+
+        def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
+            nonlocal left
+            needed = 4 * math.prod(shape)
+            if left > needed:
+                left -= needed
+                return np.empty(shape, np.float32)
+            folders[:] = folders or [stack.enter_context(hidden_folder(path))]
+            kind = np.float32 if name in _FLOATS else np.float16
+            return np.memmap(folders[0] / f"{name}.values", kind, "w+", shape=shape)
+
+        yield empty
 
 
 def _space_of(options: OutputOptions) -> ColourSpace:

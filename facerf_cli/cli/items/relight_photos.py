@@ -1,10 +1,11 @@
 """One photo, or one OLAT stack, under every light setup: relit, exposed and written."""
 
 import logging
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar, cast
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from facerf_cli.cli.items.light_weights import (
     weights_over_rig,
     weights_over_stack,
 )
-from facerf_cli.cli.items.outputs import OutputImage, write_output
+from facerf_cli.cli.items.outputs import OutputImage, canvas, write_output
 from facerf_cli.cli.items.photos import (
     FittedFace,
     face_model,
@@ -39,7 +40,7 @@ from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight_work import Relight
 from facerf_cli.cli.shots import shot_of
 from facerf_cli.colour import ExposureRule, most_exposure_ev
-from facerf_cli.composite import Composition, Relit, RelitRows, Target
+from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
@@ -51,12 +52,12 @@ from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_he
 from facerf_cli.group_photo import GroupComposition
 from facerf_cli.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Band, Layer, filled
 
+_IMAGE_PX = 12  # bytes of a pixel of an image
 _HELD = 4  # relit textures are held this many times while lights are added to them
 _STACK_BYTES = 130  # of a pixel of a stack, beside its photo
 _KEPT_PX = 12  # bytes of a pixel beside that photo: an image computed once for several formats
-T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 _of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
@@ -66,13 +67,17 @@ Written = dict[Path, float]  # the EXR of each image, and the exposure of the PN
 class Composer(Protocol):
     """A composer of images: `Composition`, `GroupComposition`; of stacks `PersonStack`, `RenderedStack`."""
 
-    def rows(self, relit: Any, ev: float, behind: Rows | None) -> RelitRows:
-        """The image of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the images."""
 
-    def layers(self, names: Sequence[str], relit: Any) -> dict[str, Rows]:
+    def bands(self, relit: Any, ev: float, behind: Band | None) -> dict[str, Layer]:
+        """rgb and A of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
+
+    def layers(self, names: Sequence[str], relit: Any) -> dict[str, Layer]:
         """Layers of the image by the names that they have in a file."""
 
-    def light_layer(self, relit: Any) -> Rows:
+    def light_layer(self, relit: Any) -> Band:
         """The person under one of several lights, over black."""
 
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
@@ -348,15 +353,41 @@ def _write_setups(
             _require_finite(item, setup, relit)
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             behind = shown.backdrops.behind(setup, ev) if shown.backdrops else None
-            image, layers = shown.composer.rows(relit, ev, behind), shown.composer.layers(work.aov, relit)
-            if setup.names:
-                layers = {**layers, **_light_layers(shown, setup, image.pixels.shape)}
-            written = _output(image, layers, shown.alpha, work)
-            write_output(path, written, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
+            with canvas(path, _held_bytes(shown.composer, work)) as empty:
+                image = _rendered(shown, setup, relit, ev, behind, work, empty)
+                write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
+                del image
             if work.output.shown_suffix and not chosen_ev:
                 log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             yield path, ev
-            del relit, image, layers, written  # a view of one holds all of its part, beside the next
+            del relit, behind  # a view of one holds all of its part, beside the next
+
+
+def _held_bytes(composer: Composer, work: Relight) -> int:
+    """Bytes beside the layers of an image; a writer of each format may hold as much as an image."""
+    return len(work.output.formats) * _IMAGE_PX * math.prod(composer.size_px)
+
+
+def _rendered(
+    shown: _Shown,
+    setup: LightSetup,
+    relit: Any,
+    ev: float,
+    behind: Band | None,
+    work: Relight,
+    empty: Callable[[str, tuple[int, ...]], np.ndarray],
+) -> OutputImage:
+    """The image of a setup, with its layers, as arrays that `empty` makes.
+
+    A soft view leaves what was photographed, and a given background, as it looks.
+    """
+    composer = shown.composer
+    arrays = filled(composer.bands(relit, ev, behind), *composer.size_px, empty)
+    layers = filled(composer.layers(work.aov, relit), *composer.size_px, empty)
+    keeps = "A" not in arrays and work.background.kind != "envmap"
+    share = layers.get("person.A") if keeps else None
+    layers |= _light_layers(shown, setup, empty)
+    return OutputImage(arrays["rgb"], arrays.get("A", shown.alpha), layers, share)
 
 
 def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
@@ -381,47 +412,19 @@ def _at_once(shown: _Shown) -> int:
     return max(1, memory.limit_bytes() // (_HELD * shown.bytes_each))
 
 
-class _Last(Generic[T]):
-    """A function of a number that remembers its last value, and gives it up before it computes another."""
-
-    def __init__(self, of: Callable[[int], T]) -> None:
-        self._of, self._held = of, dict[int, T]()
-
-    def __call__(self, number: int) -> T:
-        if number not in self._held:
-            self._held.clear()
-            self._held[number] = self._of(number)
-        return self._held[number]
-
-
-def _light_layers(shown: _Shown, setup: LightSetup, shape: tuple[int, ...]) -> dict[str, Rows]:
-    """The person under each light of a setup [H, W, 3], by the lights' names.
-
-    Lights are relit when their rows are first read, as many at a time as fit the memory.
-    """
-    at_once = _at_once(shown)
-
-    @_Last
-    def some(first: int) -> list[Any]:
-        return shown.apart(replace(setup, lights=setup.lights[first : first + at_once]))
-
-    @_Last
-    def layer(number: int) -> Rows:
-        return shown.composer.light_layer(some(number - number % at_once)[number % at_once])
-
-    def rows_of(number: int) -> Rows:
-        return Computed(shape, lambda rows: layer(number)[rows])
-
-    return {name: rows_of(number) for number, name in enumerate(setup.names)}
-
-
-def _output(
-    image: RelitRows, layers: Mapping[str, Rows], photo_alpha: np.ndarray | None, work: Relight
-) -> OutputImage:
-    """The image to write; a soft view leaves what was photographed, and a given background, as it looks."""
-    alpha = photo_alpha if image.alpha is None else image.alpha
-    keeps = image.alpha is None and work.background.kind != "envmap"
-    return OutputImage(image.pixels, alpha, layers, layers.get("person.A") if keeps else None)
+def _light_layers(
+    shown: _Shown, setup: LightSetup, empty: Callable[[str, tuple[int, ...]], np.ndarray]
+) -> dict[str, np.ndarray]:
+    """The person under each named light of a setup [H, W, 3]; lights are relit as many as fit the memory."""
+    layers: dict[str, np.ndarray] = {}
+    at_once, composer = _at_once(shown), shown.composer
+    for first in range(0, len(setup.names), at_once):
+        some = slice(first, first + at_once)
+        relit = shown.apart(replace(setup, lights=setup.lights[some]))
+        for name, one in zip(setup.names[some], relit, strict=True):
+            layers |= filled({name: composer.light_layer(one)}, *composer.size_px, empty)
+        del relit, one  # before others are relit
+    return layers
 
 
 def _exposures_ev(

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.cli.inputs import Item
+from facerf_cli.cli.items.outputs import canvas
 from facerf_cli.cli.items.photos import facts_of_found, find_people, read_photo, stamp
 from facerf_cli.cli.items.shot_frames import segmented_frame
 from facerf_cli.cli.photo_options import PhotoOptions
@@ -20,9 +21,10 @@ from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import FoundFace
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
-from facerf_cli.strips import whole
+from facerf_cli.strips import filled
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
+_HELD_PX = 38  # bytes of a pixel: the photo, and
 _KEPT_PX = 26  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the colours, a class
 _OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
@@ -56,8 +58,11 @@ def _write(
         return item.output(tag + ending)
 
     metadata, found = stamp(item), found.cut(image.alpha)
-    colours = whole(PersonColours(image.pixels, found.matte))
-    write_exr(path("_segment.exr"), colours, found.matte, found.layers(), metadata)
+    height, width = found.matte.shape
+    colours, held = PersonColours(image.pixels, found.matte)[:], _HELD_PX * height * width
+    with canvas(path("_segment.exr"), held) as empty:
+        layers = {"person.A": found.matte, **filled(found.layers(), height, width, empty)}
+        write_exr(path("_segment.exr"), colours, found.matte, layers, metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)
     write_display(path("_overlay.jpg"), _overlay(display, found, face), metadata=metadata)
     write_document(path("_landmarks.json"), _landmarks(face))
@@ -68,7 +73,7 @@ def _overlay(display: np.ndarray, found: Segmentation, face: Face) -> np.ndarray
     step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
     shown = display[::step, ::step] / np.float32(255) * (1 - _SHOWN * found.matte[::step, ::step, None])
     for name, colour in zip(CLASSES[1:], _colours(), strict=True):
-        shown += _SHOWN * whole(found.layer(name))[::step, ::step, None] * colour
+        shown += _SHOWN * found.layer(name)[::step, ::step, None] * colour
     half = max(1, round(_DOT * max(shown.shape[:2]) / 2))
     for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
         shown[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)

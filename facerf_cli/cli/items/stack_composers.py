@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from facerf_cli.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
-from facerf_cli.composite import Relit, RelitRows
+from facerf_cli.composite import Relit
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.resize import resized_rows
-from facerf_cli.strips import Computed, Rows
+from facerf_cli.strips import Band, Layer
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
@@ -22,15 +22,22 @@ class RenderedStack:
     seen: np.ndarray
     normals: np.ndarray  # [H, W, 3]
 
-    def rows(self, relit: Relit, ev: float, behind: Rows | None) -> RelitRows:
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the images."""
+        return self.seen.shape[0], self.seen.shape[1]
+
+    def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The face as relit, with its coverage as alpha."""
-        return RelitRows(_pixels(relit), self.seen)
+        pixels = _pixels(relit)
+        return {"rgb": pixels, "A": self.seen}
 
-    def light_layer(self, relit: Relit) -> np.ndarray:
+    def light_layer(self, relit: Relit) -> Band:
         """The face under one of several lights, over black."""
-        return np.asarray(_pixels(relit) * self.seen[..., None])
+        pixels = _pixels(relit)
+        return lambda rows: pixels[rows] * self.seen[rows][..., None]
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """The layer of normals; raises UsageError for others."""
         return _only_normals(names, self.normals)
 
@@ -52,29 +59,32 @@ class PersonStack:
     photo: np.ndarray | None = None
     keeps_background: bool = True
 
-    def rows(self, relit: Relit, ev: float, behind: Rows | None) -> RelitRows:
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the frame."""
+        height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
+        return height, width
+
+    def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The person before the photo's background at `ev`, before another, or with alpha."""
         (person, matte), photo, gain = self._person(relit), self.photo, np.float32(2.0**-ev)
-        if behind is None:
-            if photo is None or not self.keeps_background:
-                return RelitRows(person, matte)
-            behind = Computed(photo.shape, lambda rows: gain * photo[rows])
-        shown = behind
+        if photo is None or (behind is None and not self.keeps_background):
+            return {"rgb": person, "A": matte}
 
         def of(rows: slice) -> np.ndarray:
-            below = shown[rows]
-            return np.asarray(below + matte[rows][..., None] * (person[rows] - below))
+            below = behind(rows) if behind else gain * photo[rows]
+            return np.asarray(below + matte(rows)[..., None] * (person(rows) - below))
 
-        return RelitRows(Computed(person.shape, of))
+        return {"rgb": of}
 
-    def light_layer(self, relit: Relit) -> Rows:
+    def light_layer(self, relit: Relit) -> Band:
         """The person under one of several lights, over black."""
         person, matte = self._person(relit)
-        return Computed(person.shape, lambda rows: person[rows] * matte[rows][..., None])
+        return lambda rows: person(rows) * matte(rows)[..., None]
 
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Rows]:
+    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """The matte and the layer of normals; raises UsageError for others."""
-        normals = resized_rows(self.header.normals, self._size())
+        normals = resized_rows(self.header.normals, self.size_px)
         return {"person.A": self._matte()} | _only_normals(names, normals)
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
@@ -84,21 +94,17 @@ class PersonStack:
             return auto_exposure_ev(person, seen)
         return anchored_exposure_ev(person, self.header.source, self.face * seen, seen)
 
-    def _person(self, relit: Relit) -> tuple[Rows, Rows]:
+    def _person(self, relit: Relit) -> tuple[Band, Band]:
         """The person's own colours [H, W, 3], and its matte [H, W]."""
-        own, photo = _straight(_pixels(relit), self.header.seen), self.photo
-        if photo is None or self._size() == self.header.seen.shape:
-            return own, self.header.seen
+        own, photo, seen = _straight(_pixels(relit), self.header.seen), self.photo, self.header.seen
+        if photo is None or self.size_px == seen.shape:
+            return lambda rows: own[rows], lambda rows: seen[rows]
         source = self.header.source
-        change = resized_rows(own / (source + _DARK * source.mean()), self._size())
-        return Computed(photo.shape, lambda rows: photo[rows] * change[rows]), self._matte()
+        change = resized_rows(own / (source + _DARK * source.mean()), self.size_px)
+        return lambda rows: photo[rows] * change(rows), self._matte()
 
-    def _matte(self) -> Rows:
-        return resized_rows(self.header.seen, self._size())
-
-    def _size(self) -> tuple[int, int]:
-        height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
-        return height, width
+    def _matte(self) -> Band:
+        return resized_rows(self.header.seen, self.size_px)
 
 
 def _pixels(relit: Relit) -> np.ndarray:
@@ -111,7 +117,7 @@ def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
     return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
 
 
-def _only_normals(names: Sequence[str], normals: Rows) -> dict[str, Rows]:
+def _only_normals(names: Sequence[str], normals: Layer) -> dict[str, Layer]:
     if other := [name for name in names if name != "normal"]:
         raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
     return {"normal": normals} if names else {}

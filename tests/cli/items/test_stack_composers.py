@@ -10,7 +10,7 @@ from facerf_cli.cli.items.stack_composers import PersonStack
 from facerf_cli.composite import Relit
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
-from facerf_cli.strips import whole
+from facerf_cli.strips import filled, whole
 
 SIDE = 4
 
@@ -36,24 +36,24 @@ def lit(radiance: float) -> Relit:
 
 
 def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
-    image = PersonStack(header(), header().seen).rows(lit(0.6), 0.0, None).whole()
-    assert image.alpha is not None and image.alpha.mean() == 0.5
-    np.testing.assert_allclose(image.pixels[:, :2], 0.6, rtol=1e-6)
+    image = filled(PersonStack(header(), header().seen).bands(lit(0.6), 0.0, None), SIDE, SIDE)
+    assert image["A"].mean() == 0.5
+    np.testing.assert_allclose(image["rgb"][:, :2], 0.6, rtol=1e-6)
 
 
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
     photo = np.full((8, 8, 3), 0.2, np.float32)
     photo[0, 0] = 0.4  # a detail
-    image = PersonStack(header(), header().seen, photo).rows(lit(0.6), 1.0, None).whole()
-    assert image.alpha is None
-    assert image.pixels[4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
-    assert image.pixels[0, 0, 0] == pytest.approx(1.2, rel=2e-3)
-    np.testing.assert_allclose(image.pixels[:, -1], photo[:, -1] / 2)  # the background, as it was at 1 EV
+    image = filled(PersonStack(header(), header().seen, photo).bands(lit(0.6), 1.0, None), 8, 8)
+    assert set(image) == {"rgb"}
+    assert image["rgb"][4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
+    assert image["rgb"][0, 0, 0] == pytest.approx(1.2, rel=2e-3)
+    np.testing.assert_allclose(image["rgb"][:, -1], photo[:, -1] / 2)  # the background, as it was at 1 EV
 
 
 def test_layers_of_lights_add_up() -> None:
     composer = PersonStack(header(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
-    one, other, both = (whole(composer.light_layer(lit(radiance))) for radiance in (0.2, 0.4, 0.6))
+    one, other, both = (whole(composer.light_layer(lit(radiance)), 8, 8) for radiance in (0.2, 0.4, 0.6))
     np.testing.assert_allclose(one + other, both, rtol=1e-5)
 
 
@@ -61,14 +61,15 @@ def test_a_large_photo_is_composed_in_rows() -> None:
     """The memory at any time is that of the rows that are read, whatever is behind the person."""
     photo = np.full((2048, 512, 3), 0.2, np.float32)
     composer, behind = PersonStack(header(), header().seen, photo), np.full((2048, 512, 3), 3.0, np.float32)
-    for image in (composer.rows(lit(0.6), 1.0, None), composer.rows(lit(0.6), 1.0, behind)):
+    for given in (None, behind.__getitem__):
+        image = composer.bands(lit(0.6), 1.0, given)["rgb"]
         tracemalloc.start()
-        middle = image.pixels[1000:1010]
+        middle = image(slice(1000, 1010))
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert middle.shape == (10, 512, 3) and peak < photo.nbytes / 10
-        np.testing.assert_allclose(middle, image.whole().pixels[1000:1010], rtol=1e-6)
-    np.testing.assert_allclose(image.whole().pixels[:, -1], 3.0)
+        np.testing.assert_allclose(middle, whole(image, 2048, 512)[1000:1010], rtol=1e-6)
+    np.testing.assert_allclose(whole(image, 2048, 512)[:, -1], 3.0)
 
 
 def test_exposure_and_layers() -> None:
