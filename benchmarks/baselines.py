@@ -27,8 +27,7 @@ from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
 from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
-from facerf_cli.dataset.pairs import Pair
-from facerf_cli.dataset.weights import load_pairs
+from facerf_cli.dataset.pairs import Pair, load_pairs
 from facerf_cli.evaluation.people import CropView, Person
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats

@@ -27,11 +27,10 @@ from _common import arguments, print_header, print_row, required
 from scipy import ndimage
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.align import with_alignment
-from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.capture.layouts import read_capture
-from facerf_cli.capture.stage_json import STAGE_FILE
+from facerf_cli.capture.findings import Finding
+from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
 from facerf_cli.files.images import read_image
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults

@@ -20,10 +20,11 @@ import numpy as np
 from _common import SHIFTS, YALE_B, arguments, required
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.align import with_alignment
-from facerf_cli.capture.checks.findings import Finding, frames_left_out
+from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.findings import Finding, frames_left_out
+from facerf_cli.capture.settings import ReadSettings
+from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, read_shifts
 
 _SET_ON = ("yaleB05", "yaleB15", "yaleB22")  # subjects on which the thresholds were set
@@ -37,7 +38,8 @@ def main() -> None:
     parser.add_argument("--shifts", type=Path, help="the list of shifts in whole pixels")
     parser.add_argument("--subjects", nargs="+", help="only these")
     given = parser.parse_args()
-    capture = read_capture(required(given.data, "Extended Yale B", "--data", YALE_B), "extended-yale-b")
+    folder = required(given.data, "Extended Yale B", "--data", YALE_B)
+    capture = read_capture(folder, ReadSettings("extended-yale-b"))
     subjects = [name for name in capture.subjects if name in (given.subjects or capture.subjects)]
     found = {subject: check_subject(capture, subject) for subject in subjects}
     report_broken(capture, "thresholds set on", {name: found[name] for name in subjects if name in _SET_ON})

@@ -20,10 +20,17 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from skimage.transform import resize
 
-from facerf_cli.capture.chart_colours import delta_e_2000, fit_colours, neutral_matrix, published_colours
-from facerf_cli.capture.chart_patches import PATCH_SIDE, area_corners, sample, squares_px
-from facerf_cli.capture.colour_chart import outline_patches
-from facerf_cli.capture.find_chart import find_chart
+from facerf_cli.capture.chart import (
+    PATCH_SIDE,
+    area_corners,
+    delta_e_2000,
+    fit_colours,
+    neutral_matrix,
+    published_colours,
+    sample,
+    squares_px,
+)
+from facerf_cli.capture.chart_photo import find_chart, outline_patches
 from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import read_image, write_display
 

@@ -4,7 +4,7 @@
 
 Faces are those of photos, and with `--dataset` of every fourth of its people in every camera, under all
 lights. For every face: size and place of the crop of `face.crop.from_landmarks` in units of the box, then in
-units of the crop of `from_box` (so `dataset/crop_move.py` gets its spreads). The last figures are landmark
+units of the crop of `from_box` (so `dataset/crops.py` gets its spreads). The last figures are landmark
 errors of the regressed head, in percent of the distance of the outer eye corners, from each crop.
 Naive twin: the box itself as the crop.
 """

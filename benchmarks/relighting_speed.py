@@ -18,7 +18,7 @@ from _common import ASTRONAUT, ROOT, arguments, best_s
 from torch import Tensor
 
 from facerf_cli.composite import Composition
-from facerf_cli.dataset.relight import multiply
+from facerf_cli.dataset.weights import multiply
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.field import Field

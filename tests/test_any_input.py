@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facerf_cli.capture.draft_lights import read_light_list
+from facerf_cli.capture.draft import read_light_list
 from facerf_cli.cli.light_entries import lit_images
 from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import Shard

@@ -1,6 +1,10 @@
-"""A light-stage capture on disk: lights, calibrated cameras, and its frames in linear light."""
+"""A light-stage capture on disk: lights, calibrated cameras, and its frames in linear light.
 
-from collections.abc import Mapping
+Path patterns name the frames: {subject}, {camera} and {light} stand for parts of their paths.
+"""
+
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -8,11 +12,64 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.capture.chart_correction import ChartCorrection, correct_colours
-from facerf_cli.capture.pattern import fill_pattern
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera
+from facerf_cli.files.documents import is_name
 from facerf_cli.files.images import read_image
+
+FIELDS = ("subject", "camera", "light")
+FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's place: a frame with all lights on
+_AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # there, too: a frame without lights
+_RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that file names cannot have everywhere
+_LONGEST = 500
+Rows = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class ChartCorrection:
+    """Colour matrix of some cameras, and how it was found; plain values that processes can share."""
+
+    image: Path
+    image_sha256: str
+    cameras: tuple[str, ...]
+    corners_px: Rows  # [4, 2] of the patches' area, clockwise from the dark skin patch
+    matrix: Rows  # [3, 3] on linear Rec.709 under a light of rgb 1; keeps the luminance of neutral colours
+    delta_e_before: tuple[float, float]  # CIE 2000, mean and largest of the 24 patches
+    delta_e_after: tuple[float, float]
+    light_span: float  # brightest over darkest light on the chart; the fit removes this falloff
+    overlay: str  # file name of the control image in a dataset
+
+    def record(self) -> dict[str, Any]:
+        """Entry of the correction in `dataset.json`."""
+        return {
+            "picture": self.image.name,
+            "picture_sha256": self.image_sha256,
+            "cameras": list(self.cameras),
+            "corners_px": [list(corner) for corner in self.corners_px],
+            "matrix": [list(row) for row in self.matrix],
+            "delta_e_2000": {
+                "before": dict(zip(("mean", "max"), self.delta_e_before, strict=True)),
+                "after": dict(zip(("mean", "max"), self.delta_e_after, strict=True)),
+            },
+            "light_span": self.light_span,
+            "overlay": self.overlay,
+        }
+
+    def in_words(self) -> str:
+        """Log line with the colour errors before and after."""
+        (mean_before, max_before), (mean, most) = self.delta_e_before, self.delta_e_after
+        return (
+            f"{self.image}: colour chart of {', '.join(self.cameras)}: CIE delta E 2000 mean {mean:.1f}, "
+            f"max {most:.1f} (before: {mean_before:.1f}, {max_before:.1f})"
+        )
+
+
+def correct_colours(charts: Iterable[ChartCorrection], camera: str, linear: np.ndarray) -> np.ndarray:
+    """Apply the matrix of a camera's chart to a frame [H, W, 3], linear Rec.709, float32; if it has one."""
+    for chart in charts:
+        if camera in chart.cameras:
+            return linear @ np.array(chart.matrix, np.float32).T
+    return linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +171,68 @@ def _keys_weights(t: float) -> tuple[float, float, float, float]:
         t * (1 + 4 * t - 3 * t**2) / 2,
         -(t**2) * (1 - t) / 2,
     )
+
+
+def require_pattern(
+    pattern: str, where: str, needed: Collection[str], fields: tuple[str, ...] = FIELDS
+) -> str:
+    """Return a pattern; an InputError says `where` one stands that is no path with the needed fields alone.
+
+    It must stay below the capture's folder, and hold no braces but those of `fields`.
+    """
+    parts = pattern.split("/")
+    plain = re.sub(rf"\{{({'|'.join(fields)})\}}", "", pattern)
+    words = [f"{{{key}}}" for key in fields if key in needed]
+    odd = sorted({letter for letter in plain if letter in _RESERVED or not letter.isprintable()})
+    if (
+        odd
+        or any(word not in pattern for word in words)
+        or any(part in ("", ".", "..") for part in parts)
+        or len(pattern) > _LONGEST
+    ):
+        named = " that names " * bool(words) + " and ".join(words)
+        free = f", without {' '.join(map(ascii, odd))} elsewhere," * bool(odd)
+        raise InputError(f"{where} is {pattern!r}; a path below the capture{named}{free} is needed")
+    return pattern
+
+
+def fill_pattern(pattern: str, **names: str) -> str:
+    """Replace the fields of a pattern by names."""
+    for key, name in names.items():
+        pattern = pattern.replace(f"{{{key}}}", name)
+    return pattern
+
+
+def compile_pattern(pattern: str) -> re.Pattern[str]:
+    """Make a regular expression with a group per field; a repeated field must match the same text."""
+    expression = re.escape(pattern)
+    for key in FIELDS:
+        escaped = re.escape(f"{{{key}}}")
+        expression = expression.replace(escaped, f"(?P<{key}>[^/]+)", 1).replace(escaped, f"(?P={key})")
+    return re.compile(expression)
+
+
+def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[str]) -> Iterator[str]:
+    """Yield the subjects that have an image, sorted: the names at the part of the pattern with {subject}."""
+    parts = pattern.split("/")
+    depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
+    expression = compile_pattern("/".join(parts[: depth + 1]))
+    above = fill_pattern("/".join([*parts[:depth], "*"]), camera="*", light="*")
+    relatives = (path.relative_to(folder).as_posix() for path in folder.glob(above) if path.name[0] != ".")
+    matches = (expression.fullmatch(relative) for relative in relatives)
+    for name in sorted({match["subject"] for match in matches if match}):
+        paths = (
+            folder / fill_pattern(pattern, subject=name, camera=c, light=i) for c in cameras for i in lights
+        )
+        if any(path.exists() for path in paths):
+            if not is_name(name):
+                raise InputError(f"{folder}: the subject {name!r} is no name of letters, digits, - and _")
+            yield name
+
+
+def unlisted_kind(name: str) -> str:
+    """Kind of an image whose name in the light's place is of no single light: 'full', 'ambient', else ''."""
+    plain = name.lower().strip("_- ")
+    if plain in FULL_NAMES:
+        return "full"
+    return "ambient" if any(word in plain for word in _AMBIENT_WORDS) else ""

@@ -1,23 +1,32 @@
 """First draft of `stage.json` for a folder of images: what file names and headers say, null for the rest.
 
 The entry "draft" lists what was found, what a person must fill in, and what to check.
+
+Directions come from a list of lights next to the images, with lines `name x y z` or `x y z`, x to the image's
+right, y up, z toward the camera: an LP file of reflectance transformation imaging, whose first line is the
+number of lines that follow, or a plain text file. Vectors are normalised, because lists may also hold the
+positions of lights relative to the object.
 """
 
 import json
+import math
+import os
+import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from facerf_cli.capture.draft_files import Frames, Scan, frames_by_depth, frames_by_pattern, scan_folder
-from facerf_cli.capture.draft_lights import match_lights, read_light_list
-from facerf_cli.capture.pattern import FIELDS
+import numpy as np
+
+from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
 from facerf_cli.capture.stage_json import STAGE_FORMAT
 from facerf_cli.colour import LINEAR, find_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
+from facerf_cli.files.regular import read_text
 from facerf_cli.logs import counted
 
 _LONE_CAMERA = "C0"  # id where the pattern has no {camera}
@@ -36,6 +45,51 @@ _WANTED = {
     "width": "in pixels",
     "height": "in pixels",
 }
+# Files.
+_EXAMPLE = "{subject}/{camera}/{light}.exr"
+_LAYOUTS = ("{light}", "{subject}/{light}", "{subject}/{camera}/{light}")  # by the number of folders
+_DEEPEST = 8  # folders below the capture that are searched
+_LEAST_SHARE = 0.5  # of the expected frames: with fewer, the layout is another one
+# Lists of lights.
+_LIST_SUFFIX, _LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
+_LIST_LIMIT_BYTES = 4 << 20
+_DIGITS = 6
+
+Direction = list[float]  # unit vector toward the light
+ListedLight = tuple[str, Direction]  # name of an image, empty in a list without names; direction of its light
+Key = tuple[str, str, str]  # subject, camera and light; empty where the pattern does not name them
+
+
+@dataclass
+class Scan:
+    """Files below a folder, as paths with / between names."""
+
+    images: list[str] = field(default_factory=list)
+    lists: list[str] = field(default_factory=list)  # lists of lights, the uppermost first
+    unreadable: list[str] = field(default_factory=list)  # folders
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Images sorted by a pattern."""
+
+    paths: dict[Key, str]
+    ambient: Counter[str]  # names in the light's place of images without lights
+    strays: list[str]  # images that do not match the pattern
+    unnameable: list[str]  # ids that cannot be parts of file names
+
+    def ids(self, field: str) -> list[str]:
+        """Ids of all subjects, cameras or lights, numbers in their natural order: 2 before 10."""
+        return sorted({key[FIELDS.index(field)] for key in self.paths}, key=_natural_order)
+
+    def of_camera(self, camera: str) -> list[str]:
+        """Paths of a camera's frames."""
+        return [path for key, path in self.paths.items() if key[1] == camera]
+
+    @property
+    def expected(self) -> int:
+        """Number of frames if every camera has every subject under every light."""
+        return len(self.ids("subject")) * len(self.ids("camera")) * len(self.ids("light"))
 
 
 @dataclass(frozen=True)
@@ -230,3 +284,133 @@ def _list(names: Sequence[str]) -> str:
     """The first names, escaped where a terminal cannot print them."""
     shown = [name if name.isprintable() else ascii(name) for name in names[:_LISTED]]
     return ", ".join([*shown, "..."] if len(names) > _LISTED else shown)
+
+
+def scan_folder(folder: Path, suffixes: Collection[str]) -> Scan:
+    """Find images with these suffixes, and lists of lights; hidden files and folders are skipped.
+
+    Links to folders are followed, but each folder is entered once.
+    """
+    scan, entered = Scan(), set[tuple[int, int]]()
+
+    def note_unreadable(error: OSError) -> None:
+        scan.unreadable.append(os.path.relpath(error.filename, folder))
+
+    for here, folders, files in os.walk(folder, onerror=note_unreadable, followlinks=True):
+        status, below = os.stat(here), Path(here).relative_to(folder)
+        folders[:] = sorted(name for name in folders if name[0] != "." and len(below.parts) < _DEEPEST)
+        if (status.st_dev, status.st_ino) in entered:
+            folders.clear()
+            continue
+        entered.add((status.st_dev, status.st_ino))
+        for name in sorted(name for name in files if name[0] != "."):
+            suffix, path = os.path.splitext(name)[1].lower(), (below / name).as_posix()
+            if suffix in suffixes:
+                scan.images.append(path)
+            elif (suffix == _LIST_SUFFIX or name.lower() in _LIST_NAMES) and (folder / path).is_file():
+                scan.lists.append(path)
+    scan.lists.sort(key=lambda path: (path.count("/"), path))
+    return scan
+
+
+def sort_frames(paths: Iterable[str], pattern: str) -> Frames:
+    """Sort images into frames, ambient images and strays; images with all lights on are skipped."""
+    frames, expression = Frames({}, Counter(), [], []), compile_pattern(pattern)
+    for path in sorted(paths):
+        match = expression.fullmatch(path)
+        if match is None:
+            frames.strays.append(path)
+            continue
+        named = match.groupdict()
+        bad = [name for name in named.values() if not is_name(name)]
+        if kind := unlisted_kind(named["light"]):
+            frames.ambient.update([named["light"]] if kind == "ambient" else [])
+        elif bad:
+            frames.unnameable.extend(bad)
+        else:
+            frames.paths[named.get("subject", ""), named.get("camera", ""), named["light"]] = path
+    return frames
+
+
+def _natural_order(text: str) -> tuple[object, str]:
+    pieces = re.split("([0-9]+)", text)
+    is_number = [piece.isascii() and piece.isdigit() and len(piece) < 19 for piece in pieces]
+    key = [(0, int(p), "") if number else (1, 0, p) for p, number in zip(pieces, is_number, strict=True)]
+    return key, text
+
+
+def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
+    """Sort images by the pattern of --pattern; UsageError for a wrong one, or one that no image matches."""
+    try:
+        require_pattern(pattern, "--pattern", ["light"])
+    except InputError as error:
+        raise UsageError(str(error)) from None
+    frames = sort_frames(images, pattern)
+    if not frames.paths:
+        raise UsageError(f"--pattern {pattern}: no image matches, not even {images[0]}; correct the pattern")
+    return frames
+
+
+def frames_by_depth(images: Sequence[str]) -> tuple[Frames, str]:
+    """Sort images by the layout for their folder depth; return its pattern too.
+
+    UsageError where the images do not share a depth and a suffix, or lack most of the frames of that layout.
+    """
+    depths = sorted({path.count("/") for path in images})
+    suffixes = sorted({PurePosixPath(path).suffix for path in images})
+    if len(depths) > 1 or depths[0] >= len(_LAYOUTS):
+        raise _unknown_layout(f"images lie in {' and '.join(map(str, depths))} folders")
+    if len(suffixes) > 1:
+        raise _unknown_layout(f"images end in {' and '.join(suffixes)}")
+    pattern = _LAYOUTS[depths[0]] + suffixes[0]
+    frames = sort_frames(images, pattern)
+    if len(frames.paths) < max(_LEAST_SHARE * frames.expected, 1):
+        raise _unknown_layout(f"by {pattern}, {len(frames.paths)} of {frames.expected} frames exist")
+    return frames, pattern
+
+
+def _unknown_layout(reason: str) -> UsageError:
+    return UsageError(f"the layout of the images is unknown ({reason}); give --pattern, such as '{_EXAMPLE}'")
+
+
+def read_light_list(path: Path) -> list[ListedLight]:
+    """Read a list of lights; InputError names the first wrong line."""
+    text = read_text(path, _LIST_LIMIT_BYTES, "give lines `name x y z`")
+    rows = (line.split("#")[0].replace(",", " ").strip() for line in text.splitlines())
+    lines = [(number, row) for number, row in enumerate(rows, 1) if row]
+    if lines and lines[0][1].isdecimal():
+        lines = lines[1:]  # the number of lines
+    return [_parse_line(path, number, row) for number, row in lines]
+
+
+def _parse_line(path: Path, number: int, row: str) -> ListedLight:
+    *name, x, y, z = fields if len(fields := row.rsplit(maxsplit=3)) > 2 else [""] * 3
+    try:
+        vector = np.array([float(x), float(y), float(z)])
+    except ValueError:
+        raise InputError(f"{path}: line {number} is wrong; give `name x y z`") from None
+    length = float(np.linalg.norm(vector))
+    if not 0 < length < math.inf:
+        raise InputError(f"{path}: line {number} has no direction; give a finite vector other than 0")
+    rounded = [round(float(value), _DIGITS) + 0.0 for value in vector / length]  # + 0.0 turns -0.0 into 0.0
+    return "".join(name), rounded
+
+
+def match_lights(
+    listed: Sequence[ListedLight], light_ids: Sequence[str], light_of_stem: Mapping[str, str]
+) -> dict[str, Direction]:
+    """Assign listed directions to lights by name; a list without names goes by the order of the lights.
+
+    `light_of_stem` maps the stem of an image's file name to its light.
+    """
+    if not any(name for name, _ in listed):
+        pairs = zip(light_ids, listed, strict=True) if len(listed) == len(light_ids) else ()
+        return {light: direction for light, (_, direction) in pairs}
+    known = {**light_of_stem, **{light: light for light in light_ids}}
+    found = {}
+    for path, direction in listed:
+        name = path.replace("\\", "/").split("/")[-1]
+        light = known.get(name) or known.get(name.rpartition(".")[0])
+        if light is not None:
+            found[light] = direction
+    return found

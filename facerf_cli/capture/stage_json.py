@@ -1,4 +1,4 @@
-"""Reader of `stage.json`, the description of a capture that stands next to its images.
+"""Reader of captures, and of `stage.json`, the description of a capture that stands next to its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
      "colour_space": "lin_rec709", "black_level": 0.0,
@@ -19,6 +19,8 @@ place of the black level. A pattern may lack {camera} if there is one camera, an
 lists one.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,10 +28,11 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
-from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.pattern import FIELDS, find_subjects, require_pattern
+from facerf_cli.capture.capture import FIELDS, Capture, find_subjects, require_pattern
+from facerf_cli.capture.settings import ReadSettings
+from facerf_cli.capture.yale_b import read_yale_capture
 from facerf_cli.colour import named_space
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
 from facerf_cli.files.images import PHOTO_LIMIT_PX
@@ -176,3 +179,26 @@ def read_stage(folder: Path) -> Capture:
             require_pattern(stage.ambient, f"{path}: ambient", needed, FIELDS[:2]) if stage.ambient else ""
         ),
     )
+
+
+_AS_STORED = ReadSettings()
+LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": read_stage, "extended-yale-b": read_yale_capture}
+
+
+def read_capture(folder: Path, settings: ReadSettings = _AS_STORED) -> Capture:
+    """Read a capture's description in one of `LAYOUTS`; no images yet.
+
+    UsageError for an unknown layout, or `subtract_ambient` without ambient images; InputError for a wrong
+    description.
+    """
+    if settings.layout not in LAYOUTS:
+        known = ", ".join(sorted(LAYOUTS))
+        raise UsageError(f"--layout {settings.layout}: unknown layout; there is {known}")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder of a capture")
+    capture = LAYOUTS[settings.layout](folder)
+    if settings.subtract_ambient and not capture.ambient_pattern:
+        raise UsageError(
+            f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them, or omit it"
+        )
+    return replace(capture, subtract_ambient=settings.subtract_ambient, align=settings.align)

@@ -8,6 +8,11 @@ Files are `yaleBXX/yaleBXX_P00A+035E-20.pgm`, 168 x 192 grey pixels of 8 bit, cl
 the flash's azimuth in degrees, positive to the viewer's left; E is its elevation, positive above. Images that
 the database marks as damaged end in `.bad`. `yaleBXX_P00_Ambient.pgm` shows the subject without a flash; for
 some subjects it is not cropped.
+
+Nothing calibrates the camera, and the cropped images were cut out and scaled by hand, so a documented guess
+stands in: focal length `FOCAL_PX`, principal point in the middle, square pixels. The flashes' angles are
+relative to the camera's axis, so world space is camera space. All flashes have intensity 1; the unit of light
+is unknown.
 """
 
 import csv
@@ -19,11 +24,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from facerf_cli.capture.capture import Capture, shift_image
 from facerf_cli.errors import InputError
+from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.images import read_image
+from facerf_cli.files.regular import read_text
 from facerf_cli.light.sphere import azel_to_direction
 
 WIDTH_PX, HEIGHT_PX = 168, 192
+CAMERA = "P00"  # the frontal pose, the only one of the cropped database
+FOCAL_PX = 1000.0  # at a distance of a metre, a face then fills the image
+_LICENCE = "Extended Yale Face Database B: free for research (Georghiades et al. 2001; Lee et al. 2005)"
 _SUBJECT = re.compile(r"yaleB\d\d")
 _FLASH = re.compile(r"A([+-]\d{1,3})E([+-]\d{1,2})")
 _SHIFTS_LIMIT_BYTES = 4 << 20  # all 38 subjects take 130 kB
@@ -107,10 +118,14 @@ class YaleB:
             raise InputError(
                 f"{self.folder / subject}: no sound image under {flash.name}; copy the folder again"
             )
-        image = _read_cropped(self.files[subject][flash])
-        if image is None:
-            raise InputError(_wrong_size(self.files[subject][flash]))
-        return _shifted(image, *self.shifts.get((subject, flash), (0, 0)))
+        path = self.files[subject][flash]
+        image = _read_grey(path)
+        if image.shape != (HEIGHT_PX, WIDTH_PX):
+            raise InputError(
+                f"{path}: {image.shape[1]} x {image.shape[0]} pixels, not {WIDTH_PX} x {HEIGHT_PX}; use the "
+                "cropped database as distributed (CroppedYale.zip); some public copies are shrunk"
+            )
+        return shift_image(image, *self.shifts.get((subject, flash), (0, 0)))
 
     def images(self, subject: str) -> np.ndarray:
         """Read the images [L, 192, 168] of a subject under all its `flashes`."""
@@ -119,7 +134,8 @@ class YaleB:
     def ambient(self, subject: str) -> np.ndarray | None:
         """Read the image [192, 168] of a subject without a flash; None if it is missing or not cropped."""
         path = self.folder / subject / f"{subject}_P00_Ambient.pgm"
-        return _read_cropped(path) if path.is_file() else None
+        image = _read_grey(path) if path.is_file() else np.empty(0)
+        return image if image.shape == (HEIGHT_PX, WIDTH_PX) else None
 
 
 def read_yale_b(
@@ -158,25 +174,9 @@ def _images_of(folder: Path) -> dict[Flash, Path]:
     return dict(sorted(found.items()))
 
 
-def _read_cropped(path: Path) -> np.ndarray | None:
-    """Read a grey image [192, 168] in 0..1; None if it has another size."""
-    pixels = read_image(path, "linear").pixels[..., 0]
-    return pixels if pixels.shape == (HEIGHT_PX, WIDTH_PX) else None
-
-
-def _wrong_size(path: Path) -> str:
-    height, width = read_image(path, "linear").pixels.shape[:2]
-    return (
-        f"{path}: {width} x {height} pixels, not {WIDTH_PX} x {HEIGHT_PX}; use the cropped database as "
-        "distributed (CroppedYale.zip); some public copies are shrunk"
-    )
-
-
-def _shifted(image: np.ndarray, down: int, right: int) -> np.ndarray:
-    """Shift an image by whole pixels; the border is repeated."""
-    rows = np.clip(np.arange(HEIGHT_PX) - down, 0, HEIGHT_PX - 1)
-    columns = np.clip(np.arange(WIDTH_PX) - right, 0, WIDTH_PX - 1)
-    return image[rows][:, columns]
+def _read_grey(path: Path) -> np.ndarray:
+    """Read a grey image [H, W] in 0..1."""
+    return read_image(path, "linear").pixels[..., 0]
 
 
 def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
@@ -184,13 +184,10 @@ def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
 
     Other columns are ignored. InputError names the first wrong row.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give a list of shifts with lines subject,light,dy,dx")
-    if path.stat().st_size > _SHIFTS_LIMIT_BYTES:
-        raise InputError(f"{path}: too large for a list of shifts; give lines subject,light,dy,dx")
+    advice = "give a list of shifts with lines subject,light,dy,dx"
+    text = read_text(path, _SHIFTS_LIMIT_BYTES, advice)
     try:
-        with path.open(encoding="utf-8", errors="replace", newline="") as stream:
-            rows = list(csv.DictReader(stream))
+        rows = list(csv.DictReader(text.splitlines()))
     except csv.Error as error:
         raise InputError(f"{path}: not a list of shifts ({error}); give lines subject,light,dy,dx") from None
     shifts = {}
@@ -216,3 +213,51 @@ def _shift(row: Mapping[str, str | None]) -> tuple[str, Flash, int, int] | None:
     if not subject or flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
         return None
     return subject, flash, down, right
+
+
+def read_yale_capture(folder: Path) -> Capture:
+    """Read the database in a folder as a capture; no images are decoded yet."""
+    database = read_yale_b(folder, leave_out={})
+    marked = {subject: _marked(database, subject) for subject in database.subjects}
+    flashes = sorted({flash for found in (*database.files.values(), *marked.values()) for flash in found})
+    return Capture(
+        folder=folder,
+        pattern="{subject}/{subject}_{camera}{light}.pgm",
+        colour_space="linear",
+        black_level=0.0,
+        light_ids=tuple(flash.name for flash in flashes),
+        directions_world=np.stack([flash.direction for flash in flashes]),
+        intensities=np.ones((len(flashes), 3)),
+        cameras={CAMERA: guess_camera()},
+        subjects={subject: {} for subject in database.subjects},
+        provenance={
+            "database": "Extended Yale Face Database B, cropped",
+            "licence": _LICENCE,
+            "synthetic": False,
+            "calibration": f"a guess: focal length {FOCAL_PX:g} px, equal flashes of unknown intensity",
+        },
+        ambient_pattern="{subject}/{subject}_{camera}_Ambient.pgm",
+        marked={
+            subject: frozenset(flash.name for flash in found) for subject, found in marked.items() if found
+        },
+    )
+
+
+def guess_camera() -> PosedCamera:
+    """Camera of the cropped images, at the world origin, looking down -z."""
+    return PosedCamera(
+        focal_px=(FOCAL_PX, FOCAL_PX),
+        centre_px=(WIDTH_PX / 2, HEIGHT_PX / 2),
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+        rotation=torch.eye(3, dtype=torch.float64),
+        translation_m=torch.zeros(3, dtype=torch.float64),
+    )
+
+
+def _marked(database: YaleB, subject: str) -> set[Flash]:
+    """Flashes of which a subject has an image that ends in .bad and no sound one."""
+    prefix, suffix = f"{subject}_{CAMERA}", ".pgm.bad"
+    names = (name for name in database.marked_damaged if name.startswith(prefix))
+    found = {Flash.named(name.removeprefix(prefix).removesuffix(suffix)) for name in names}
+    return {flash for flash in found if flash is not None} - set(database.files[subject])

@@ -1,28 +1,12 @@
 """`facerf relight-dataset`: relight a prepared dataset under environment maps, into pairs to train on."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import BATCH, DryRunOption, Overwrite, OverwriteOption, Settings, settings_of
-
-_PAIRS = "Pairs"
-
-
-@dataclass(frozen=True)
-class RelightDataset:
-    """The options of a run; settings only."""
-
-    dataset: Path
-    envmaps: str
-    per_subject: int
-    lazy: bool
-    overwrite: Overwrite
-    dry_run: bool
-    jobs: int
-    settings: Settings
+from facerf_cli.cli.options import BATCH, DryRunOption, OverwriteOption, settings_of
+from facerf_cli.dataset.settings import PairSettings
 
 
 def relight_dataset(
@@ -31,35 +15,7 @@ def relight_dataset(
         Path,
         typer.Argument(metavar="DATASET", help="Folder of `facerf prepare-dataset`.", show_default=False),
     ],
-    envmaps: Annotated[
-        str,
-        typer.Option(
-            "--envmaps",
-            metavar="DIR|FILE|procedural:N",
-            help="Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), "
-            "a file, or N maps drawn from --seed.",
-            show_default=False,
-        ),
-    ],
-    per_subject: Annotated[
-        int,
-        typer.Option(
-            "--per-subject",
-            min=1,
-            max=100_000,
-            metavar="N",
-            help="Make so many images of each subject.",
-            rich_help_panel=_PAIRS,
-        ),
-    ] = 1000,
-    lazy: Annotated[
-        bool,
-        typer.Option(
-            "--lazy",
-            help="Write the recipes alone; training relights when it needs them.",
-            rich_help_panel=_PAIRS,
-        ),
-    ] = False,
+    pairs: PairSettings,
     overwrite: OverwriteOption = "changed",
     dry_run: DryRunOption = False,
     jobs: Annotated[
@@ -81,8 +37,9 @@ def relight_dataset(
     the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
     and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
     """
+    from facerf_cli.cli.batch import BatchOptions
     from facerf_cli.cli.items.relight_pairs import relight_subjects
+    from facerf_cli.dataset.pairs import RELIT
 
-    settings = settings_of(context)
-    work = RelightDataset(dataset, envmaps, per_subject, lazy, overwrite, dry_run, jobs, settings)
-    raise typer.Exit(relight_subjects(work))
+    batch = BatchOptions(dataset / RELIT, overwrite, dry_run, jobs)
+    raise typer.Exit(relight_subjects(dataset, pairs, batch, settings_of(context)))

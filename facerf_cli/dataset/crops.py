@@ -4,27 +4,77 @@ Each line of relit/pairs.jsonl gives a pair of crops. The source is the image th
 else the weighted sum of the whole stack, which takes a hundred times as long. The target is one part of a
 stack. Both have the exposure of the texture stages: the source so that the face's mean radiance is
 `MEAN_RADIANCE`, the target so that the mean would be that under a constant map of radiance 1.
+
+Crops move at random, because at test time a crop is cut around a detector's box, not around landmarks. The
+spreads are those of `face.crop.from_box` against `face.crop.from_landmarks` on synthetic people in eight
+cameras (`benchmarks/crop_boxes.py`): a detector's box is off to the side where a head is turned.
+
+`open_photos` gives crops of faces in photos, with detected landmarks: found once, kept in a cache.
 """
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.crop_move import UNMOVED, CropMove
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, image_path, read_pairs
-from facerf_cli.dataset.relight import relit_images
-from facerf_cli.dataset.weights import load_pairs
+from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, read_pairs
+from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
+from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import fit_from_arrays, load_fit
-from facerf_cli.files.images import read_image
+from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
+from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.network.inputs import MEAN_RADIANCE, resize
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.workers import in_shards
+
+_LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
+_MOST = 2.0  # standard deviations
+
+
+@dataclass(frozen=True)
+class CropMove:
+    """A scale about a crop's centre, then a shift (right, down) in units of its side.
+
+    The crop's camera is fixed: the face moves within the image, as if the box had been another.
+    """
+
+    scale: float = 1.0
+    shift: tuple[float, float] = (0.0, 0.0)
+
+    @staticmethod
+    def draw(generator: torch.Generator) -> "CropMove":
+        """Draw a random move."""
+        size, right, down = torch.randn(3, generator=generator).clamp(-_MOST, _MOST).tolist()
+        return CropMove(float(torch.tensor(_LOG_SCALE * size).exp()), (_SHIFT[0] * right, _SHIFT[1] * down))
+
+    def points(self, share: Tensor) -> Tensor:
+        """Move points [..., 2] in units of the crop's side."""
+        return (share - 0.5) * self.scale + 0.5 + share.new_tensor(self.shift)
+
+    def image(self, images: Tensor, side: int) -> Tensor:
+        """Resample crops [B, C, S, S] to [B, C, side, side]; beyond their border the edge pixels repeat."""
+        if self == UNMOVED:
+            return resize(images, side)
+        right, down = self.shift
+        # from the moved crop to the given one, in -1..1
+        back = images.new_tensor([[1, 0, -2 * right], [0, 1, -2 * down]]) / self.scale
+        grid = F.affine_grid(back[None].expand(len(images), -1, -1), [len(images), 1, side, side], False)
+        small = resize(images, side) if images.shape[-1] > side else images  # averages before it samples
+        return F.grid_sample(small, grid, padding_mode="border", align_corners=False)
+
+
+UNMOVED = CropMove()
+
 
 _STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
 _SUBJECTS_AVERAGED = 16  # enough for the mean position of heads
@@ -184,3 +234,87 @@ def _stack_info(path: Path) -> _StackInfo:
         lit_mean=max(float(header.source[face].mean()), _DARKEST),
         face_bits=np.packbits(face),
     )
+
+
+CACHED_SIDE_PX = 512  # the side of the paper's crops
+log = logging.getLogger(LOGGER_NAME)
+
+
+class _PhotoRecord(Document):
+    landmarks_px: Points68 | None
+
+
+@dataclass(frozen=True)
+class PhotoCrops:
+    """B crops of photos [B, 3, S, S], scene-linear, and detected landmarks [B, 68, 2] in crop pixels."""
+
+    crops: Tensor
+    landmarks_px: Tensor
+
+    def to(self, device: torch.device) -> "PhotoCrops":
+        """Copy the crops to `device`."""
+        return PhotoCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Photos:
+    """Detected faces, drawn as crops of `side_px`."""
+
+    paths: tuple[Path, ...]  # crops in the cache
+    landmarks_px: Tensor  # [N, 68, 2] in crops of `CACHED_SIDE_PX`
+    side_px: int
+
+    def draw(self, generator: torch.Generator) -> PhotoCrops:
+        """Draw a random face, B = 1, its crop as a detector's box would cut it."""
+        place = int(torch.randint(len(self.paths), (), generator=generator))
+        crop = torch.from_numpy(read_image(self.paths[place]).pixels).permute(2, 0, 1)[None]
+        move = CropMove.draw(generator)
+        points = move.points(self.landmarks_px[place] / CACHED_SIDE_PX)
+        return PhotoCrops(move.image(crop, self.side_px), self.side_px * points[None])
+
+
+def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1) -> Photos:
+    """Open the faces of photos; detect those that are not in `cache`, with a warning for a photo without one.
+
+    Raises InputError where no photo has a face.
+    """
+    known = {path: _record_path(path, cache) for path in sorted(paths)}
+    missing = [path for path, record in known.items() if not record.is_file()]
+    if missing:
+        log.info("%s: detecting faces in %d photos (done once)", cache, len(missing))
+        work = partial(_detect, cache)
+        if jobs > 1 and len(missing) > 1:
+            in_shards(work, missing, jobs)
+        else:
+            work(missing)
+    found, landmarks = [], []
+    for record in known.values():
+        landmarks_px = read_document(record, _PhotoRecord, "delete the folder").landmarks_px
+        if landmarks_px is not None:
+            found.append(record.with_suffix(".jpg"))
+            landmarks.append(landmarks_px)
+    if not found:
+        raise InputError(f"--photos: no face in any of {len(known)} photos; give a folder of photos of faces")
+    return Photos(tuple(found), torch.from_numpy(np.stack(landmarks)).float(), side_px)
+
+
+def _record_path(photo: Path, cache: Path) -> Path:
+    facts = photo.stat()
+    return cache / f"{digest(f'{photo.absolute()} {facts.st_size} {facts.st_mtime_ns}'.encode())}.json"
+
+
+def _detect(cache: Path, photos: list[Path]) -> None:
+    """Write the crop and the record of each photo."""
+    cache.mkdir(parents=True, exist_ok=True)
+    for photo in photos:
+        record = _record_path(photo, cache)
+        landmarks_px = None
+        try:
+            pixels = read_image(photo).pixels
+            face = find_faces(pixels, str(photo))[0]
+            crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
+            write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
+            landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()
+        except InputError as error:
+            log.warning("%s", error)
+        write_document(record, {"photo": str(photo), "landmarks_px": landmarks_px})

@@ -341,3 +341,25 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "negative": "set to 0 after the crop",
         },
     }
+
+
+def provenance_of(dataset: Dataset, model: MorphableModel) -> dict[str, Any]:
+    """Provenance of a dataset, for a checkpoint that was trained on it."""
+    name = dataset.folder.resolve().name
+    return {
+        "trained_on": f"{name}, {len(dataset.splits['train'])} subjects",
+        "dataset": dataset.provenance,
+        "fitted_with": model.credit,
+        "licence": _licence(dataset.provenance, name),
+    }
+
+
+def _licence(provenance: dict[str, Any], name: str) -> str:
+    """Licence that the dataset or its capture states, or a reference to the dataset."""
+    found = provenance.get("capture")
+    capture = found if isinstance(found, dict) else {}
+    if words := provenance.get("licence") or capture.get("licence"):
+        return str(words)
+    if capture.get("synthetic") is True and "face_model_licence" in capture:  # by `facerf synth-stage`
+        return f"MIT; the heads' shapes: {capture['face_model_licence']}"
+    return f"that of the dataset {name}"

@@ -1,26 +1,48 @@
 """Training pairs (paper, 'Dataset'): a source under an envmap, and one light to predict from it.
 
     relit/pairs.jsonl         a `Pair` a line, sorted by subject and index
+    relit/weights-KEY.npy     weights of all rows of pairs.jsonl [rows, L, 3] float32; KEY is its digest
     relit/SUBJECT/NNNNN.exr   the pair's source, unless the pairs are lazy
 
-A pair is a recipe: subject, camera, envmap, rotation and target. `dataset/weights.py` adds the exposures.
+A pair is a recipe: subject, camera, envmap, rotation, exposure and target. A row of weights holds those of
+its subject's lights, padded with zeros where the subject lacks some of the rig's L. Weights follow from the
+rows and the envmaps, and are computed again where the file is missing.
 """
 
 import hashlib
+import logging
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.errors import InputError
-from facerf_cli.files.documents import checked
+from facerf_cli.dataset.weights import (
+    DEFAULT_MEMORY_BYTES,
+    EnvmapTask,
+    Spread,
+    compute_weights,
+    map_directions,
+    relit_images,
+)
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.documents import checked, digest
+from facerf_cli.files.images import write_exr
 from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 _TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,3 +143,204 @@ def _check_pair(dataset: Dataset, pair: Pair) -> None:
         raise ValueError("number out of range")
     if not math.isfinite(pair.rotate_deg):
         raise ValueError("angle not finite")
+
+
+def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Spread = map) -> list[Pair]:
+    """Write pairs.jsonl and the weights of newly drawn pairs; return the pairs with their exposures.
+
+    Existing pairs stay where they agree, so that a larger number adds pairs; every existing image must belong
+    to a pair that stays. `overwrite` removes old pairs and images once the new weights are computed.
+    """
+    if not overwrite:
+        old = read_pairs(dataset)
+        before = [replace(pair, exposure_ev=0) for pair in old]
+        if old and before == drawn and weights_path(dataset).is_file():
+            return old
+        _require_agreement(dataset, before, drawn)
+    weights, pairs = compute_pair_weights(dataset, drawn, spread)
+    if overwrite:
+        _remove_old(dataset)
+    else:
+        _require_agreement(dataset, old, pairs)  # now the exposures, too: the envmaps may have changed
+    text = "".join(json_line(asdict(pair)) + "\n" for pair in pairs)
+    _write_weights(dataset, weights, text.encode())
+    with atomic_path(pairs_path(dataset)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return pairs
+
+
+def _require_agreement(dataset: Dataset, old: list[Pair], new: list[Pair]) -> None:
+    """Raise UsageError where common pairs differ, or an image belongs to no common pair."""
+    known = {pair.key: pair for pair in old}
+    both = [pair for pair in new if pair.key in known]
+    explained = {image_path(dataset, *pair.key) for pair in both}
+    if any(known[pair.key] != pair for pair in both) or not explained.issuperset(_images(dataset)):
+        raise UsageError(
+            f"{dataset.folder / RELIT}: holds images of another seed, other envmaps, another dataset or a "
+            "larger --per-subject; give those options again, or --overwrite always"
+        )
+
+
+def _images(dataset: Dataset) -> list[Path]:
+    return list((dataset.folder / RELIT).glob("*/[0-9]*.exr"))
+
+
+def _remove_old(dataset: Dataset) -> None:
+    """Delete old pairs, then images, so that a killed run leaves no image that passes for a new pair's."""
+    pairs_path(dataset).unlink(missing_ok=True)
+    for path in _images(dataset):
+        path.unlink()
+
+
+def weights_path(dataset: Dataset) -> Path:
+    """Path of the weights of the present pairs."""
+    return _weights_path(dataset, pairs_path(dataset).read_bytes())
+
+
+def _weights_path(dataset: Dataset, pairs_text: bytes) -> Path:
+    return dataset.folder / RELIT / f"weights-{digest(pairs_text)}.npy"
+
+
+def _write_weights(dataset: Dataset, weights: np.ndarray, pairs_text: bytes) -> None:
+    path = _weights_path(dataset, pairs_text)
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, weights)
+    for old in path.parent.glob("weights-*.npy"):
+        if old != path:
+            old.unlink()
+
+
+def load_pairs(dataset: Dataset) -> dict[str, tuple[list[Pair], np.ndarray]]:
+    """Each subject's pairs and their weights [rows, L, 3] float32, memory-mapped; L are the subject's lights.
+
+    Weights include the exposures. Empty where the dataset has no pairs. The result is cached until
+    pairs.jsonl changes.
+    """
+    path = pairs_path(dataset)
+    if not path.is_file():
+        return {}
+    return _load_pairs(_ByFolder(dataset, dataset.folder.absolute()), path.stat().st_mtime_ns)
+
+
+@dataclass(frozen=True)
+class _ByFolder:
+    """A dataset as a cache key."""
+
+    dataset: Dataset = field(compare=False)
+    folder: Path
+
+
+@lru_cache(maxsize=1)
+def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
+    pairs = read_pairs(key.dataset)
+    weights = _load_weights(key.dataset, pairs)
+    rows_of: dict[str, list[int]] = defaultdict(list)
+    for row, pair in enumerate(pairs):
+        rows_of[pair.subject].append(row)
+    return {
+        subject: (
+            pairs[rows[0] : rows[-1] + 1],
+            weights[rows[0] : rows[-1] + 1, : len(key.dataset.lights_of(subject))],
+        )
+        for subject, rows in rows_of.items()
+    }
+
+
+def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
+    path = weights_path(dataset)
+    if not path.is_file():
+        log.info("%s: missing; computing the weights again", path)
+        weights, computed = compute_pair_weights(dataset, pairs)
+        if computed != pairs:
+            raise InputError(
+                f"{pairs_path(dataset)}: the envmaps have changed since the pairs were made; run "
+                "relight-dataset with --overwrite always"
+            )
+        _write_weights(dataset, weights, pairs_path(dataset).read_bytes())
+    try:
+        weights = np.load(path, mmap_mode="r")
+        if weights.shape != (len(pairs), len(dataset.light_ids), 3) or weights.dtype != np.float32:
+            raise ValueError(f"shape {weights.shape}")
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: damaged ({error}); delete it to have it computed again") from None
+    return weights
+
+
+def compute_pair_weights(
+    dataset: Dataset, pairs: list[Pair], spread: Spread = map
+) -> tuple[np.ndarray, list[Pair]]:
+    """Compute weights [rows, L, 3] of pairs, and the pairs with exposures; read each envmap once."""
+    rows_of: dict[str, list[int]] = defaultdict(list)
+    for row, pair in enumerate(pairs):
+        rows_of[pair.envmap].append(row)
+    directions = map_directions(dataset)
+    tasks = [
+        EnvmapTask(
+            name,
+            directions,
+            tuple(pairs[row].rotate_deg for row in rows),
+            tuple(dataset.lights_of(pairs[row].subject) for row in rows),
+        )
+        for name, rows in rows_of.items()
+    ]
+    weights = np.zeros((len(pairs), len(directions), 3), np.float32)
+    exposed, complaints = list(pairs), []
+    for rows, result in zip(rows_of.values(), spread(compute_weights, tasks), strict=True):
+        if isinstance(result, str):
+            complaints.append(result)
+            continue
+        weights[rows] = result.weights
+        for row in rows:
+            exposed[row] = replace(pairs[row], exposure_ev=result.exposure_ev)
+    if complaints:
+        for complaint in complaints:
+            log.error("%s", complaint)
+        raise FacerfError(  # without them, pairs would differ from those of the complete folder
+            f"--envmaps: {len(complaints)} of {len(tasks)} maps cannot be used; repair or remove them"
+        )
+    return weights, exposed
+
+
+def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
+    """Compute the weights [L, 3] of one pair from its envmap; they equal those of `load_pairs`."""
+    lights = dataset.lights_of(pair.subject)
+    result = compute_weights(EnvmapTask(pair.envmap, map_directions(dataset), (pair.rotate_deg,), (lights,)))
+    if isinstance(result, str):
+        raise InputError(result)
+    if result.exposure_ev != pair.exposure_ev:
+        raise InputError(
+            f"{pair.envmap}: the envmap has changed since the pair was made; run relight-dataset with "
+            "--overwrite always"
+        )
+    return torch.from_numpy(result.weights[0, : len(lights)])
+
+
+def relight_subject(
+    dataset: Dataset,
+    pairs: list[Pair],
+    weights: np.ndarray,
+    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    overwrite: bool = False,
+) -> int:
+    """Write the missing sources of a subject's pairs, with weights [rows, L, 3]; return how many."""
+    todo = [row for row, pair in enumerate(pairs) if overwrite or not image_path(dataset, *pair.key).exists()]
+    for camera in sorted({pairs[row].source_camera for row in todo}):
+        rows = [row for row in todo if pairs[row].source_camera == camera]
+        path = dataset.stack_path(pairs[rows[0]].subject, camera)
+        images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
+        attributes = attributes_of_sum(read_olat_header(path).metadata)
+        for row, image in zip(rows, images, strict=True):
+            pixels = image.permute(1, 2, 0).float().numpy()
+            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
+            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata=attributes | recipe)
+    return len(todo)
+
+
+def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:
+    """Render the source [3, H, W] float16 of a line of pairs.jsonl from the dataset and the envmap alone.
+
+    The result equals the file that `relight-dataset` writes, bit for bit.
+    """
+    pair = row if isinstance(row, Pair) else checked(Pair, row, "a line of pairs")
+    weights = pair_weights(dataset, pair)
+    return next(relit_images(dataset.stack_path(pair.subject, pair.source_camera), weights[None]))

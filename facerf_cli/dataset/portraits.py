@@ -21,8 +21,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.samples import provenance_of
+from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
 from facerf_cli.dataset.textures import is_made_from, stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model

@@ -2,12 +2,11 @@
 
 Images are read one by one, twice: for the fully lit sum on which the face is detected, and for the stack. At
 most one camera's sum is in memory. A `Selection` gives the lights and cameras to use; a camera that does not
-see the face is left out as well.
+see the face is left out as well. `index_page` shows all subjects: each one's sheet, split, fit and findings.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +16,12 @@ import torch
 from torch import Tensor
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.select import Selection
+from facerf_cli.capture.findings import Selection
+from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
-from facerf_cli.dataset.pages import sheet_lights, sheet_tiles
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
+from facerf_cli.face.drawings import draw_fit
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
 from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
 from facerf_cli.face.landmarks import choose_face, to_display
@@ -29,17 +29,23 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Name, read_document, write_document
-from facerf_cli.files.drawings import contact_sheet
+from facerf_cli.files.drawings import contact_sheet, mark_light
 from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.pages import filled_page
 from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 
+_TILE_PX = 192
+_SHEET_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # front, left and right, in camera space
 _DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half floats lose precision
 log = logging.getLogger(LOGGER_NAME)
+
+FindingRows = Sequence[Mapping[str, Any]]
 
 
 class _SubjectRecord(Document):
@@ -71,8 +77,10 @@ def prepare_subject(
     record_path(folder, subject).unlink(missing_ok=True)
     person = _Subject(capture, subject, chosen.lights, model)
     landmarks = [_find_landmarks(person, camera) for camera in chosen.cameras]
-    with _name_errors(subject):
+    try:
         joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
+    except InputError as error:
+        raise InputError(f"{subject}: {error}") from None
     cameras, rows, dropped = {}, [], dict(chosen.dropped)
     for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
         seen_px = None if error_iod is None else landmarks_px  # missing or rejected without an error
@@ -179,15 +187,6 @@ def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
     return without
 
 
-@contextmanager
-def _name_errors(name: str) -> Iterator[None]:
-    """Put the subject's name before an error raised in the block."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{name}: {error}") from None
-
-
 def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     """Detect landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
     weights = constant_weights(person.directions_world)
@@ -290,3 +289,42 @@ def _warn_of_half_float_limits(name: str, clipped: int, lit: float) -> None:
     elif lit < _DIMMEST:
         advice = "the lights' intensities in stage.json are too large"
         log.warning("%s: a constant map of radiance 1 gives radiance %.2g at most; %s", name, lit, advice)
+
+
+def index_page(
+    dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], findings: Mapping[str, FindingRows]
+) -> str:
+    """Make the page from the content of `dataset.json`, the records of finished subjects and the findings."""
+    return filled_page(
+        Path(__file__).with_name("index.html"),
+        dataset=dataset,
+        records=records,
+        findings=findings,
+        split_of={name: split for split, names in dataset["splits"].items() for name in names},
+    )
+
+
+def sheet_lights(directions: np.ndarray) -> list[int]:
+    """Indices of the sheet's three lights: those nearest to front, left and right; directions [L, 3]."""
+    wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHEET_AZEL_DEG])
+    return (wanted @ directions.T).argmax(1).tolist()
+
+
+def sheet_tiles(
+    header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
+) -> np.ndarray:
+    """Tiles of one camera [6, h, w, 3]: fully lit, the fit over it, masked, and three single lights.
+
+    Scene-linear, exposed for display; the three lights share one exposure.
+    """
+    side_px = fit.crop.size_px
+    lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
+    overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
+    masked = lit * (0.1 + 0.9 * header.seen[..., None])
+    single = np.stack([shown[light] for light in sheet_lights(header.directions)])
+    single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
+    small = Crop(0.0, 0.0, float(side_px), _TILE_PX)  # crops of a subject may differ in size
+    tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])
+    for tile, light in zip(tiles[3:], sheet_lights(header.directions), strict=True):
+        mark_light(tile, header.directions[light], 1.0)
+    return tiles

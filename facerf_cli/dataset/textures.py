@@ -1,17 +1,23 @@
-"""Textures of a prepared dataset: OLAT stacks and relit sources, unwrapped once, that training reads.
+"""Textures of a prepared dataset, unwrapped once, and the training samples of the texture stages from them.
 
     textures-SIDE/SUBJECT/CAMERA.safetensors   OLAT textures of a stack and their visibility, half floats
     textures-SIDE/SUBJECT/relit-KEY.npy        sources [rows, 3, T, T] float16, if they were written
 
 `build_textures` makes what is missing or older than its stack; the folder may be deleted. KEY is a digest of
 the subject's pairs and stacks.
+
+Samples take the place of the synthetic ones of `synth/bank/texture_samples.py`, with photographed instead of
+rendered lights. A source is an unwrapped image of `relight-dataset`; for lazy pairs it is the weighted sum of
+the stack's textures, which is the same, for unwrapping is linear. Without pairs a random light is drawn, as
+for synthetic heads.
 """
 
 import logging
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,9 +25,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, image_path
-from facerf_cli.dataset.weights import load_pairs
+from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
+from facerf_cli.dataset.pairs import Pair, image_path, load_pairs
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -30,8 +35,12 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import digest
 from facerf_cli.files.images import HALF_MAX, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
+from facerf_cli.light.sphere import RIG_LIGHTS
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.logs import LOGGER_NAME, json_line
-from facerf_cli.raster.texture import normal_map, unwrap
+from facerf_cli.raster.texture import inpaint, normal_map, unwrap
+from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
+from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
 from facerf_cli.workers import in_shards, one_thread
 
 # Images unwrapped together: so many, but no more samples in memory than _VALUES_AT_ONCE.
@@ -199,3 +208,186 @@ def _read_source(dataset: Dataset, pair: Pair, fit: FaceFit) -> Tensor:
     if pixels.shape[:2] != (fit.crop.size_px, fit.crop.size_px):
         raise InputError(f"{path}: another size than its stack; run relight-dataset with --overwrite always")
     return torch.from_numpy(pixels).permute(2, 0, 1)
+
+
+_SAME_POSE_SHARE = 0.5  # of samples without pairs
+_MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetTextures:
+    """A prepared dataset and its textures, a `SampleSource`; its heads are indices of `dataset.subjects`."""
+
+    dataset: Dataset
+    model: MorphableModel
+    side: int
+    provenance: dict[str, Any]
+    sources: dict[str, Path]  # unwrapped sources, of subjects that have them
+    rig_lights: int = RIG_LIGHTS  # of the mean face's shadows
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Heads of the split train, and at most `held_out` of the split validation."""
+        places = {subject: place for place, subject in enumerate(self.dataset.subjects)}
+        train, validation = (
+            [places[subject] for subject in self.dataset.splits[split] if self.dataset.cameras[subject]]
+            for split in ("train", "validation")
+        )
+        for split, found in (("train", train), ("validation", validation)):
+            if not found:
+                raise InputError(
+                    f"{self.dataset.folder}: no subject in the split {split}; "
+                    "run prepare-dataset with another --split"
+                )
+        return torch.tensor(train), torch.tensor(validation[:held_out])
+
+    def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the face model's mean."""
+        settings = HeadBakeSettings(_MEAN_SIDE, self.rig_lights, bake=BakeSettings(bounce_samples=0))
+        mean = bake_head(self.model, 0, 0, settings)
+        normals = normal_map(mean["vertices"], grid_triangles(), _MEAN_SIDE)
+        return normals, mean["visibility"].float() / 255, mean["directions"]
+
+    def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
+        """Draw one sample of every subject in `heads` [B], with `lights` target lights.
+
+        The albedo of real skin is unknown. The exposure is that of the face under a constant map of radiance
+        1 instead, which equals the albedo but for light that other parts of the face occlude.
+        """
+        subjects = [self.dataset.subjects[int(head)] for head in heads]
+        lights = min(lights, *(len(self.dataset.lights_of(subject)) for subject in subjects))
+        faces = [self._draw_face(subject, lights, generator) for subject in subjects]
+        visible = torch.stack([face.source.visible for face in faces])
+        source, target = simulate_camera(
+            torch.stack([face.texture for face in faces]),
+            torch.stack([face.target for face in faces]),
+            torch.stack([face.source.lit for face in faces]),
+            visible,
+            generator,
+        )
+        return Sample(
+            source=torch.stack([inpaint(s, v[0]) for s, v in zip(source, visible, strict=True)]),
+            visible=visible,
+            normals_source=torch.stack([face.source.normals for face in faces]),
+            normals_target=torch.stack([face.normals_target for face in faces]),
+            lights=torch.stack([face.lights for face in faces]),
+            target=target,
+            weight=torch.stack([face.weight for face in faces]),
+        )
+
+    def _draw_face(self, subject: str, lights: int, generator: torch.Generator) -> "_FaceTextures":
+        pairs, weights = load_pairs(self.dataset).get(subject, ([], None))
+        if weights is None:
+            return self._draw_without_pairs(subject, lights, generator)
+        row = int(torch.randint(len(pairs), (), generator=generator))
+        pair = pairs[row]
+        with self._open(subject, pair.source_camera) as file:
+            source, texture = UnwrappedView.read(file), self._written_source(subject, row)
+            if texture is None:
+                texture = _weighted_sum(file, torch.from_numpy(np.array(weights[row])))
+        return self._face(subject, pair.target_camera, source, texture, pair.target_light, lights, generator)
+
+    def _draw_without_pairs(self, subject: str, lights: int, generator: torch.Generator) -> "_FaceTextures":
+        """Draw cameras, light and targets of a subject without pairs."""
+        cameras = self.dataset.cameras[subject]
+        camera, other = (cameras[int(i)] for i in torch.randint(len(cameras), (2,), generator=generator))
+        same = torch.rand((), generator=generator) < _SAME_POSE_SHARE
+        with self._open(subject, camera) as file:
+            source = UnwrappedView.read(file)
+            texture = _weighted_sum(file, draw_light(source.directions, generator))
+        return self._face(subject, camera if same else other, source, texture, None, lights, generator)
+
+    def _face(
+        self,
+        subject: str,
+        target_camera: str,
+        source: "UnwrappedView",
+        texture: Tensor,
+        first_light: int | None,
+        lights: int,
+        generator: torch.Generator,
+    ) -> "_FaceTextures":
+        """Add random target lights, `first_light` first where it is given, to a source."""
+        with self._open(subject, target_camera) as file:
+            target = UnwrappedView.read(file)
+            lights = min(lights, len(target.directions))
+            chosen = draw_target_lights(target.directions, lights, generator)
+            if first_light is not None:
+                rest = chosen[chosen != first_light]
+                chosen = torch.cat([torch.tensor([first_light]), rest])[:lights]
+            olats = file.get_slice("olats")
+            images = torch.stack([olats[int(light)] for light in chosen]).float()
+        source_to_target = target.rotation @ source.rotation.T
+        return _FaceTextures(
+            source=source,
+            texture=texture,
+            target=images,
+            lights=target.directions[chosen],
+            # The source's normals turned, as in `pipeline.predict_olat`.
+            normals_target=torch.einsum("dc,cij->dij", source_to_target, source.normals),
+            weight=target.visible * (0.3 + 0.7 * source.visible),
+        )
+
+    def _open(self, subject: str, camera: str) -> Any:
+        return safe_open(texture_path(self.dataset, self.side, subject, camera), framework="pt")
+
+    def _written_source(self, subject: str, row: int) -> Tensor | None:
+        """The unwrapped source [3, T, T] of a subject's pair; None for lazy pairs."""
+        if subject not in self.sources:
+            return None
+        return torch.from_numpy(np.load(self.sources[subject], mmap_mode="r")[row].astype(np.float32))
+
+
+@dataclass(frozen=True)
+class UnwrappedView:
+    """A subject in one camera's crop, unwrapped: textures of the fitted mesh, camera space.
+
+    The fields' names are those of the tensors in a texture file.
+    """
+
+    rotation: Tensor  # [3, 3] head_to_camera
+    directions: Tensor  # [L, 3]
+    normals: Tensor  # [3, T, T]
+    visible: Tensor  # [1, T, T]
+    lit: Tensor  # [3, T, T] under a constant map of radiance 1
+
+    @staticmethod
+    def read(file: Any) -> "UnwrappedView":
+        """Read all tensors of a texture file but its OLATs."""
+        names = UnwrappedView.__dataclass_fields__
+        return UnwrappedView(*(file.get_tensor(name).float() for name in names))
+
+
+@dataclass(frozen=True)
+class _FaceTextures:
+    """One face of a sample, before the simulated camera."""
+
+    source: UnwrappedView
+    texture: Tensor  # [3, T, T] of the source
+    target: Tensor  # [L, 3, T, T]
+    lights: Tensor  # [L, 3] in the target's camera space
+    normals_target: Tensor  # [3, T, T]
+    weight: Tensor  # [1, T, T]
+
+
+def _weighted_sum(file: Any, weights: Tensor) -> Tensor:
+    """Sum a file's OLAT textures with weights [L, 3]: [3, T, T]."""
+    olats = file.get_tensor("olats")  # [L, 3, T, T]
+    channels = [weights[:, c] @ olats[:, c].flatten(1).float() for c in range(3)]
+    return torch.stack(channels).view(olats.shape[1:])
+
+
+def open_dataset_textures(
+    folder: Path, face_model: str, side: int, jobs: int, rig_lights: int = RIG_LIGHTS
+) -> DatasetTextures:
+    """Open the dataset in a folder and make missing textures of its splits train and validation."""
+    dataset, model = read_dataset(folder), load_face_model(face_model)
+    if model.name != dataset.face_model:
+        raise InputError(
+            f"{folder}: fitted with the face model {dataset.face_model}, not {model.name}; give --fit-with"
+        )
+    subjects = [*dataset.splits["train"], *dataset.splits["validation"]]
+    textures = DatasetTextures(dataset, model, side, provenance_of(dataset, model), {}, rig_lights)
+    textures.heads(1)  # raises for a split without subjects before anything is unwrapped
+    build_textures(dataset, face_model, side, subjects, jobs)
+    written = {subject: sources_path(dataset, side, subject) for subject in subjects}
+    return replace(textures, sources={name: path for name, path in written.items() if path.exists()})

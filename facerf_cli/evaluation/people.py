@@ -14,9 +14,7 @@ from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, image_path
-from facerf_cli.dataset.relight import render_source
-from facerf_cli.dataset.weights import load_pairs, pair_weights, weights_path
+from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights, render_source, weights_path
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.face.crop import Crop

@@ -35,3 +35,16 @@ def require_regular(path: Path, advice: str = "check the path") -> None:
         raise InputError(f"{path}: is a folder, not a file; {advice}")
     if not stat.S_ISREG(mode):
         raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")
+
+
+def read_text(path: Path, limit_bytes: int, advice: str) -> str:
+    """Read a regular text file of at most `limit_bytes`, in UTF-8; other bytes are replaced."""
+    require_regular(path, advice)
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(limit_bytes + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
+    if len(content) > limit_bytes:
+        raise InputError(f"{path}: too large, over {limit_bytes >> 20} MiB; {advice}")
+    return content.decode(errors="replace")

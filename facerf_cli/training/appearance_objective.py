@@ -12,8 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
-from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.samples import provenance_of
+from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.training.objective import Objective, Validation, concatenate

@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.crops import CropPairs, PhotoCrops, Photos, open_pairs, spread_pairs
+from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.dataset.pairs import Pair
-from facerf_cli.dataset.photos import PhotoCrops, Photos
-from facerf_cli.dataset.samples import DatasetTextures, provenance_of
+from facerf_cli.dataset.textures import DatasetTextures
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import OUTER_EYE_CORNERS

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from skimage.transform import resize
 
-from facerf_cli.capture.chart_colours import published_colours
-from facerf_cli.capture.chart_patches import (
+from facerf_cli.capture.chart import (
     COLUMNS,
     PATCH_SIDE,
     PATCHES,
@@ -14,6 +13,7 @@ from facerf_cli.capture.chart_patches import (
     area_corners,
     homography,
     project,
+    published_colours,
 )
 
 SHAPE = (240, 330)

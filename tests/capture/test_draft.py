@@ -3,13 +3,24 @@
 import json
 import os
 import shutil
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facerf_cli.capture.draft import as_text, draft_stage
-from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.capture import fill_pattern
+from facerf_cli.capture.draft import (
+    as_text,
+    draft_stage,
+    frames_by_depth,
+    frames_by_pattern,
+    match_lights,
+    read_light_list,
+    sort_frames,
+)
+from facerf_cli.capture.settings import ReadSettings
+from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.colour import ACESCG
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_display, write_exr
@@ -109,7 +120,7 @@ def test_a_pattern_may_repeat_the_subject(tmp_path: Path) -> None:
     for light in stage["lights"]:
         light["direction"] = [0, 0, 1]
     (tmp_path / "stage.json").write_text(as_text(stage))
-    capture = read_capture(tmp_path, subtract_ambient=True)
+    capture = read_capture(tmp_path, ReadSettings(subtract_ambient=True))
     assert capture.frame("b02", "C0", 0) == pytest.approx(0)
 
 
@@ -204,3 +215,159 @@ def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
     assert noted(stage, "3 subjects, 1 camera") and noted(stage, "rename them")
     assert not noted(stage, "do not match")  # nothing was found twice
     assert all(note.isprintable() for note in stage["draft"])
+
+
+PEOPLE, CAMERAS, LIGHTS = range(1, 5), range(1, 4), range(1, 13)
+FOLDERS = "{subject}/{camera}/{light}.exr"
+
+
+def crossed(
+    form: str, subjects: object = PEOPLE, cameras: object = CAMERAS, lights: object = LIGHTS
+) -> list[str]:
+    """The paths of every subject, camera and light, by a format string of s, c and l."""
+    return [form.format(s=s, c=c, l=light) for s, c, light in product(subjects, cameras, lights)]  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize(
+    ("paths", "pattern", "first"),
+    [
+        (crossed("s{s:02}/cam{c}/light_{l:03}.exr"), FOLDERS, ("s01", "cam1", "light_001")),
+        (crossed("{s}/{c}/{l}.png"), "{subject}/{camera}/{light}.png", ("1", "1", "1")),
+        (crossed("{s}/{l}.EXR", cameras=[1]), "{subject}/{light}.EXR", ("1", "", "1")),
+        (crossed("{l:03}.png", [1], [1]), "{light}.png", ("", "", "001")),
+    ],
+)
+def test_a_layout_for_each_folder_depth(paths: list[str], pattern: str, first: tuple[str, ...]) -> None:
+    frames, found = frames_by_depth(paths)
+    assert found == pattern and sorted(frames.paths.values()) == sorted(paths) and not frames.strays
+    assert tuple(frames.ids(field)[0] for field in ("subject", "camera", "light")) == first
+    assert frames.expected == len(paths)
+
+
+@pytest.mark.parametrize(
+    ("paths", "said"),
+    [
+        (crossed("images/{s}/{c}/{l}.exr"), "images lie in 3 folders"),
+        ([*crossed("{s}/{c}/{l}.exr"), "chart.exr"], "images lie in 0 and 2 folders"),
+        ([*crossed("{s}/{c}/{l}.exr"), "1/1/1.png"], r"images end in \.exr and \.png"),
+        (crossed("yaleB{s:02}/yaleB{s:02}_P00{l}.pgm", cameras=[1]), "48 of 192 frames exist"),
+        ([f"C{c}/IMG_{100 * c + n:04}.jpg" for c in range(3) for n in range(50)], "150 of 450 frames exist"),
+    ],
+)
+def test_another_layout_needs_a_pattern(paths: list[str], said: str) -> None:
+    with pytest.raises(UsageError, match=said) as raised:
+        frames_by_depth(paths)
+    assert "give --pattern, such as '{subject}/{camera}/{light}.exr'" in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("paths", "pattern", "first"),
+    [
+        (crossed("{s:04}_C{c}_L{l:03}.png"), "{subject}_{camera}_{light}.png", ("0001", "C1", "L001")),
+        (crossed("S{s}C{c}L{l:03}.exr"), "S{subject}C{camera}L{light}.exr", ("1", "1", "001")),
+        (crossed("{s:04}/L{l:03}/C{c}.exr"), "{subject}/{light}/{camera}.exr", ("0001", "C1", "L001")),
+        (
+            crossed("{s:02}/{s:02}_cam{c}_{l:03}.jpg"),
+            "{subject}/{subject}_{camera}_{light}.jpg",
+            ("01", "cam1", "001"),
+        ),
+        (crossed("cam{c}/light{l}.exr", [1]), "{camera}/{light}.exr", ("", "cam1", "light1")),
+        (
+            crossed("{s}_C{c}_L{l:03}.exr", ["anna", "mary_jane", "zoe", "eve"]),
+            "{subject}_{camera}_{light}.exr",
+            ("anna", "C1", "L001"),
+        ),
+        (crossed("images/{s}/{c}/{l:03}.tif"), "images/{subject}/{camera}/{light}.tif", ("1", "1", "001")),
+        (crossed("{s}/take (1)/L{l}.exr", cameras=[1]), "{subject}/take (1)/{light}.exr", ("1", "", "L1")),
+    ],
+)
+def test_a_given_pattern_names_subject_camera_and_light(
+    paths: list[str], pattern: str, first: tuple[str, ...]
+) -> None:
+    frames = frames_by_pattern(paths, pattern)
+    assert sorted(frames.paths.values()) == sorted(paths) and not frames.strays
+    assert tuple(frames.ids(field)[0] for field in ("subject", "camera", "light")) == first
+    for (subject, camera, light), path in frames.paths.items():
+        assert fill_pattern(pattern, subject=subject, camera=camera, light=light) == path
+
+
+@pytest.mark.parametrize(
+    ("pattern", "said"),
+    [
+        ("{subject}/{camera}.exr", "names {light} is needed"),
+        ("../{light}.exr", "below the capture"),
+        ("{subject}/{lamp}/{light}.exr", "without '{' '}' elsewhere"),
+        ("{subject}/{light}.exr", r"no image matches, not even 1/1/1\.exr"),
+    ],
+)
+def test_a_wrong_pattern_is_refused(pattern: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said) as raised:
+        frames_by_pattern(crossed("{s}/{c}/{l}.exr"), pattern)
+    assert str(raised.value).startswith("--pattern") and "\n" not in str(raised.value)
+
+
+def test_images_that_do_not_match_are_strays() -> None:
+    frames = sort_frames([*crossed("{l:03}.png", [1], [1]), "readme.jpg", "thumbs/001.png"], "{light}.png")
+    assert len(frames.paths) == len(LIGHTS) and frames.strays == ["readme.jpg", "thumbs/001.png"]
+
+
+def test_images_without_lights_and_with_all_are_no_frames() -> None:
+    extra = ["0001/C1/ambient.exr", "0002/C1/ambient.exr", "0001/C1/dark.exr", "0001/C2/all_on.exr"]
+    frames = sort_frames([*crossed("{s:04}/C{c}/L{l:03}.exr"), *extra], FOLDERS)
+    assert frames.ambient.most_common() == [("ambient", 2), ("dark", 1)]
+    assert len(frames.ids("light")) == len(LIGHTS) and not frames.strays
+
+
+def test_ids_come_in_the_order_of_their_numbers() -> None:
+    frames = sort_frames(crossed("{s}/{c}/L{l}.exr"), FOLDERS)
+    assert frames.ids("light")[:3] == ["L1", "L2", "L3"] and frames.ids("light")[-1] == "L12"
+
+
+def test_ids_that_no_file_could_bear_are_left_out() -> None:
+    paths = crossed("{s}/C{c}/L{l}.exr", ["ann\n", "b\udcff", "\u0627\u062d", "ok"])
+    frames = sort_frames(paths, FOLDERS)
+    assert frames.ids("subject") == ["ok"] and set(frames.unnameable) == {"ann\n", "b\udcff", "\u0627\u062d"}
+
+
+def listed(folder: Path, text: str) -> Path:
+    (folder / "lights.lp").write_text(text)
+    return folder / "lights.lp"
+
+
+def test_an_lp_file_is_read_by_the_images_names(tmp_path: Path) -> None:
+    path = listed(tmp_path, "3\r\nC:\\rti\\a 1.jpg 0 0 2\r\nrti/L2.jpg 0.6 0 .8\r\nL9.jpg 1 0 0\r\n")
+    lights = read_light_list(path)
+    assert [name for name, _ in lights] == ["C:\\rti\\a 1.jpg", "rti/L2.jpg", "L9.jpg"]
+    assert match_lights(lights, ["L1", "L2"], {"a 1": "L1"}) == {"L1": [0, 0, 1], "L2": [0.6, 0, 0.8]}
+
+
+def test_a_list_without_names_goes_by_order(tmp_path: Path) -> None:
+    lights = read_light_list(listed(tmp_path, "# x y z\n\n0 0 1\n0, 1, 0\n-1e0 0 0\n"))
+    expected = {"2": [0, 0, 1], "10": [0, 1, 0], "11": [-1, 0, 0]}
+    assert match_lights(lights, ["2", "10", "11"], {}) == expected
+    assert match_lights(lights, ["2", "10"], {}) == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1\nL1 0 0", "line 2 is wrong"),
+        ("L1 0 0 1\nL2 a b c", "line 2 is wrong"),
+        ("L1 0 0 0", "line 1 has no direction"),
+        ("L1 nan 0 0", "no direction"),
+        ("L1 inf 0 0", "no direction"),
+        ("\0\1\2", "line 1 is wrong"),
+        ("0 0 1\n" * 1_000_000, "too large"),
+    ],
+)
+def test_a_wrong_list_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        read_light_list(listed(tmp_path, text))
+
+
+def test_directions_are_unit_to_what_stage_json_asks(tmp_path: Path) -> None:
+    vectors = np.random.default_rng(1).normal(size=(50, 3))
+    lights = read_light_list(listed(tmp_path, "\n".join(" ".join(map(str, row)) for row in vectors)))
+    lengths = np.linalg.norm([direction for _, direction in lights], axis=1)
+    assert np.abs(lengths - 1).max() < 1e-5

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.capture.draft_lights import read_light_list
+from facerf_cli.capture.draft import read_light_list
 from facerf_cli.cli.batch import _exist, print_path
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.cli.naming import NamePattern

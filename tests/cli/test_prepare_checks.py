@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.findings import Finding
-from facerf_cli.capture.select import LEAST_LIGHTS
+from facerf_cli.capture.findings import LEAST_LIGHTS, Finding
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.main import main
 from tests.dataset.capture import write_capture
@@ -33,7 +32,8 @@ def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
         def check_subject(capture: Capture, subject: str) -> list[Finding]:
             return [found for found in findings if found.subject == subject]
 
-        monkeypatch.setattr("facerf_cli.cli.items.capture_findings.check_subject", check_subject)
+        for module in ("capture_findings", "prepare_capture"):
+            monkeypatch.setattr(f"facerf_cli.cli.items.{module}.check_subject", check_subject)
 
     return planted
 
@@ -44,7 +44,7 @@ def prepare(capture: Path, output: Path, *line: str) -> int:
 
 def frame(light: int, subject: str = "0000", camera: str = "C1") -> Finding:
     words = "is far darker than its neighbours"
-    return Finding("error", "unlit", subject, words, camera, f"L{light:03d}", {"share": 0.1}, True)
+    return Finding("error", "unlit", subject, words, camera, f"L{light:03d}", {"share": 0.1})
 
 
 ORDER = Finding("error", "order", "0001", "the lamps are in another order", "C0")
@@ -157,7 +157,7 @@ def test_heads_that_moved_are_moved_back(
         asked[camera] = broken
         return {"L002": (1.0, -2.0)} if camera == "C0" else {}
 
-    monkeypatch.setattr("facerf_cli.capture.checks.align.align_shifts", align_shifts)
+    monkeypatch.setattr("facerf_cli.capture.checks.motion.align_shifts", align_shifts)
     assert prepare(capture, tmp_path, "--align", "--split", "1/1/0") == 0
     assert set(asked) == {"C0", "C1", "C2"}
     record = json.loads((tmp_path / "fits/0000.json").read_text())

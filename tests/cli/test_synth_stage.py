@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.files.images import read_image
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.main import main

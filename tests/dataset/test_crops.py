@@ -1,17 +1,33 @@
+"""Crops of pairs and of photos: exposed, placed and moved as training needs them."""
+
+import json
+import logging
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from facerf_cli.dataset.crop_move import UNMOVED, CropMove
-from facerf_cli.dataset.crops import PairReader, mean_translation_m, open_pairs, spread_pairs
+from facerf_cli.dataset import crops as module
+from facerf_cli.dataset.crops import (
+    CACHED_SIDE_PX,
+    UNMOVED,
+    CropMove,
+    PairReader,
+    mean_translation_m,
+    open_pairs,
+    open_photos,
+    spread_pairs,
+)
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path
-from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
+from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path, load_pairs, relight_subject, write_pairs
+from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
+from facerf_cli.face.landmarks import Face
+from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.files.images import write_display
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.synth.sky.skies import ProceduralMaps
@@ -149,3 +165,70 @@ def test_heads_stand_where_their_fits_say(dataset: Dataset) -> None:
     expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
     assert torch.allclose(torch.tensor(mean_translation_m(dataset)), expected, atol=1e-6)
     assert expected[2] < -0.9
+
+
+SIDE_PX = 200
+
+
+def _landmarks_px(x: float) -> np.ndarray:
+    """A face whose nose is at x, as large as half the photo."""
+    return np.array([x, 100]) + LANDMARKS_M[:, :2] * [1, -1] * 500
+
+
+@pytest.fixture
+def looked_at() -> list[str]:
+    """What the detector was shown."""
+    return []
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked_at: list[str]) -> Path:
+    """Three photos; in the two darker ones there is a face."""
+
+    def find(pixels: np.ndarray, name: str) -> list[Face]:
+        looked_at.append(name)
+        if pixels.mean() > 0.7:
+            raise InputError(f"{name}: no face found")
+        return [Face((50, 50, 150, 150), 1.0, _landmarks_px(90 if pixels.mean() < 0.4 else 110))]
+
+    monkeypatch.setattr(module, "find_faces", find)
+    for name, value in (("a.png", 0.2), ("b.png", 0.6), ("c.png", 0.9)):
+        write_display(tmp_path / name, np.full((SIDE_PX, SIDE_PX, 3), value, np.float32))
+    return tmp_path
+
+
+def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: pytest.LogCaptureFixture) -> None:
+    paths, cache = sorted(folder.glob("*.png")), folder / "cache"
+    with caplog.at_level(logging.WARNING):
+        first = open_photos(paths, cache, 64)
+    assert [Path(name).name for name in looked_at] == ["a.png", "b.png", "c.png"]
+    assert caplog.text.count("c.png: no face found") == 1
+    again = open_photos(paths, cache, 64)
+    assert len(looked_at) == 3 and again.paths == first.paths and len(first.paths) == 2
+    os.utime(paths[0], (0, 0))
+    open_photos(paths, cache, 64)
+    assert len(looked_at) == 4  # the one that changed
+
+
+def test_crops_hold_their_landmarks(folder: Path) -> None:
+    found = open_photos(sorted(folder.glob("*.png")), folder / "cache", 64)
+    drawn = found.draw(torch.Generator().manual_seed(0))
+    assert drawn.crops.shape == (1, 3, 64, 64) and drawn.landmarks_px.shape == (1, 68, 2)
+    full = found.landmarks_px / CACHED_SIDE_PX
+    move = CropMove.draw(_after_the_choice(0))  # as a detector's box would cut the crop
+    assert any(torch.allclose(drawn.landmarks_px[0] / 64, move.points(face), atol=1e-5) for face in full)
+    assert full.min() > 0 and full.max() < 1 and (full[:, :, 0].amax(1) - full[:, :, 0].amin(1)).min() > 0.4
+    records = [json.loads(path.read_text()) for path in (folder / "cache").glob("*.json")]
+    assert sum(record["landmarks_px"] is None for record in records) == 1
+
+
+def _after_the_choice(seed: int) -> torch.Generator:
+    """The generator of a draw once it has chosen one of two photos."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.randint(2, (), generator=generator)
+    return generator
+
+
+def test_no_face_at_all_is_an_error(folder: Path) -> None:
+    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
+        open_photos([folder / "c.png"], folder / "cache", 64)

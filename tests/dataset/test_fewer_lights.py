@@ -9,18 +9,19 @@ import torch
 
 from facerf_cli.dataset.crops import open_pairs
 from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.pairs import draw_pairs, pairs_path, read_pairs
-from facerf_cli.dataset.relight import relight_subject, render_source
-from facerf_cli.dataset.samples import open_dataset_textures
-from facerf_cli.dataset.weights import (
-    envmap_names,
+from facerf_cli.dataset.pairs import (
+    draw_pairs,
     load_pairs,
-    map_directions,
     pair_weights,
-    read_envmap,
+    pairs_path,
+    read_pairs,
+    relight_subject,
+    render_source,
     weights_path,
     write_pairs,
 )
+from facerf_cli.dataset.textures import open_dataset_textures
+from facerf_cli.dataset.weights import envmap_names, map_directions, read_envmap
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.light.envmap import envmap_weights

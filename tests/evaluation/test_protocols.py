@@ -315,8 +315,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     assert (
         main(["relight-dataset", str(dataset.folder), "--envmaps", "procedural:2", "--per-subject", "2"]) == 0
     )
-    from facerf_cli.dataset.pairs import image_path, read_pairs
-    from facerf_cli.dataset.weights import weights_path
+    from facerf_cli.dataset.pairs import image_path, read_pairs, weights_path
 
     person, (first, second) = Person(dataset, "0000", None, Sides(128, 32)), read_pairs(dataset)
     directions, weights = person.light(second)

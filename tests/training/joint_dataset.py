@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import draw_pairs
-from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
+from facerf_cli.dataset.pairs import draw_pairs, load_pairs, relight_subject, write_pairs
+from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 

@@ -12,9 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, spread_pairs
+from facerf_cli.dataset.crops import CropPairs, PhotoCrops, spread_pairs
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, INNER_MOUTH_CORNERS, grid_triangles
 from facerf_cli.network.geometry import GeometryEstimate

@@ -6,9 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs
+from facerf_cli.dataset.crops import CropPairs, PhotoCrops
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.photos import PhotoCrops
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures

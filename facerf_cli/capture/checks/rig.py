@@ -13,10 +13,9 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.capture.checks.findings import Finding
 from facerf_cli.capture.checks.frames import CameraFrames
-from facerf_cli.capture.checks.numerics import angle_deg
-from facerf_cli.capture.checks.stereo import Stereo
+from facerf_cli.capture.checks.shading import Stereo, angle_deg
+from facerf_cli.capture.findings import Finding
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera, fit_views
 from facerf_cli.face.landmarks import choose_face, to_display
@@ -130,8 +129,7 @@ def check_rig_roughly(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]
     leaning = float(np.corrcoef(stereo.normals[:, 0], columns)[0, 1])
     if leaning < -_LEAN:
         words = "the object looks hollow from left to right; check whether lights or images are mirrored"
-        figures = {"leaning": round(leaning, 2)}
-        yield Finding("error", "rig", frames.subject, words, frames.camera, figures=figures)
+        yield frames.error("rig", words, leaning=round(leaning, 2))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,13 +1,20 @@
 """All checks of a subject's frames, before a dataset is prepared from them."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import replace
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.findings import Finding
-from facerf_cli.capture.checks.frames import CameraFrames, read_frames
-from facerf_cli.capture.checks.gamma import Curve, added_exponent, check_gamma, fit_exponent
-from facerf_cli.capture.checks.lighting import check_frames_order, check_too_bright, check_unlit
+from facerf_cli.capture.checks.frames import (
+    CameraFrames,
+    check_black,
+    check_clipped,
+    check_fields,
+    check_missing,
+    check_other_cameras,
+    check_readable,
+    read_frames,
+    same_frames,
+)
 from facerf_cli.capture.checks.motion import check_motion
 from facerf_cli.capture.checks.rig import (
     RigFit,
@@ -16,49 +23,44 @@ from facerf_cli.capture.checks.rig import (
     find_face_normals,
     measure_rig,
 )
-from facerf_cli.capture.checks.single_frames import (
-    check_black,
-    check_clipped,
+from facerf_cli.capture.checks.shading import (
+    Curve,
+    Stereo,
+    added_exponent,
     check_duplicates,
-    check_fields,
-    check_missing,
-    check_other_cameras,
-    check_readable,
-    same_frames,
+    check_frames_order,
+    check_gamma,
+    check_too_bright,
+    check_unlit,
+    fit_exponent,
+    fit_stereo,
 )
-from facerf_cli.capture.checks.stereo import Stereo, fit_stereo
+from facerf_cli.capture.findings import Finding
 
 _FACE_TRIES = 3  # cameras without a face that are searched; each costs a second or more
 
 
-@dataclass(frozen=True)
-class CheckSettings:
-    """Settings of the checks."""
-
-    side_px: int = 96  # longest side of the small frames that the checks share
-
-
-_DEFAULTS = CheckSettings()
-
-
-def check_subject(capture: Capture, subject: str, settings: CheckSettings = _DEFAULTS) -> list[Finding]:
+def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Finding]:
     """Check a subject's frames; findings are sorted, errors first.
 
-    Each frame is read once, and one camera is in memory at a time, with `settings.side_px` squared values per
-    light. Unreadable frames are findings, not exceptions.
+    Each frame is read once, and one camera is in memory at a time, with `side_px` squared values per light.
+    Unreadable frames are findings, not exceptions; a missing frame that the capture marks as damaged is none.
+    The checks see the frames without a colour chart's matrix, which would hide clipped channels.
     """
-    checks = _Checks(capture, subject, settings)
+    checks = _Checks(replace(capture, charts=()), subject, side_px)
     found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
     found += check_gamma(subject, checks.curves)
     found += check_rigs(subject, checks.rigs) if checks.rigs else checks.rough
+    marked = capture.marked.get(subject, frozenset())
+    found = [finding for finding in found if finding.check != "missing" or finding.light not in marked]
     return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
 
 
 class _Checks:
     """Checks of a subject's cameras in turn, and the results that are judged at the end."""
 
-    def __init__(self, capture: Capture, subject: str, settings: CheckSettings) -> None:
-        self.capture, self.subject, self.settings = capture, subject, settings
+    def __init__(self, capture: Capture, subject: str, side_px: int) -> None:
+        self.capture, self.subject, self.side_px = capture, subject, side_px
         self.curves: list[Curve] = []
         self.rough: list[Finding] = []  # of the rig, without a face
         self.rigs: list[RigFit] = []
@@ -68,7 +70,7 @@ class _Checks:
     def of_camera(self, camera: str) -> list[Finding]:
         """Check the frames of a camera."""
         found = list(check_missing(self.capture, self.subject, camera))
-        frames, unread = read_frames(self.capture, self.subject, camera, self.settings.side_px)
+        frames, unread = read_frames(self.capture, self.subject, camera, self.side_px)
         found += check_readable(frames, unread)
         for check in (check_black, check_clipped, check_fields):
             found += check(frames)

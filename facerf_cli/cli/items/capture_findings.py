@@ -6,7 +6,7 @@ before the subject is prepared.
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.findings import Finding, stopping
 from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.findings import Finding, stopping
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.options import Settings, workers_of
 from facerf_cli.errors import InputError, UsageError
@@ -67,24 +67,11 @@ class CheckOnly:
     def __call__(self, item: Item) -> list[Finding]:
         """Check a subject on one thread."""
         with one_thread():
-            return check(self.opened(), item.name)
+            return check_subject(self.opened(), item.name)
 
 
 def _died(item: Item, error: Exception) -> list[Finding]:
     return [Finding("error", "unchecked", item.name, process_died(error))]
-
-
-def check(capture: Capture, subject: str) -> list[Finding]:
-    """Check a subject's frames; a missing frame that the capture marks as damaged is no finding.
-
-    The checks see the frames without a colour chart's matrix, which would hide clipped channels.
-    """
-    marked = capture.marked.get(subject, frozenset())
-    return [
-        found
-        for found in check_subject(replace(capture, charts=()), subject)
-        if not (found.check == "missing" and found.light in marked)
-    ]
 
 
 def require_sound(subject: str, findings: Iterable[Finding], strict: bool) -> None:

@@ -8,20 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.chart_correction import ChartCorrection
-from facerf_cli.capture.checks.align import with_alignment
-from facerf_cli.capture.checks.findings import frames_left_out
-from facerf_cli.capture.colour_chart import read_charts, write_chart_overlays
+from facerf_cli.capture.capture import Capture, ChartCorrection
+from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
+from facerf_cli.capture.checks.motion import with_alignment
+from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.draft import as_text, draft_stage
-from facerf_cli.capture.layouts import read_capture
-from facerf_cli.capture.select import Selection, has_new_frames, select_frames
-from facerf_cli.capture.stage_json import STAGE_FILE
+from facerf_cli.capture.findings import Selection, frames_left_out, has_new_frames, select_frames
+from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
+from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
 from facerf_cli.cli.batch import BatchOptions, run_items, sums_up
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.capture_findings import (
     CheckOnly,
-    check,
     check_all,
     collect_findings,
     require_sound,
@@ -29,7 +27,6 @@ from facerf_cli.cli.items.capture_findings import (
     write_findings,
 )
 from facerf_cli.cli.options import Settings
-from facerf_cli.cli.prepare_dataset import Checks, PrepareOptions
 from facerf_cli.cli.report import Outcome
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
@@ -39,8 +36,8 @@ from facerf_cli.dataset.dataset import (
     preparation_key,
     record_path,
 )
-from facerf_cli.dataset.pages import index_page
-from facerf_cli.dataset.prepare import prepare_subject, prepared_subjects, subject_outputs
+from facerf_cli.dataset.prepare import index_page, prepare_subject, prepared_subjects, subject_outputs
+from facerf_cli.dataset.settings import DatasetSettings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
@@ -76,32 +73,36 @@ def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: b
     print(path)
 
 
-def prepare_capture(options: PrepareOptions, output: Path, settings: Settings) -> int:
-    """Prepare all subjects of a capture, or only check them; return the exit code."""
-    split = Split.parse(options.split)
-    if (px := options.crop_px) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
+def prepare_capture(
+    folder: Path,
+    reading: ReadSettings,
+    chart: ChartSettings,
+    checking: CheckSettings,
+    content: DatasetSettings,
+    face_model: str,
+    batch: BatchOptions,
+    settings: Settings,
+) -> int:
+    """Prepare all subjects of the capture in a folder, or only check them; return the exit code."""
+    split, overwrite, output = Split.parse(content.split), batch.overwrite == "always", batch.output
+    if (px := content.crop) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
         raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    source = _with_charts(
-        CaptureSource(options.capture, options.layout, options.subtract_ambient, options.align),
-        options.colour_chart,
-        options.chart_corners,
-    )
+    source = _with_charts(CaptureSource(folder, reading), chart)
     capture = source.opened()
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
-    if options.checks == "only" and not options.dry_run:
-        return check_all(CheckOnly(source.opened), items, output, options.jobs, options.strict, settings)
-    model_sha256 = _model_digest(options.face_model)
-    key = preparation_key(capture, model_sha256, options.crop_px)
-    _check_earlier(capture, output, key, options.overwrite == "always")
-    work = Prepare(source, options.checks, options.strict, options.face_model, options.crop_px, output, key)
-    batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)
-    if options.overwrite == "always" and not options.dry_run:
+    if checking.checks == "only" and not batch.dry_run:
+        return check_all(CheckOnly(source.opened), items, output, batch.jobs, checking.strict, settings)
+    model_sha256 = _model_digest(face_model)
+    key = preparation_key(capture, model_sha256, content.crop)
+    _check_earlier(capture, output, key, overwrite)
+    work = Prepare(source, checking, face_model, content.crop, output, key)
+    if overwrite and not batch.dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
-    elif not options.dry_run:
+    elif not batch.dry_run:
         _forget_completed(capture, output)
     code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
-    if not options.dry_run and sums_up(items, work.outputs_of, batch, settings):
+    if not batch.dry_run and sums_up(items, work.outputs_of, batch, settings):
         _write_dataset(work, capture, split, settings.seed, model_sha256)
     return code
 
@@ -111,27 +112,25 @@ class CaptureSource:
     """A capture's folder and the options to read it with."""
 
     folder: Path
-    layout: str
-    subtract_ambient: bool
-    align: bool
+    reading: ReadSettings
     charts: tuple[ChartCorrection, ...] = ()
 
     def opened(self) -> Capture:
         """Read the capture's description once per process; UsageError where it is wrong."""
-        capture = _read_capture(self.folder, self.layout, self.subtract_ambient, self.align)
-        return replace(capture, charts=self.charts)
+        return replace(_read_capture(self.folder, self.reading), charts=self.charts)
 
 
 @cache
-def _read_capture(folder: Path, layout: str, subtract_ambient: bool, align: bool) -> Capture:
+def _read_capture(folder: Path, reading: ReadSettings) -> Capture:
     try:
-        return read_capture(folder, layout, subtract_ambient, align)
+        return read_capture(folder, reading)
     except InputError as error:
         raise UsageError(str(error)) from None
 
 
-def _with_charts(source: CaptureSource, image: str, corners: str) -> CaptureSource:
+def _with_charts(source: CaptureSource, given: ChartSettings) -> CaptureSource:
     """Add the colour corrections of --colour-chart, and log each."""
+    image, corners = given.colour_chart, given.chart_corners
     if not image:
         if corners:
             raise UsageError("--chart-corners: no image is given; give --colour-chart too")
@@ -206,8 +205,7 @@ class Prepare:
     """Prepares one subject; settings only."""
 
     source: CaptureSource
-    checks: Checks
-    strict: bool
+    checking: CheckSettings
     face_model: str
     crop_px: int | None
     folder: Path
@@ -223,7 +221,7 @@ class Prepare:
         with one_thread():
             capture, chosen = self._choose(item.name)
             record = prepare_subject(
-                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.strict
+                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.checking.strict
             )
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
@@ -236,10 +234,10 @@ class Prepare:
     def _choose(self, subject: str) -> tuple[Capture, Selection]:
         """Check a subject, select its sound frames, and align them on request; InputError for too few."""
         capture = self.source.opened()
-        findings = check(capture, subject) if self.checks == "on" else []
+        findings = check_subject(capture, subject) if self.checking.checks == "on" else []
         write_findings(self.folder, subject, findings)
-        require_sound(subject, findings, self.strict)
-        chosen = select_frames(capture, subject, findings, self.strict)
+        require_sound(subject, findings, self.checking.strict)
+        chosen = select_frames(capture, subject, findings, self.checking.strict)
         if capture.align:
             capture = with_alignment(capture, subject, frames_left_out(findings))
         return capture, chosen
@@ -250,7 +248,7 @@ def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, mod
     found = prepared_subjects(capture, work.folder).items()
     records = {subject: record for subject, record in found if record.get("prepared") == work.key}
     findings = collect_findings(work.folder, capture.subjects)
-    show_findings([row for rows in findings.values() for row in rows], work.strict)
+    show_findings([row for rows in findings.values() for row in rows], work.checking.strict)
     if not records:
         return
     _write_chart_overlays(capture, work.folder)

@@ -12,49 +12,48 @@ from facerf_cli.cli.batch import BatchOptions, run_items
 from facerf_cli.cli.inputs import Item, collect_items
 from facerf_cli.cli.lights import MAP_SUFFIXES
 from facerf_cli.cli.options import Settings, workers_of
-from facerf_cli.cli.relight_dataset import RelightDataset
 from facerf_cli.cli.report import Outcome
 from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.pairs import RELIT, draw_pairs, image_path, pairs_path
-from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
+from facerf_cli.dataset.pairs import (
+    draw_pairs,
+    image_path,
+    load_pairs,
+    pairs_path,
+    relight_subject,
+    write_pairs,
+)
+from facerf_cli.dataset.settings import PairSettings
+from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import UsageError
 from facerf_cli.logs import STDERR
 from facerf_cli.synth.sky.skies import parse_envmaps
 from facerf_cli.workers import process_died, spread
 
 
-def relight_subjects(options: RelightDataset) -> int:
-    """Write the pairs and, unless lazy, the sources of a dataset; return the exit code."""
-    dataset = read_dataset(options.dataset)
-    output = options.dataset / RELIT
-    names = _envmap_names(options, output)
-    pairs = draw_pairs(dataset, names, options.per_subject, options.settings.seed)
+def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:
+    """Write the pairs and, unless lazy, the sources of the dataset in a folder; return the exit code."""
+    dataset, overwrite = read_dataset(folder), batch.overwrite == "always"
+    names = _envmap_names(wanted.envmaps, batch.output, settings.seed)
+    pairs = draw_pairs(dataset, names, wanted.per_subject, settings.seed)
     if not pairs:
-        raise UsageError(
-            f"{options.dataset}: no subject is in a split; run prepare-dataset with another --split"
-        )
-    if not options.dry_run:
-        write_pairs(dataset, pairs, options.overwrite == "always", _Spread(options.jobs, options.settings))
-    if options.lazy:
+        raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
+    if not batch.dry_run:
+        write_pairs(dataset, pairs, overwrite, _Spread(batch.jobs, settings))
+    if wanted.lazy:
         print(pairs_path(dataset))
         return 0
-    work = _Relight(dataset, options.per_subject, options.overwrite == "always")
+    work = _Relight(dataset, wanted.per_subject, overwrite)
     subjects = dict.fromkeys(pair.subject for pair in pairs)
-    items = [Item(options.dataset / "olat" / name, output / name, name) for name in subjects]
-    batch = BatchOptions(output, options.overwrite, options.dry_run, options.jobs)
-    return run_items("relight-dataset", items, work, work.outputs_of, batch, options.settings)
+    items = [Item(folder / "olat" / name, batch.output / name, name) for name in subjects]
+    return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
 
 
-def _envmap_names(options: RelightDataset, output: Path) -> list[str]:
-    if options.envmaps.startswith("procedural:"):
-        return envmap_names(parse_envmaps(options.envmaps, options.settings.seed))
-    if not Path(options.envmaps).exists():
-        raise UsageError(
-            f"--envmaps {options.envmaps}: no such folder; give one of lat-long maps, or procedural:N"
-        )
-    items = collect_items([options.envmaps], output, MAP_SUFFIXES)
-    return envmap_names([item.input_path for item in items])
+def _envmap_names(envmaps: str, output: Path, seed: int) -> list[str]:
+    if envmaps.startswith("procedural:"):
+        return envmap_names(parse_envmaps(envmaps, seed))
+    if not Path(envmaps).exists():
+        raise UsageError(f"--envmaps {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
+    return envmap_names([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,10 @@ from facerf_cli.cli.items.train_people import (
 from facerf_cli.cli.items.train_progress import TrainProgress
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.train import TrainOptions
-from facerf_cli.dataset.crops import mean_translation_m
+from facerf_cli.dataset.crops import Photos, mean_translation_m, open_photos
 from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.photos import Photos, open_photos
 from facerf_cli.dataset.portraits import open_dataset_portraits
-from facerf_cli.dataset.samples import open_dataset_textures
+from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION

@@ -27,7 +27,7 @@ _FACE_DEPTH_M = 0.11  # distance from the face back to the origin of the head fr
 _OCCLUDED, _GREY, _TURNED = 0.3, 0.25, 0.5  # shares of samples that are occluded, grey, rotated
 _TURN_DEG = 15.0  # largest turn
 # Standard deviations of the shift to the right and down (sides) and of log scale: a crop is cut around a
-# detector's box, see `dataset/crop_move.py`.
+# detector's box, see `dataset/crops.py`.
 _SHIFT, _SCALE = (0.1, 0.03), 0.07
 
 

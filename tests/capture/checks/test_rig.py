@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.capture.checks.numerics import parabola_vertex
 from facerf_cli.capture.checks.rig import RigFit, Turn, check_rigs
+from facerf_cli.capture.checks.shading import parabola_vertex
 
 
 def rig(camera: str, turned_deg: float = 0.0, looking_away: float = 0.0, mirrored: float = 0.8) -> RigFit:

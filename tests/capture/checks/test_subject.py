@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.checks import subject as module
-from facerf_cli.capture.checks.findings import Finding, frames_left_out, stopping
 from facerf_cli.capture.checks.frames import CameraFrames
 from facerf_cli.capture.checks.rig import FaceNormals
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.findings import Finding, frames_left_out, stopping
+from facerf_cli.capture.stage_json import read_capture
 from tests.capture.checks.egg_stage import (
     CAMERA,
     HEIGHT,

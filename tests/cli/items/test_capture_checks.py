@@ -4,15 +4,12 @@ import io
 
 from rich.console import Console
 
-from facerf_cli.capture.checks.findings import Finding
+from facerf_cli.capture.findings import Finding
 from facerf_cli.cli.items.capture_findings import show_findings, summary
 
 STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
 WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
-UNLIT = [
-    Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{k:03d}", {}, True)
-    for k in range(9)
-]
+UNLIT = [Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{k:03d}") for k in range(9)]
 
 
 def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:

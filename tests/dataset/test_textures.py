@@ -8,11 +8,16 @@ import torch
 from safetensors import safe_open
 
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import draw_pairs, image_path, pairs_path
-from facerf_cli.dataset.relight import relight_subject
-from facerf_cli.dataset.samples import DatasetTextures, UnwrappedView, open_dataset_textures
-from facerf_cli.dataset.textures import texture_path
-from facerf_cli.dataset.weights import envmap_names, load_pairs, write_pairs
+from facerf_cli.dataset.pairs import (
+    draw_pairs,
+    image_path,
+    load_pairs,
+    pairs_path,
+    relight_subject,
+    write_pairs,
+)
+from facerf_cli.dataset.textures import DatasetTextures, UnwrappedView, open_dataset_textures, texture_path
+from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.olat_stack import read_olat_stack

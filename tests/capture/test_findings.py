@@ -6,10 +6,8 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.findings import Finding
-from facerf_cli.capture.layouts import read_yale_capture
-from facerf_cli.capture.select import has_new_frames, select_frames
-from facerf_cli.capture.yale_b import Flash
+from facerf_cli.capture.findings import Finding, Severity, has_new_frames, select_frames
+from facerf_cli.capture.yale_b import Flash, read_yale_capture
 from facerf_cli.errors import InputError
 from tests.capture.yale_fixture import write_yale_b
 
@@ -21,8 +19,8 @@ def capture(tmp_path: Path) -> Capture:
     return read_yale_capture(write_yale_b(tmp_path, flashes=FLASHES))
 
 
-def broken(light: str, leaves_out: bool = True) -> Finding:
-    return Finding("error", "unlit", "yaleB05", "is dark", "P00", light, leaves_out=leaves_out)
+def broken(light: str, severity: Severity = "error") -> Finding:
+    return Finding(severity, "unlit", "yaleB05", "is dark", "P00", light)
 
 
 def test_everything_is_there(capture: Capture) -> None:
@@ -39,7 +37,7 @@ def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None
     bad.rename(bad.with_name(bad.name + ".bad"))
     capture = read_yale_capture(capture.folder)
     assert capture.marked == {"yaleB05": frozenset({marked})} and len(capture.light_ids) == 13
-    findings = [broken(unlit), broken(sound, leaves_out=False)]
+    findings = [broken(unlit), broken(sound, "warning")]
     chosen = select_frames(capture, "yaleB05", findings)
     assert chosen.lights == (0, *range(4, 13))
     assert chosen.left_out == {

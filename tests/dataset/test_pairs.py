@@ -8,18 +8,27 @@ import torch
 from torch import Tensor
 
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import draw_pair, draw_pairs, image_path, pairs_path, read_pairs
+from facerf_cli.dataset.pairs import (
+    draw_pair,
+    draw_pairs,
+    image_path,
+    load_pairs,
+    pair_weights,
+    pairs_path,
+    read_pairs,
+    relight_subject,
+    render_source,
+    weights_path,
+    write_pairs,
+)
 from facerf_cli.dataset.prepare import constant_weights
-from facerf_cli.dataset.relight import multiply, relight_subject, relit_images, render_source
 from facerf_cli.dataset.weights import (
     envmap_names,
-    load_pairs,
     map_directions,
-    pair_weights,
+    multiply,
     read_envmap,
-    weights_path,
+    relit_images,
     world_to_map,
-    write_pairs,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.images import read_image, write_exr
@@ -194,7 +203,7 @@ def test_memory_bounds_what_is_held_and_changes_no_bit(
         held.append(2 * part.numel())
         return part
 
-    monkeypatch.setattr("facerf_cli.dataset.relight.read_olats", spy)
+    monkeypatch.setattr("facerf_cli.dataset.weights.read_olats", spy)
     memory_bytes = 3 << 20  # of a stack of 7 MB
     parts = torch.stack(list(relit_images(path, weights, memory_bytes)))
     assert torch.equal(parts, whole)

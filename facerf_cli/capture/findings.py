@@ -1,4 +1,7 @@
-"""Selection of the cameras and lights that go into a subject's OLAT stacks.
+"""Findings of a capture's checks, and the frames that go into a subject's OLAT stacks.
+
+An error stops its subject, unless it is about one frame: then the subject goes on without that frame. A
+warning stops nothing.
 
 All stacks of a subject hold the same lights, because pairs share the weights of an envmap between cameras. So
 a light whose frame is missing or broken in one camera is left out for the subject; a camera that lacks most
@@ -7,15 +10,69 @@ of its frames is left out as a whole instead, so that the other cameras keep the
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.findings import Finding
 from facerf_cli.errors import InputError
 from facerf_cli.logs import counted
 
+Severity = Literal["error", "warning"]
 LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # lights, and share of the rig's, that a usable OLAT stack has
 MISSING, MARKED = "missing", "marked as damaged"
 _LISTED = 6  # entries of a log line; the rest are counted
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A fault, with a message that says what to do and the measured figures.
+
+    An empty camera or light means all of them.
+    """
+
+    severity: Severity
+    check: str  # name of the check, such as 'missing' or 'unlit'
+    subject: str
+    words: str
+    camera: str = ""
+    light: str = ""
+    figures: Mapping[str, float | int | str] = field(default_factory=dict)
+
+    @property
+    def leaves_out(self) -> bool:
+        """Whether this frame alone is broken, and left out."""
+        return self.severity == "error" and bool(self.light)
+
+    @property
+    def place(self) -> str:
+        """Place of the fault, `subject/camera/light` as far as given."""
+        return "/".join(name for name in (self.subject, self.camera, self.light) if name)
+
+    def row(self) -> dict[str, Any]:
+        """Row of findings.jsonl."""
+        return {
+            "severity": self.severity,
+            "check": self.check,
+            "subject": self.subject,
+            "camera": self.camera or None,
+            "light": self.light or None,
+            "leaves_out": self.leaves_out,
+            "words": self.words,
+            "figures": dict(self.figures),
+        }
+
+
+def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]:
+    """Select the findings that stop their subject; with `strict` all do."""
+    return [found for found in findings if strict or (found.severity == "error" and not found.leaves_out)]
+
+
+def frames_left_out(findings: Iterable[Finding]) -> dict[str, set[str]]:
+    """Collect the ids of the lights whose frames are left out, by camera."""
+    broken: dict[str, set[str]] = {}
+    for found in findings:
+        if found.leaves_out:
+            broken.setdefault(found.camera, set()).add(found.light)
+    return broken
 
 
 @dataclass(frozen=True)

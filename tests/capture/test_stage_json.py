@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.settings import ReadSettings
+from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.colour import matrix_to_rec709, named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import read_document, write_document
@@ -193,7 +194,7 @@ def test_no_capture_and_no_such_layout(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "nowhere")
     with pytest.raises(UsageError, match="there is extended-yale-b, stage"):
-        read_capture(tmp_path, "multipie")
+        read_capture(tmp_path, ReadSettings("multipie"))
 
 
 def test_a_frame_that_is_missing_torn_or_of_another_size_is_named(tmp_path: Path) -> None:

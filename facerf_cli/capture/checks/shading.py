@@ -1,0 +1,346 @@
+"""Checks by shading: photometric stereo of a camera's frames, and what contradicts it.
+
+R. Woodham, *Photometric method for determining surface orientation from multiple images*, Optical Engineering
+1980: under a light from direction d a matte surface has radiance g . d, where g is its normal times its
+albedo. A constant per pixel is fitted too, for the light of the room. The fit is robust against cast shadows,
+highlights and broken frames: weights fall with the residual, and frames under lights behind a pixel do not
+count.
+
+**Order.** In front of the face, the direction of a frame's light is solved for on the fitted normals. Lights
+at the side or behind reach only edges and hair; there, brightness is compared with neighbouring lights.
+
+**Display curve.** Two methods find the exponent e for which values^e are linear. With a frame under all
+lights at once, the other frames must add up to it; this needs no model of the object, but few stages record
+that frame. Otherwise shading decides: photometric stereo is fitted to values^e, raised to 1/e and compared
+with the values. That comparison uses the same values for every e; on values^e a low exponent would win by
+flattening everything.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from facerf_cli.capture.capture import FULL_NAMES, Capture
+from facerf_cli.capture.checks.frames import CameraFrames, grey_of, reaches_face, same_frames, small
+from facerf_cli.capture.findings import Finding
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import read_image
+
+# Photometric stereo.
+_LEAST_FRAMES = 8  # fewer do not determine what another one should look like
+_LEAST_LIT_PX = 100
+_ITERATIONS = 6
+_RIDGE = 1e-3  # keeps the equations of pixels with few weighted frames solvable
+_LEAST_COSINE = 0.15  # of light and normal: at grazing angles a matte surface is a poor model
+_BRIGHT_SHARE = 0.2  # of a pixel's brightest frames: darker ones start as shadow
+_LIT_SHARE = 0.1  # of the brightest pixels: pixels that never get as bright are background
+# Display curve.
+EXPONENTS = np.array([0.35, 0.4, 0.45, 0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8, 2.2, 2.6, 3.0])
+# Linear frames of Extended Yale B's subjects 05, 15 and 22 give 0.85 to 1, synthetic ones 1; encoded by 1/2.2
+# they give 1.7 to 2.4.
+_LINEAR = (0.6, 1.5)
+_EXACTLY_LINEAR = (0.93, 1.07)  # by a frame under all lights
+_CLEAR = 1.25  # least ratio of the error at exponent 1 to the smallest error
+# By shading.
+_PIXELS = 600
+_FACING = 0.3  # cosine of light and normal
+_LIT = 0.25  # of a pixel's brightest frame, values as they are
+# By additivity.
+_FINE_EXPONENTS = np.geomspace(EXPONENTS[0], EXPONENTS[-1], 80)  # its minimum is sharp
+_NOISE = 1e-3  # least log ratio that a sum can reach
+_DARK_PIXEL = 0.02  # of the brightest: darker pixels are noise
+# Order of lights in front. On Extended Yale B's subjects 05, 15 and 22 and synthetic faces the light of a
+# frame is found to 14 degrees at worst.
+_OFF_DEG = 30.0
+_IN_FRONT, _BELOW = 0.4, -0.7  # cosine to the camera's axis; sine of elevation: other lights leave shadows
+_MOST_SWAPPED = 0.25  # of the frames: with more off, the list of lights is wrong
+_LIGHT_ITERATIONS = 4
+# Order of lights at the side and behind. Sound frames of synthetic faces reach 1.5 times their neighbours, of
+# Extended Yale B 1.1.
+_BRIGHTEST_RATIO = 2.5
+_AROUND, _LEAST_AROUND = 0.7, 3  # cosine between neighbouring lights; number of them needed
+_DARK_FRAME = 0.05  # of the brightest frames: noise and the room dominate darker ones
+# Lights that did not fire. Sound frames of Extended Yale B's subjects 05, 15 and 22 have 0.77 of their
+# neighbours' gain or more, those of synthetic faces 0.41; a light that did not fire leaves some hundredths.
+_LEAST_GAIN = 0.3
+_REACH = 0.3  # of the best placed lights' radiance: below it, cast shadows and the room dominate
+_NEIGHBOURS = 6
+_BRIGHT_PERCENTILE = 98  # of the pixels, above which gains are measured
+
+
+@dataclass(frozen=True, eq=False)
+class Stereo:
+    """Shape and albedo of the P pixels that `lit` covers."""
+
+    g: np.ndarray  # [P, 3] normal times albedo, camera space
+    room: np.ndarray  # [P] constant light of the room, not negative
+    lit: np.ndarray  # [h, w] bool
+
+    def lit_by(self, directions: np.ndarray) -> np.ndarray:
+        """Radiance [L, P] under lights from directions [L, 3], without the room's light and cast shadows."""
+        return np.maximum(directions @ self.g.T, 0)
+
+    def predicted(self, directions: np.ndarray) -> np.ndarray:
+        """Predicted frames [L, P] under lights from directions [L, 3]."""
+        return self.lit_by(directions) + self.room
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Unit normals [P, 3]."""
+        return self.g / np.maximum(np.linalg.norm(self.g, axis=1, keepdims=True), 1e-12)
+
+
+def fit_stereo(frames: CameraFrames) -> Stereo | None:
+    """Fit the frames of a camera; None where there are too few frames or lit pixels."""
+    lit = lit_pixels(frames.grey) if len(frames.light_ids) >= _LEAST_FRAMES else np.zeros((1, 1), bool)
+    if lit.sum() < _LEAST_LIT_PX:
+        return None
+    return photometric_stereo(frames.grey[:, lit].astype(float), frames.directions, lit)
+
+
+def lit_pixels(grey: np.ndarray) -> np.ndarray:
+    """Mask [h, w] of the object in frames [L, h, w], without the dark background."""
+    bright = np.percentile(grey, 90, axis=0)
+    return bright > _LIT_SHARE * np.percentile(bright, 95)
+
+
+def photometric_stereo(values: np.ndarray, directions: np.ndarray, lit: np.ndarray) -> Stereo:
+    """Fit the values [L, P] of the pixels in `lit` [h, w] under lights from directions [L, 3]."""
+    terms = np.c_[directions, np.ones(len(directions))]
+    outer = (terms[:, :, None] * terms[:, None]).reshape(len(terms), -1)
+    top = np.percentile(values, 95, axis=0)
+    weights = (values > _BRIGHT_SHARE * top).astype(float)
+    ridge = np.diag([_RIDGE] * 3 + [_RIDGE * 10])  # the room's light is the least certain
+    for _ in range(_ITERATIONS):
+        matrices = (weights.T @ outer).reshape(-1, 4, 4) + ridge
+        fitted = np.linalg.solve(matrices, ((weights * values).T @ terms)[..., None])[..., 0]  # [P, 4]
+        residual = np.abs(values - terms @ fitted.T)
+        spread = 1.48 * np.median(residual, axis=0) + 1e-3 * top + 1e-12
+        facing = directions @ fitted[:, :3].T > _LEAST_COSINE * np.linalg.norm(fitted[:, :3], axis=1)
+        weights = facing / (1 + (residual / (2 * spread)) ** 2)
+    return Stereo(fitted[:, :3], np.maximum(fitted[:, 3], 0), lit)
+
+
+def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles between unit vectors [..., 3], in degrees."""
+    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
+
+
+def parabola_vertex(x: np.ndarray, y: np.ndarray, place: int) -> float:
+    """Refine the place of an extremum of samples y [N] at x [N] by a parabola through it and its neighbours.
+
+    Returns x[place] for a sample at an end, or where the three values are equal.
+    """
+    if not 0 < place < len(x) - 1:
+        return float(x[place])
+    slopes = np.diff(y[place - 1 : place + 2]) / np.diff(x[place - 1 : place + 2])
+    bend = (slopes[1] - slopes[0]) / (x[place + 1] - x[place - 1])
+    return float((x[place - 1] + x[place]) / 2 - slopes[0] / (2 * bend)) if bend else float(x[place])
+
+
+def check_duplicates(frames: CameraFrames, stereo: Stereo | None) -> Iterator[Finding]:
+    """Report identical frames, except the one of each group whose light predicts the image best.
+
+    `stereo` is fitted without these frames; if it is None, whole groups are reported.
+    """
+    for rows in same_frames(frames):
+        own = None if stereo is None else _best_row(frames, stereo, rows)
+        names = ", ".join(frames.light_ids[row] for row in rows)
+        for row in rows:
+            if row == own:
+                continue
+            words = f"is identical to other frames ({names})"
+            words += "" if own is None else f" and fits light {frames.light_ids[own]} best"
+            yield frames.error("duplicate", words + "; copy it again", row, frames=len(rows))
+
+
+def _best_row(frames: CameraFrames, stereo: Stereo, rows: list[int]) -> int:
+    """Row whose predicted frame correlates best with the image that the rows share."""
+    predicted = stereo.predicted(frames.directions[rows])
+    image = frames.grey[rows[0]][stereo.lit]
+    return rows[int(np.argmax([np.corrcoef(image, guess)[0, 1] for guess in predicted]))]
+
+
+def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
+    """Report each frame whose light comes from elsewhere than declared; one finding if there are many."""
+    rows = np.flatnonzero((frames.directions[:, 2] > _IN_FRONT) & (frames.directions[:, 1] > _BELOW))
+    if len(rows) < 4:
+        return
+    found = np.stack([solve_light(frames.grey[row][stereo.lit], stereo) for row in rows])
+    off_deg = angle_deg(found, frames.directions[rows])
+    wrong = np.flatnonzero(off_deg > _OFF_DEG)
+    if len(wrong) > max(_MOST_SWAPPED * len(rows), 2):
+        words = (
+            f"{len(wrong)} of {len(rows)} frames are lit from elsewhere than declared (median "
+            f"{np.median(off_deg):.0f} degrees off); correct the order of the lights"
+        )
+        yield frames.error(
+            "order", words, frames=len(wrong), median_off_deg=round(float(np.median(off_deg)), 1)
+        )
+        return
+    for place in wrong.tolist():
+        like = frames.light_ids[int(np.argmax(frames.directions @ found[place]))]
+        words = (
+            f"is lit from {off_deg[place]:.0f} degrees off its light's direction, as under {like}; correct "
+            "the file's name"
+        )
+        yield frames.error("order", words, int(rows[place]), off_deg=round(float(off_deg[place]), 1))
+
+
+def solve_light(image: np.ndarray, stereo: Stereo) -> np.ndarray:
+    """Solve for the direction [3] of a frame's light from its lit pixels [P], by robust least squares."""
+    values = image - stereo.room
+    weights = (values > 0.2 * np.percentile(values, 95)).astype(float)
+    light = np.array([0.0, 0.0, 1.0])
+    for _ in range(_LIGHT_ITERATIONS):
+        g = stereo.g * weights[:, None]
+        light = np.linalg.solve(g.T @ stereo.g + 1e-9 * np.eye(3), g.T @ values)
+        residual = np.abs(values - stereo.g @ light)
+        spread = 1.48 * np.median(residual[weights > 0.1]) if (weights > 0.1).any() else 1.0
+        facing = stereo.normals @ light > 0.15 * np.linalg.norm(light)
+        weights = facing / (1 + (residual / (2 * spread + 1e-9)) ** 2)
+    return light / max(np.linalg.norm(light), 1e-12)
+
+
+def check_too_bright(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
+    """Report each frame of a light not in front that is far brighter than those of neighbouring lights."""
+    means = frames.grey[:, stereo.lit].mean(1)
+    near = frames.directions @ frames.directions.T > _AROUND
+    np.fill_diagonal(near, False)
+    # The second brightest neighbour: of two neighbours that are swapped, each sees the other.
+    around = np.sort(np.where(near, means, 0), axis=1)[:, -2]
+    judged = (frames.directions[:, 2] <= _IN_FRONT) & (near.sum(1) >= _LEAST_AROUND)
+    judged &= means > _DARK_FRAME * np.percentile(means, 95)
+    for row in np.flatnonzero(judged & (means > _BRIGHTEST_RATIO * around)).tolist():
+        times = float(means[row] / max(float(around[row]), 1e-12))
+        brighter = f"is {min(times, 999):.0f} times as bright as the frames of neighbouring lights"
+        yield frames.error("order", f"{brighter}; correct the file's name", row, times=round(times, 1))
+
+
+def check_unlit(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
+    """Report each frame with far less of its predicted light than the frames of neighbouring lights have."""
+    expected, gains = measure_gains(frames, stereo)
+    judged = expected > _REACH * np.percentile(expected, 95)
+    judged &= reaches_face(frames.directions)
+    if judged.sum() <= _NEIGHBOURS:
+        return
+    rows = np.flatnonzero(judged)
+    cosines = frames.directions[rows] @ frames.directions[rows].T
+    np.fill_diagonal(cosines, -2)
+    neighbours = rows[np.argsort(-cosines, axis=1)[:, :_NEIGHBOURS]]
+    for row, usual in zip(rows.tolist(), np.median(gains[neighbours], axis=1), strict=True):
+        if gains[row] < _LEAST_GAIN * usual:
+            share = max(float(gains[row] / usual), 0.0)
+            words = f"has {share:.0%} of the light that its neighbours predict; check whether the light fired"
+            mean = float(frames.grey[row].mean())
+            yield frames.error("unlit", words, row, share=round(share, 3), mean=mean)
+
+
+def measure_gains(frames: CameraFrames, stereo: Stereo) -> tuple[np.ndarray, np.ndarray]:
+    """Expected radiance [L] of the brightest pixels under each light, and the measured share of it [L].
+
+    Hair or a hand may hide a light from most of the face, but some pixel, such as the nose's tip, nearly
+    always stays lit.
+    """
+    predicted = stereo.lit_by(frames.directions)
+    seen = frames.grey[:, stereo.lit] - stereo.room
+    bright, expected = (np.percentile(values, _BRIGHT_PERCENTILE, axis=1) for values in (seen, predicted))
+    return expected, bright / np.maximum(expected, 1e-12)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The exponent that linearises a camera's frames best."""
+
+    exponent: float
+    times_worse: float  # error at exponent 1 over the smallest error
+    exact: bool = False  # found by additivity, not by shading
+
+
+def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:
+    """Report one error for a subject whose cameras agree, in the median, that values are not linear."""
+    if not curves:
+        return
+    exponent = float(np.median([curve.exponent for curve in curves]))
+    worse = float(np.median([curve.times_worse for curve in curves]))
+    least, most = _EXACTLY_LINEAR if all(curve.exact for curve in curves) else _LINEAR
+    if least < exponent < most or worse < _CLEAR:
+        return
+    words = (
+        f"frames are declared linear, but values to the power {exponent:.1f} explain them {worse:.1f} "
+        "times better; give their colour space"
+    )
+    figures = {"exponent": round(exponent, 2), "times_better": round(worse, 2), "cameras": len(curves)}
+    yield Finding("error", "gamma", subject, words, figures=figures)
+
+
+def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> Curve | None:
+    """Fit the exponent to a camera's lit pixels [h, w] by shading; None where too little is lit."""
+    values = np.maximum(frames.grey[:, lit].astype(float), 0)
+    step = max(values.shape[1] // _PIXELS, 1)
+    values = values[:, ::step]
+    top = np.percentile(values, 98, axis=0)
+    values = values[:, top > 0] / top[top > 0]
+    used = values > _LIT
+    if len(values) < _LEAST_FRAMES or used.sum() < _PIXELS:
+        return None
+    errors = np.array([_shading_error(values, used, frames.directions, exponent) for exponent in EXPONENTS])
+    place = int(errors.argmin())
+    exponent = parabola_vertex(np.log(EXPONENTS), errors, place)
+    at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
+    return Curve(float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9))
+
+
+def _shading_error(values: np.ndarray, used: np.ndarray, directions: np.ndarray, exponent: float) -> float:
+    """Median error of matte shading on values [L, P] that are scaled to 1."""
+    linear = values**exponent
+    outer = (directions[:, :, None] * directions[:, None]).reshape(len(directions), -1)
+    weights = used.astype(float)
+    for _ in range(_ITERATIONS):
+        matrices = (weights.T @ outer).reshape(-1, 3, 3) + 1e-3 * np.eye(3)
+        g = np.linalg.solve(matrices, ((weights * linear).T @ directions)[..., None])[..., 0]
+        shaded = directions @ g.T
+        residual = np.abs(linear - shaded)
+        spread = 1.48 * np.median(residual, axis=0) + 1e-3
+        weights = (shaded > _FACING * np.linalg.norm(g, axis=1)) / (1 + (residual / (2 * spread)) ** 2)
+    back = np.maximum(shaded, 0) ** (1 / exponent)
+    return float(np.median(np.abs(values - back)[used]))
+
+
+def added_exponent(capture: Capture, frames: CameraFrames) -> Curve | None:
+    """Fit the exponent for which all frames add up to the frame under all lights; None without that frame.
+
+    None also where a light's frame is missing, which would look like a curve.
+    """
+    full = _full_frame(capture, frames)
+    if full is None or len(frames.light_ids) < len(capture.light_ids):
+        return None
+    strength = capture.intensities[frames.places].mean(1)[:, None]
+    lit = full > _DARK_PIXEL * full.max()
+    each = np.maximum(frames.grey[:, lit] * strength, 0).astype(float)
+    together = full[lit].astype(float)
+    errors = np.array([_sum_error(each, together, exponent) for exponent in _FINE_EXPONENTS])
+    at_one = _sum_error(each, together, 1.0)
+    exponent = float(_FINE_EXPONENTS[errors.argmin()])
+    return Curve(exponent, at_one / max(float(errors.min()), _NOISE), exact=True)
+
+
+def _sum_error(each: np.ndarray, together: np.ndarray, exponent: float) -> float:
+    """Median log ratio of the sum of linearised frames [L, P] and the linearised full frame [P]."""
+    return float(np.median(np.abs(np.log((each**exponent).sum(0) + 1e-12) - exponent * np.log(together))))
+
+
+def _full_frame(capture: Capture, frames: CameraFrames) -> np.ndarray | None:
+    """Read the grey frame [h, w] under all lights, as recorded less the black level; None without one."""
+    for name in FULL_NAMES:
+        path = capture.frame_path(frames.subject, frames.camera, name)
+        if name in capture.light_ids or not path.is_file():
+            continue
+        try:
+            pixels = read_image(path, capture.colour_space, non_finite="zero").pixels
+        except InputError:
+            return None
+        grey = small(grey_of(pixels) - np.float32(capture.black_level), frames.grey.shape[1:])
+        return grey if grey.max() > 0 else None
+    return None

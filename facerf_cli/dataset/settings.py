@@ -1,0 +1,49 @@
+"""Options of a prepared dataset and of its pairs; light to import."""
+
+from dataclasses import dataclass
+
+from facerf_cli.option import option
+
+_DATASET, _PAIRS = "Dataset", "Pairs"  # panels of the help
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """What a dataset holds."""
+
+    split: str = option(
+        "0.8/0.1/0.1",
+        "Split the subjects into training, validation and test: counts (300/10/40) or shares, drawn by "
+        "--seed.",
+        "T/V/T",
+        panel=_DATASET,
+    )
+    crop: int | None = option(
+        None,
+        "Write crops of this side, a multiple of 8.",
+        "PX",
+        shown_default="256, or less where the face has fewer pixels",
+        panel=_DATASET,
+    )
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """Which pairs to draw from a dataset."""
+
+    envmaps: str = option(
+        ...,
+        "Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a file, "
+        "or N maps drawn from --seed.",
+        "DIR|FILE|procedural:N",
+        shown_default=False,
+    )
+    per_subject: int = option(
+        1000, "Make so many images of each subject.", "N", panel=_PAIRS, least=1, most=100_000
+    )
+    lazy: bool = option(
+        False,
+        "Write the recipes alone; training relights when it needs them.",
+        flags=("--lazy",),
+        panel=_PAIRS,
+    )
