@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from facerf_cli import colour
+from facerf_cli.cli.items.outputs import canvas
 from facerf_cli.cli.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
@@ -168,3 +169,14 @@ def test_a_configuration_of_a_show_names_spaces_in_and_out(given: Path, tmp_path
     assert relight(given, tmp_path / "in2", *line[2:6], "--format", "exr") == 0
     one, two = (read_image(tmp_path / folder / f"{NAME}.exr").pixels for folder in ("in", "in2"))
     np.testing.assert_allclose(one, two, atol=0.02)
+
+
+def test_layers_that_do_not_fit_are_files_that_go(tmp_path: Path) -> None:
+    path = tmp_path / "a.exr"
+    with canvas(path, held_bytes=1 << 60) as empty:
+        image, shadow = empty("rgb", (6, 8, 3)), empty("shadow", (6, 8, 3))
+        assert isinstance(image, np.memmap) and (image.dtype, shadow.dtype) == (np.float32, np.float16)
+        assert len(list(tmp_path.glob(".*/*"))) == 2
+    assert not any(tmp_path.iterdir())
+    with canvas(path, held_bytes=0) as empty:
+        assert not isinstance(empty("rgb", (6, 8, 3)), np.memmap) and not any(tmp_path.iterdir())

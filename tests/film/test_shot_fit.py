@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.film.shot_fit import fit_frames, identity_of, spread_over
+from facerf_cli.film.shot_view import fit_frames, identity_of, spread_over
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project, rotation_to_pose
 
 SIZE = (180, 240)

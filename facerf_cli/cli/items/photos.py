@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,7 @@ import torch
 
 from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
-from facerf_cli.cli.items.companions import companion
+from facerf_cli.cli.naming import OF_PHOTOS, NamePattern
 from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
@@ -33,6 +33,29 @@ from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
 from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
+
+
+def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> Path:
+    """The file of an option that goes with a photo.
+
+    A folder mirrors the photos', or holds all files in one place; a pattern has fields, as in
+    `mattes/{dir}/{stem}.png`. Raises InputError for a photo without a file.
+    """
+    if "{" in str(given) and not given.exists():
+        text = given.as_posix()
+        pattern = NamePattern.parse(text.lstrip("/"), option, OF_PHOTOS)
+        found = Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)
+        candidates = [found]
+    elif given.is_dir():
+        names = dict.fromkeys((item.name, item.input_path.stem))
+        candidates = [given / f"{name}{suffix}" for name in names for suffix in suffixes]
+    else:
+        return given
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(f"{item.input_path}: {option} has no {candidates[0]}; add it there")
+
 
 _PHOTO_BYTES = 12  # of a pixel of the photo that is held
 _KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face

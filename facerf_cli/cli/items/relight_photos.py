@@ -13,7 +13,6 @@ import torch
 from facerf_cli import memory
 from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.items.backdrops import Backdrops
-from facerf_cli.cli.items.companions import companion
 from facerf_cli.cli.items.light_weights import (
     near_lights_of,
     strengths,
@@ -24,6 +23,7 @@ from facerf_cli.cli.items.light_weights import (
 from facerf_cli.cli.items.outputs import OutputImage, canvas, write_output
 from facerf_cli.cli.items.photos import (
     FittedFace,
+    companion,
     face_model,
     facts_of,
     fit_faces,

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.cli.items.companions import companion
-from facerf_cli.cli.items.photos import LANDMARK_SUFFIXES, FittedFace, load_models_once, read_photo
+from facerf_cli.cli.items.photos import LANDMARK_SUFFIXES, FittedFace, companion, load_models_once, read_photo
 from facerf_cli.cli.options import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot
@@ -20,8 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import Face, face_at, read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
-from facerf_cli.film.cuts import CutFinder, takes
-from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps
+from facerf_cli.film.follow import LONGEST_GAP, CutFinder, Follower, Sighting, gaps, takes
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.portrait.segment import Segmentation

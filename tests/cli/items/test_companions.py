@@ -5,7 +5,7 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.companions import companion
+from facerf_cli.cli.items.photos import companion
 from facerf_cli.cli.photo_options import check_companion
 from facerf_cli.errors import InputError, UsageError
 
