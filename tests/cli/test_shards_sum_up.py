@@ -18,11 +18,11 @@ Said = pytest.CaptureFixture[str]
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Every file but the reports, which hold times."""
+    """Every file but the reports and indexes, which hold times."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.startswith("report")
+        if path.is_file() and not path.name.startswith(("report", ".facerf-index"))
     }
 
 
