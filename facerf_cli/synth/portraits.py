@@ -8,21 +8,17 @@ any appearance under any lights, in a few hundredths of a second, with the truth
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.errors import InputError
 from facerf_cli.face.silhouette import RAYS_PER_LANDMARK, silhouette_ids
 from facerf_cli.face.topology import CONTOUR
-from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
+from facerf_cli.portrait.classes import MORE_LANDMARKS
 from facerf_cli.raster.camera import project
 from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sample
 from facerf_cli.synth.head.body import clearance_m
@@ -285,35 +281,6 @@ def materials_of(portrait: BakedPortrait, appearance: Appearance) -> MaterialPoi
     return sample(appearance, portrait.part.long(), portrait.uv)
 
 
-def visibility_of(portrait: BakedPortrait) -> Tensor:
-    """Share [L, S, S] of each light that reaches the person in a pixel; 0 on surfaces that face away."""
-    cosines = (portrait.normals.float() @ portrait.directions.T).clamp_min(_LEAST_COSINE)
-    cosines[portrait.part.long() == _HAIR] = 1
-    share = portrait.share.float()[:, None]
-    visible = (portrait.direct.float() / 255 / cosines).clamp(0, 1)
-    side, lights = portrait.side_px, len(portrait.directions)
-    columns = torch.cat([visible, torch.ones(len(visible), 1)], 1) * share
-    summed = torch.zeros(side * side, lights + 1).index_add_(0, portrait.pixel.long(), columns)
-    return (summed[:, :-1] / summed[:, -1:].clamp_min(1e-6)).T.view(lights, side, side)
-
-
 def portrait_tensors(portrait: BakedPortrait) -> dict[str, Tensor]:
     """A portrait's tensors by name, for a file."""
     return {field.name: getattr(portrait, field.name).contiguous() for field in fields(portrait)}
-
-
-def save_portrait(path: Path, portrait: BakedPortrait) -> None:
-    """Write a portrait, whole or not at all."""
-    with atomic_path(path) as temporary:
-        save_file(portrait_tensors(portrait), temporary)
-
-
-def load_portrait(path: Path) -> BakedPortrait:
-    """Read a portrait; raise InputError where the file is not one."""
-    try:
-        portrait = BakedPortrait(**load_file(path))
-    except Exception as error:  # safetensors raises its own kinds
-        raise InputError(f"{path}: not a portrait; bake it again ({type(error).__name__})") from None
-    if portrait.classes.shape[-1] != len(CLASSES):
-        raise InputError(f"{path}: a portrait of another version; bake it again")
-    return portrait

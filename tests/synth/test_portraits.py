@@ -1,14 +1,12 @@
 """Portraits shade as the bake renderer does, under any lights and appearance."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
-from facerf_cli.errors import InputError
 from facerf_cli.face.topology import GRID
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
@@ -21,10 +19,7 @@ from facerf_cli.synth.head.mesh import PARTS, joined, strandless
 from facerf_cli.synth.portraits import (
     BakedPortrait,
     bake_portrait,
-    load_portrait,
     photograph,
-    save_portrait,
-    visibility_of,
 )
 from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.subjects import Subject
@@ -140,32 +135,9 @@ def test_the_specular_share_is_what_gloss_adds(portrait: BakedPortrait) -> None:
     assert torch.allclose((shining - rest)[skin], added[skin], atol=1e-5)
 
 
-def test_visibility_by_light(portrait: BakedPortrait) -> None:
-    visible = visibility_of(portrait)
-    assert visible.shape == (24, SIDE_PX, SIDE_PX) and visible.min() >= 0 and visible.max() <= 1
-    photo = photograph(portrait, appearance(), weights(0))
-    skin = photo.classes[class_index("skin")] > 0.99
-    toward = torch.einsum("lc,chw->lhw", portrait.directions, photo.normals)
-    lit, away = toward > 0.3, toward < -0.1
-    assert visible[:, skin][lit[:, skin]].mean() > 0.9  # nothing but the board behind it is near the ball
-    assert visible[:, skin][away[:, skin]].max() < 0.1  # a pixel holds some normals
-
-
 def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: BakedPortrait) -> None:
     assert torch.allclose(portrait.landmarks_px[:68], torch.tensor([SIDE_PX / 2, SIDE_PX / 2]), atol=1e-3)
     ear = portrait.landmarks_px[68 + MORE_LANDMARKS.index(EAR)]
     assert portrait.landmarks_px[68:].isnan().all(1).sum() == len(MORE_LANDMARKS) - 1
     assert float(ear[1]) == pytest.approx(SIDE_PX / 2 - 0.02 / 0.14 * SIDE_PX, abs=0.05)
     assert torch.allclose(portrait.rotation, pose_to_rotation(-15, 0, 0) @ subject.head_to_world, atol=1e-6)
-
-
-def test_a_file_gives_the_same_portrait_and_another_is_refused(
-    portrait: BakedPortrait, tmp_path: Path
-) -> None:
-    path = tmp_path / "one.safetensors"
-    save_portrait(path, portrait)
-    again = load_portrait(path)
-    assert torch.equal(again.direct, portrait.direct) and again.side_px == SIDE_PX
-    path.write_bytes(b"something else")
-    with pytest.raises(InputError, match="not a portrait"):
-        load_portrait(path)
