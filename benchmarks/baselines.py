@@ -24,7 +24,7 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
-from facerf_cli.baselines.diffuse_sh import CHECKPOINT, explain_texture, load_diffuse_network
+from facerf_cli.baselines.diffuse_sh import explain_texture
 from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, load_pairs
@@ -33,7 +33,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.metrics import mean_interval, si_mse
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import explain, relight
 
 METHODS = ("field", "diffuse-sh", "diffuse-sh low-pass", "diffuse-sh unrefined", "specular-sh", "prt")
@@ -72,7 +72,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     dataset = read_dataset(required(given.dataset, "a prepared dataset", "--dataset"))
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     errors: dict[str, list[tuple[str, list[float], float]]] = defaultdict(list)
     for subject in dataset.splits[given.split]:
         person = Person(models.face, dataset, subject)
@@ -132,7 +132,7 @@ def explain_by(models: Models, head: Head, method: str) -> Explained:
     if method in get_args(Kind):
         return explain(models, head, cast(Kind, method))
     fine, refit = "low-pass" not in method, "unrefined" not in method
-    return explain_texture(load_diffuse_network(CHECKPOINT), head.face, fine, refit)
+    return explain_texture(SHIPPED_NETWORKS.diffuse_sh, head.face, fine, refit)
 
 
 if __name__ == "__main__":

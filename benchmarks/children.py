@@ -26,6 +26,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.segment import segment
@@ -164,13 +165,13 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
     photo = photograph(baked, subject.appearance, weights)
     image = photo.image / photo.image.mean((1, 2)).mean() * 0.18 + 0.25 * (1 - photo.alpha)
     display = to_display(image.permute(1, 2, 0).contiguous().numpy())
-    faces = faces_of(display)
+    faces = faces_of(SHIPPED_NETWORKS.parsing, display)
     shown = [display, display]
     scores = {"found": float(bool(faces))}
     if faces:
         face = max(faces, key=lambda one: one.area_px)
         everything, inner = distances(face.landmarks_px, baked.landmarks_px[:68].numpy())
-        found = segment(display, face.landmarks_px)
+        found = segment(SHIPPED_NETWORKS.parsing, display, face.landmarks_px)
         scores |= {"landmarks, all %": everything, "inner %": inner}
         scores["IoU matte"] = overlap(found.matte, photo.alpha.numpy())
         for name in ("skin", "hair", "ears"):

@@ -31,8 +31,9 @@ from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
 from facerf_cli.metrics import light_error_deg
-from facerf_cli.models import DEFAULT_CHECKPOINT, Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.files import SHIPPED
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.training.pretrained import load_features
@@ -41,7 +42,7 @@ TURNS_DEG = (0, 120)  # of each map
 SINGLE_LIGHTS, FILL = 6, 0.15  # FILL is the light in front, of a key light of about 1
 MEASURES = ("angle", "weights", "weights scaled", "SH", "SH scaled")
 RIG = rig_directions()
-LIGHT_FEATURES = DEFAULT_CHECKPOINT.with_name("light_features.safetensors")
+LIGHT_FEATURES = SHIPPED["light_features"]
 _MOVED_PX = 30.0  # from its place in the photo; further off, it is another face
 _Estimate = tuple[str, str, Tensor]  # what it was estimated from, by which method, weights [150, 3]
 
@@ -64,7 +65,7 @@ def main() -> None:
     given = parser.parse_args()
     torch.set_num_threads(1)
     lights = [*single_lights(given.seed), *map_lights(given.maps)][: given.lights]
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     features = load_features(LIGHT_FEATURES, "light_features") if given.refine else None
     rows: dict[tuple[str, str], list[dict[str, float]]] = {}
     for photo in photos(given.photos):
@@ -106,7 +107,7 @@ def estimates(
 ) -> Iterator[tuple[KnownLight, _Estimate]]:
     """Relight a photo by each light and yield what is estimated back, from the texture and from a PNG."""
     photo = read_image(path).pixels
-    landmarks_px = find_faces(photo, str(path))[0].landmarks_px
+    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
     composition = Composition(models.face, photo, head)
     weights = torch.stack([light.weights for light in lights])
@@ -119,7 +120,7 @@ def estimates(
         ev = composition.auto_exposure_ev(relit.texture)
         image = composition.image(rig_light, relit)
         relit_photo = through_png(composition.exposed(rig_light, relit, image, ev))
-        seen_px = find_faces(relit_photo, light.name)[0].landmarks_px
+        seen_px = find_faces(SHIPPED_NETWORKS.parsing, relit_photo, light.name)[0].landmarks_px
         if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
             print(f"PNG {path.stem} {light.name}: left out, another face was detected")
             continue

@@ -24,7 +24,7 @@ from facerf_cli.face.landmarks import Face
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import regress_head
 from facerf_cli.portrait.find import find_faces
 
@@ -42,7 +42,7 @@ def main() -> None:
     places, moves, errors = [], [], []
     for name, photo in images(photos(given.photos), given.dataset):
         try:
-            faces = find_faces(photo, name, "all")
+            faces = find_faces(SHIPPED_NETWORKS.parsing, photo, name, "all")
         except InputError as error:
             print(error)
             continue

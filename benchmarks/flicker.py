@@ -30,7 +30,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 from _common import arguments, print_header, print_row
 from _film_of_photo import frames_of
 from PIL import Image
@@ -59,7 +58,7 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight each frame as a photo."""
     results = []
     for frame in frames:
-        face = pipeline.find_for("landmarks", frame, "frame")[0]
+        face = pipeline.find_for(models.networks.parsing, "landmarks", frame, "frame")[0]
         results.append(relit(models, frame, pipeline.head_of(models, frame, face)))
     return results
 
@@ -231,7 +230,7 @@ def main() -> None:
     parser.add_argument("--film", type=Path)
     parser.add_argument("--sheet")
     given = parser.parse_args()
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     if given.film:
         measure_film(given.film, given.frames, models)
         return

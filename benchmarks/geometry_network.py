@@ -28,7 +28,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.models import load_models
+from facerf_cli.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
@@ -119,7 +119,7 @@ def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
     crops, landmarks = [], []
     for path in paths:
         photo = read_image(path).pixels
-        landmarks_px = find_faces(photo, str(path))[0].landmarks_px
+        landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px
         crop = from_landmarks(landmarks_px, CROP_PX)
         crops.append(torch.from_numpy(crop.apply(photo)).permute(2, 0, 1))
         landmarks.append(torch.from_numpy(crop.to_crop(landmarks_px)).float())

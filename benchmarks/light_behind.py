@@ -19,7 +19,7 @@ from torch import Tensor
 
 from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import LightEvidence, estimate_signed_weights, estimate_smooth_weights
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import estimate_light, fit_photo
 from facerf_cli.portrait.find import find_faces
 
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("photos", type=Path, nargs="*", help="photos, or folders of them")
     given = parser.parse_args()
     torch.set_num_threads(1)
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     print_header("photo", "by", "lights behind", "zero behind", "of all", "roughness behind", "of all")
     for path in photos(given.photos):
         evidence = evidence_of(models, path)
@@ -50,7 +50,7 @@ def main() -> None:
 def evidence_of(models: Models, path: Path) -> LightEvidence:
     """Fit the largest face of a photo and predict it under the single lights of the rig."""
     photo = read_image(path).pixels
-    head = fit_photo(models, photo, find_faces(photo, str(path))[0].landmarks_px)
+    head = fit_photo(models, photo, find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px)
     return estimate_light(models, head).evidence
 
 

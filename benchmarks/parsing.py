@@ -36,9 +36,9 @@ from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
-from facerf_cli.portrait.parse import parsing_network
 from facerf_cli.portrait.segment import segment
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
@@ -104,7 +104,7 @@ def measure_yale_b(folder: Path, every: int) -> None:
             if index % every and flash != frontal:
                 continue
             image = _displayed(database.image(subject, flash))
-            own, other = faces_of(image), detect_landmarks(image)
+            own, other = faces_of(SHIPPED_NETWORKS.parsing, image), detect_landmarks(image)
             angle = flash.angle_deg
             bin_ = next(f"{a}-{b} deg" for a, b in pairwise(ANGLES_DEG) if angle < b)
             counts[bin_] += np.array([1, bool(own), bool(other)])
@@ -138,7 +138,7 @@ def measure_photos(folder: Path) -> None:
     """Print distances on the photos of a folder."""
     for path in sorted(folder.iterdir()):
         image = to_display(read_image(path).pixels)
-        own, other = faces_of(image), detect_landmarks(image)
+        own, other = faces_of(SHIPPED_NETWORKS.parsing, image), detect_landmarks(image)
         print(f"{path.name}: facerf {len(own)} faces, dlib {len(other)}", end="")
         for face in own:
             near = min(
@@ -175,11 +175,13 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
         for path in sorted(folder.glob(f"{subject}_P00*{drawn['reference']}*")):
             grey = np.asarray(Image.open(path).convert("L"), np.float32) / 255
             image = _displayed(grey)
-            faces = faces_of(image)
+            faces = faces_of(SHIPPED_NETWORKS.parsing, image)
             if not faces:
                 print(f"{path.name}: no face found")
                 continue
-            found = segment(image, max(faces, key=lambda face: face.area_px).landmarks_px)
+            found = segment(
+                SHIPPED_NETWORKS.parsing, image, max(faces, key=lambda face: face.area_px).landmarks_px
+            )
             shares = {name: sum(found.layer(of) for of in classes) for name, classes in REGIONS.items()}
             for name, mask in outlines(drawn, (image.shape[1], image.shape[0])):
                 got = {of: float((share[mask] > 0.5).mean()) for of, share in shares.items()}
@@ -204,7 +206,7 @@ def _matte_errors(found: np.ndarray, crop: PortraitCrops) -> tuple[float, float]
 def measure_held_out(folder: Path) -> None:
     """Print IoU and F1 by class and errors of the matte on crops of held-out synthetic people."""
     portraits = _held_out(folder)
-    network, counts = parsing_network(), np.zeros((len(CLASSES), 3))
+    network, counts = SHIPPED_NETWORKS.parsing, np.zeros((len(CLASSES), 3))
     matte_errors, error_percent = [], []
     for person in range(len(portraits.paths)):
         for draw in range(8):
@@ -251,7 +253,9 @@ def measure_segment(folder: Path) -> None:
             if not (crop.present[0] and crop.known[0, :68].all()):
                 continue
             image = (255 * crop.crops[0].permute(1, 2, 0)).round().byte().numpy()
-            found = segment(image, SEGMENT_PX * crop.landmarks[0, :68].numpy()).matte
+            found = segment(
+                SHIPPED_NETWORKS.parsing, image, SEGMENT_PX * crop.landmarks[0, :68].numpy()
+            ).matte
             errors.append(_matte_errors(found, crop))
     sad, gradient = np.mean(errors, 0) * (256 / SEGMENT_PX) ** 2
     print(f"held-out matte of segment: SAD {sad:.3f}, gradient {gradient:.4f} ({len(errors)} photos)")
@@ -261,8 +265,10 @@ def measure_speed() -> None:
     """Print seconds of one core at 1024 x 1024."""
     photo = (255 * resize(skimage.data.astronaut(), (1024, 1024))).astype(np.uint8)
     steps = {
-        "facerf, boxes and landmarks": lambda: faces_of(photo),
-        "facerf, classes and matte": lambda: segment(photo, faces_of(photo)[0].landmarks_px),
+        "facerf, boxes and landmarks": lambda: faces_of(SHIPPED_NETWORKS.parsing, photo),
+        "facerf, classes and matte": lambda: segment(
+            SHIPPED_NETWORKS.parsing, photo, faces_of(SHIPPED_NETWORKS.parsing, photo)[0].landmarks_px
+        ),
         "dlib, boxes and landmarks": lambda: detect_landmarks(photo),
     }
     for name, step in steps.items():

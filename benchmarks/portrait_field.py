@@ -22,12 +22,12 @@ from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait_field import PortraitField, portrait_network
+from facerf_cli.portrait_field import PortraitField
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.bank.transport import load_view
 from facerf_cli.synth.portraits import images_under
@@ -53,7 +53,7 @@ def main() -> None:
     parser.add_argument("--sheet", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     print_speed(models)
     bank = required(options.bank, "a bank of portraits", "--bank")
     with torch.no_grad():
@@ -77,7 +77,7 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
         wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
         photo = (source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
         try:
-            head = head_of(models, photo, find_for("landmarks", photo, path.name)[0])
+            head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, path.name)[0])
         except InputError:
             lost += 1
             continue
@@ -128,13 +128,13 @@ def _ssim(image: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:
 def print_speed(models: Models) -> None:
     """Print times in forward passes, and how well a photo comes back under its own light."""
     photo = read_image(ASTRONAUT).pixels
-    head = head_of(models, photo, find_for("landmarks", photo, "astronaut")[0])
+    head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, "astronaut")[0])
     field = reflectance_of(models, head, "portrait", photo=photo)
     assert isinstance(field, PortraitField)
     rig = rig_directions(150)
     summary = rig_directions(48)
     inputs = field.person.inputs(summary, field.person.visibility(summary))
-    network, weights = portrait_network(), torch.ones(1, 150, 3)
+    network, weights = SHIPPED_NETWORKS.portrait, torch.ones(1, 150, 3)
     ways = {"a forward pass": lambda: network(inputs), "150 lights": lambda: field.lit(rig, weights)}
     times, _ = best_s(ways, 3)
     print(", ".join(f"{name} {seconds:.3f} s" for name, seconds in times.items()), end="; ")

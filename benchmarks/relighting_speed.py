@@ -43,7 +43,9 @@ def main() -> None:
     parser.add_argument("--checkpoint", type=Path, help="default: the shipped one")
     parser.add_argument("--device", default="cpu", help="of the network")
     given = parser.parse_args()
-    models = load_models(given.checkpoint, "builtin", torch.device(given.device))
+    models = load_models(
+        [given.checkpoint] if given.checkpoint else (), "builtin", torch.device(given.device)
+    )
     print(f"{torch.get_num_threads()} threads, {given.device}, {given.lights} lights, {given.side} px")
     rig = rig_directions(given.lights)
     report_olats(models, mean_face(models, given.side), rig)
@@ -76,7 +78,8 @@ def mean_face(models: Models, side: int) -> FaceTexture:
 def report_second_map(models: Models, rig: Tensor, side: int) -> None:
     """Print what one more envmap costs once one is shown, and what a new prediction costs."""
     photo = read_image(ASTRONAUT).pixels
-    head = fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px, models.sides(side))
+    face = find_faces(models.networks.parsing, photo, "astronaut")[0]
+    head = fit_photo(models, photo, face.landmarks_px, models.sides(side))
     reflectance, composition = reflectance_of(models, head), Composition(models.face, photo, head)
     maps = [
         torch.from_numpy(read_image(path).pixels)

@@ -44,7 +44,7 @@ def main() -> None:
     options = parser.parse_args()
     bank = required(options.bank, "a bank of portraits", "--bank")
     view = load_view(min(bank.glob("[0-9]*_0.safetensors")))
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     looks = [
         materials_of(view.portrait, draw_appearance(LOOK_PX, seeded(SEED, number)))
         for number in range(options.drawn)
@@ -88,7 +88,7 @@ def measured(
     wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
-    head = head_of(models, photo, find_for("landmarks", photo, "the photo")[0])
+    head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, "the photo")[0])
     reflectance = reflectance_of(models, head, "portrait", photo=photo)
     composition = composition_of(models, photo, head, reflectance, Target(background="none"))
     shown = {}

@@ -27,7 +27,7 @@ from large_photos import enlarged
 from facerf_cli.colour import srgb_to_linear
 from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import load_models
+from facerf_cli.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 
@@ -38,8 +38,8 @@ import torch
 from facerf_cli.network import checkpoint
 if {naive}:
     checkpoint._Unfilled.__torch_function__ = lambda self, f, _, args=(), kw=None: f(*args, **(kw or {{}}))
-from facerf_cli.models import load_models
-load_models(None, "builtin", torch.device("cpu"))
+from facerf_cli.models import SHIPPED_NETWORKS, load_models
+load_models()
 """
 
 
@@ -81,9 +81,11 @@ def as_floats(path: Path) -> np.ndarray:
 
 def astronaut_person() -> SeenPerson:
     """The person of the example photo."""
-    models, photo = load_models(None, "builtin", torch.device("cpu")), read_image(ASTRONAUT).pixels
-    head = head_of(models, photo, find_for(models.default_geometry, photo, "the example")[0])
-    return look_at_person(models.face, photo, head.fit)
+    models, photo = load_models(), read_image(ASTRONAUT).pixels
+    head = head_of(
+        models, photo, find_for(models.networks.parsing, models.default_geometry, photo, "the example")[0]
+    )
+    return look_at_person(SHIPPED_NETWORKS.parsing, models.face, photo, head.fit)
 
 
 def shadows(person: SeenPerson, rig: torch.Tensor, at_once: int) -> None:

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 
 HERE = Path(__file__).parent
@@ -23,7 +24,9 @@ MARGIN = 0.08  # in sides of the face's crop
 
 def sheet(photo: Path) -> np.ndarray:
     """The presets, three in a row [2 cells, 3 cells, 3], linear, over black."""
-    face = from_landmarks(find_faces(read_image(photo).pixels, str(photo))[0].landmarks_px, CELL_PX)
+    face = from_landmarks(
+        find_faces(SHIPPED_NETWORKS.parsing, read_image(photo).pixels, str(photo))[0].landmarks_px, CELL_PX
+    )
     room = MARGIN * face.side_px
     frame = Crop(face.x0_px - room, face.y0_px - room, face.side_px + 2 * room, CELL_PX)
     with tempfile.TemporaryDirectory() as folder:

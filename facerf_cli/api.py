@@ -4,6 +4,7 @@ Images are scene-linear Rec.709, float32 [H, W, 3]; angles in degrees; the units
 command line (docs/design.md).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,8 +24,9 @@ from facerf_cli.files import images
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import Models
+from facerf_cli.models import SHIPPED_NETWORKS, Models
 from facerf_cli.models import load_models as load
+from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
@@ -104,22 +106,31 @@ def write_image(path: str | Path, pixels: np.ndarray, exposure: float | Literal[
 
 
 def load_models(
-    checkpoint: str | Path | None = None, face_model: str | Path = "builtin", device: str = "cpu"
+    checkpoint: str | Path | Sequence[str | Path] | None = None,
+    face_model: str | Path = "builtin",
+    device: str = "cpu",
 ) -> Models:
-    """Load networks (None: the shipped checkpoint) and a face model; `device` is cpu, cuda or mps."""
-    return load(None if checkpoint is None else Path(checkpoint), face_model, torch.device(device))
+    """Load networks (None: the shipped ones) and a face model; `device` is cpu, cuda or mps.
+
+    Of several checkpoints, or runs' folders, each serves the networks that its last training trained.
+    """
+    given = [checkpoint] if isinstance(checkpoint, (str, Path)) else checkpoint or ()
+    return load([checkpoint_file(Path(path)) for path in given], face_model, torch.device(device))
 
 
-def segment(photo: np.ndarray, landmarks_px: np.ndarray | None = None) -> dict[str, np.ndarray]:
+def segment(
+    photo: np.ndarray, landmarks_px: np.ndarray | None = None, models: Models | None = None
+) -> dict[str, np.ndarray]:
     """Segment the person with the largest face of a photo [H, W, 3], or the one with landmarks [68, 2].
 
     Returns layers [H, W] in 0..1: 'person.A', the matte, and 'class.hair', 'class.skin' and so on, which sum
     to it. Raises InputError where no face is found.
     """
     photo = _checked(photo)
+    parsing = (models.networks if models else SHIPPED_NETWORKS).parsing
     if landmarks_px is None:
-        landmarks_px = find_faces(photo, "photo")[0].landmarks_px
-    found = segment_image(to_display(photo), check_landmarks(landmarks_px))
+        landmarks_px = find_faces(parsing, photo, "photo")[0].landmarks_px
+    found = segment_image(parsing, to_display(photo), check_landmarks(landmarks_px))
     return {"person.A": found.matte, **filled(found.layers(), *found.matte.shape)}
 
 
@@ -142,7 +153,7 @@ def fit_photo(
         if geometry == "network":
             raise UsageError("geometry: 'network' uses no landmarks; leave one out")
         return pipeline.fit_photo(models, photo, landmarks_px, sides)
-    face = pipeline.find_for(geometry or models.default_geometry, photo, "photo")[0]
+    face = pipeline.find_for(models.networks.parsing, geometry or models.default_geometry, photo, "photo")[0]
     return pipeline.head_of(models, photo, face, sides)
 
 

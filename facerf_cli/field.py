@@ -7,7 +7,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.errors import UsageError
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
@@ -62,12 +61,7 @@ class Field:
 
     @property
     def _network(self) -> ReflectanceNetwork:
-        if self.models.network is None:
-            raise UsageError(
-                f"{self.models.checkpoint_name}: a checkpoint without a Reflectance Network, which the field "
-                "needs; give --reflectance diffuse-sh with it, or another --checkpoint"
-            )
-        return self.models.network
+        return self.models.networks.reflectance
 
     def _batch(self, lights: int) -> int:
         """Lights that are decoded at once."""

@@ -35,9 +35,11 @@ from facerf_cli.cli.options import (
     DeviceName,
     Settings,
     unwrapped,
+    was_given,
     with_groups,
     with_machines,
 )
+from facerf_cli.cli.photo_options import FITTING, NETWORKS, networks_of
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
@@ -62,6 +64,18 @@ VERBS: dict[str, tuple[Callable[..., Any], ...]] = {
 GROUPS: dict[str, tuple[typer.Typer, str]] = {
     "evaluate": (evaluate.app, _DATA),
     "face-model": (face_model.app, _SETUP),
+}
+
+# The networks that verbs use; with some options they use fewer.
+_ALL = networks_of(NETWORKS) | {"light_features"}
+USES: dict[str, frozenset[str]] = {
+    "relight": _ALL,
+    "view": networks_of(["portrait"]),
+    "estimate-light": _ALL - {"portrait"},
+    "predict-olat": networks_of(["portrait"]),
+    "segment": frozenset({"parsing"}),
+    "fit-geometry": FITTING,
+    "evaluate": _ALL,
 }
 
 # Global options, which are moved before the verb wherever they stand.
@@ -105,11 +119,14 @@ def _global_options(
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr as JSON lines.")] = False,
     device: Annotated[DeviceName, typer.Option(help="Compute on this device.")] = Settings.device,
     checkpoint: Annotated[
-        Path | None,
+        list[Path],
         typer.Option(
-            metavar="FILE", help="Load trained networks (.safetensors).", show_default="the shipped one"
+            metavar="FILE|RUN",
+            help="Use the networks of a checkpoint (.safetensors), or of the best one in a run's folder. "
+            "Repeatable: each file counts for the networks that it was trained for.",
+            show_default="the shipped ones",
         ),
-    ] = Settings.checkpoint,
+    ] = [],  # noqa: B006 (typer copies it)
     seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = Settings.seed,
     memory_gb: Annotated[
         float | None,
@@ -148,8 +165,34 @@ def _global_options(
     if memory_gb is not None and not math.isfinite(memory_gb):
         raise UsageError(f"--memory {memory_gb}: not a size; give a number of GB")
     limit_bytes = None if memory_gb is None else int(memory_gb * 2**30)
-    context.obj = Settings(verbosity, log_json, device, checkpoint, seed, null, memory_bytes=limit_bytes)
+    context.obj = Settings(
+        verbosity,
+        log_json,
+        device,
+        _checkpoints(context, checkpoint),
+        not was_given(context, "checkpoint"),
+        seed,
+        null,
+        memory_bytes=limit_bytes,
+    )
     memory.set_limit(context.obj.job_bytes(1))
+
+
+def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, ...]:
+    """The files of `--checkpoint`; raises UsageError for one that serves no network of the verb.
+
+    A configuration file is for all verbs, so that what it names may serve others.
+    """
+    if not given:
+        return ()
+    from facerf_cli.network.files import checkpoint_file, serving_files
+
+    files, verb = tuple(map(checkpoint_file, given)), context.invoked_subcommand or ""
+    if was_given(context, "checkpoint"):
+        if verb not in ("doctor", "config"):  # which show what is wrong
+            serving_files(files, USES.get(verb, ()), f"facerf {verb}")
+        return files
+    return files if verb in USES else ()
 
 
 for _panel, _verbs in VERBS.items():

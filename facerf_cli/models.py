@@ -1,6 +1,8 @@
-"""The face model and the trained networks that the pipeline needs, loaded from a checkpoint."""
+"""The face model and every trained network, on its device, from the shipped file or the user's."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +13,22 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.downloads import file_sha256
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.network.files import SHIPPED, read_metadata, serving_files
+from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.inputs import SourceColours
+from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.parse import LANDMARKS
 
 TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: by default, and at most
+_CPU = torch.device("cpu")
 CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
-NO_GEOMETRY_NETWORK = (
-    "a checkpoint without a Geometry Network, which --geometry network needs; give --geometry landmarks, or "
-    "another --checkpoint"
-)
-DEFAULT_CHECKPOINT = Path(__file__).parent / "assets" / "default.safetensors"
 
 
 @dataclass(frozen=True)
@@ -33,23 +39,98 @@ class Sides:
     crop_px: int
 
 
+class Networks:
+    """The trained networks, each loaded when it is first needed, and kept on the device."""
+
+    def __init__(
+        self,
+        files: Mapping[str, Path] = SHIPPED,
+        device: torch.device = _CPU,
+        given: Mapping[str, nn.Module] | None = None,
+    ) -> None:
+        self.files, self.device = dict(files), device
+        self._loaded: dict[str, Any] = dict(given or {})
+
+    @property
+    def reflectance(self) -> ReflectanceNetwork:
+        """The Reflectance Network."""
+        return self._get("reflectance")
+
+    @property
+    def geometry(self) -> nn.Module:
+        """The Geometry Network."""
+        return self._get("geometry")
+
+    @property
+    def diffuse_sh(self) -> DiffuseNetwork:
+        """The network of the baseline diffuse-sh."""
+        return self._get("diffuse_sh")
+
+    @property
+    def light_features(self) -> LightNetwork:
+        """The feature network S_f, frozen."""
+        return self._get("light_features")
+
+    @property
+    def parsing(self) -> ParsingNetwork:
+        """The Parsing Network."""
+        return self._get("parsing")
+
+    @property
+    def portrait(self) -> PortraitNetwork:
+        """The Portrait Network."""
+        return self._get("portrait")
+
+    def load(self, names: Iterable[str]) -> None:
+        """Load networks by name; raises InputError for a file that is damaged or of another version."""
+        for name in names:
+            self._get(name)
+
+    def with_networks(self, **networks: nn.Module) -> "Networks":
+        """Return the same networks with others in place of some."""
+        return Networks(self.files, self.device, {**self._loaded, **networks})
+
+    def served(self) -> dict[str, dict[str, str]]:
+        """File and SHA-256 of each network that was needed so far, for reports."""
+        names = [name for name in SHIPPED if name in self._loaded]
+        return {name: described_file(self.files[name]) for name in names}
+
+    def _get(self, name: str) -> Any:
+        if name not in self._loaded:
+            path = self.files[name]
+            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
+            if name in _CHECKS:
+                _CHECKS[name](path, network)
+            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
+        return self._loaded[name]
+
+
+SHIPPED_NETWORKS = Networks()  # on the CPU; a verb's own are in its Models
+
+
 @dataclass(frozen=True)
 class Models:
-    """The face model, on the CPU as all geometry is, and the trained networks on `device`.
-
-    A network is None where the checkpoint does not hold it.
-    """
+    """The face model, on the CPU as all geometry is, and the trained networks on their device."""
 
     face: MorphableModel
-    network: ReflectanceNetwork | None
-    geometry: nn.Module | None  # the Geometry Network
-    diffuse: DiffuseNetwork | None  # the network of the baseline diffuse-sh
-    checkpoint_name: str
-    metadata: dict[str, Any]
-    device: torch.device
+    networks: Networks
     trained_sides: Sides = Sides(TEXTURE_SIDE, CROP_PER_TEXTURE * TEXTURE_SIDE)  # or the default ones
     default_geometry: Geometry = "landmarks"  # "network" if both networks were trained together
     source_colours: SourceColours | None = None  # of the network's training; None: no cast is removed
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the networks."""
+        return self.networks.device
+
+    @property
+    def checkpoint_name(self) -> str:
+        """Name of the Reflectance Network's file."""
+        return self.networks.files["reflectance"].stem
+
+    def with_networks(self, **networks: nn.Module) -> "Models":
+        """Return the same models with other networks in place of some."""
+        return replace(self, networks=self.networks.with_networks(**networks))
 
     def sides(self, texture_side: int | None = None) -> Sides:
         """The sides that the networks were trained on; or a texture's, with a crop in the same proportion."""
@@ -59,26 +140,22 @@ class Models:
         return Sides(texture_side, round(texture_side * trained.crop_px / trained.texture))
 
 
-def load_models(checkpoint: Path | None, face_model: str | Path, device: torch.device) -> Models:
-    """Load a checkpoint (None: the shipped one) and a face model (its name or file).
+def load_models(
+    checkpoints: Sequence[Path] = (),
+    face_model: str | Path = BUILTIN,
+    device: torch.device = _CPU,
+) -> Models:
+    """Load a face model (its name or file); the networks of checkpoints, else the shipped ones, follow.
 
-    Raises InputError where the checkpoint holds no network that relights, or fits another face model.
+    A network is loaded when it is first needed. Raises InputError for what is no checkpoint.
     """
-    path = checkpoint or DEFAULT_CHECKPOINT
-    networks, metadata = load_networks(path, LAYOUT_VERSION)
-    if not networks.keys() & {"reflectance", "diffuse_sh"}:
-        raise InputError(f"{path}: holds no Reflectance Network; give a checkpoint of `facerf train`")
-    _require_builtin_coefficients(path, networks.get("geometry"))
+    files = serving_files(checkpoints, user="facerf")
+    path = files["reflectance"]
+    metadata = read_metadata(path)
     side = _side(path, metadata, "texture_side", TEXTURE_SIDE)
-    on_device: Any = {name: network.to(device).eval() for name, network in networks.items()}
     return Models(
         face=load_face_model(face_model),
-        network=on_device.get("reflectance"),
-        geometry=on_device.get("geometry"),
-        diffuse=on_device.get("diffuse_sh"),
-        checkpoint_name=path.stem,
-        metadata=metadata,
-        device=device,
+        networks=Networks(files, device),
         trained_sides=Sides(side, _side(path, metadata, "crop_px", CROP_PER_TEXTURE * side)),
         default_geometry=default_geometry(metadata),
         source_colours=_source_colours(path, metadata),
@@ -106,10 +183,27 @@ def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | Non
         raise InputError(f"{path}: invalid source_colours in its metadata; train it again") from None
 
 
-def _require_builtin_coefficients(path: Path, geometry: Any) -> None:
+def _require_builtin_coefficients(path: Path, geometry: GeometryNetwork) -> None:
     """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
-    if geometry is None:
-        return
     model, settings = load_face_model(BUILTIN), geometry.settings
     if settings.identity > len(model.identity) or settings.expression > len(model.expression):
         raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
+
+
+def _require_these_classes(path: Path, parsing: ParsingNetwork) -> None:
+    """Raise InputError where a Parsing Network knows other classes or landmarks than this version."""
+    settings = parsing.settings
+    if (settings.classes, settings.landmarks) != (len(CLASSES), LANDMARKS):
+        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
+
+
+_CHECKS: dict[str, Callable[[Path, Any], None]] = {
+    "geometry": _require_builtin_coefficients,
+    "parsing": _require_these_classes,
+}
+
+
+@cache
+def described_file(path: Path) -> dict[str, str]:
+    """Path and SHA-256 of a checkpoint, for reports; of a shipped one the name alone."""
+    return {"file": path.name if path in SHIPPED.values() else str(path), "sha256": file_sha256(path)}

@@ -37,10 +37,11 @@ from facerf_cli.field import (
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import NearLights
-from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, Sides
+from facerf_cli.models import Models, Sides
 from facerf_cli.near_textures import near_texture
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.own_light import own_light, photo_quotient
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
 from facerf_cli.portrait.occluders import uncovered
@@ -76,14 +77,12 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
     sides = sides or models.sides()
     crop = from_box(box_px, sides.crop_px)
     cropped = crop.apply(photo)
-    regressed = regress_head(models, cropped)
-    if regressed is None:
-        raise UsageError(f"{models.checkpoint_name}: {NO_GEOMETRY_NETWORK}")
-    fit = regressed_fit(models.face, regressed, crop)
+    fit = regressed_fit(models.face, regress_head(models, cropped), crop)
     return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
 
 
 def find_for(
+    parsing: ParsingNetwork,
     geometry: Geometry,
     photo: np.ndarray,
     name: str,
@@ -94,7 +93,7 @@ def find_for(
 
     `which` is largest, all or an index. Raises InputError, with the photo's name, where no face is found.
     """
-    faces = find_faces(photo, name, which, landmarks_from)
+    faces = find_faces(parsing, photo, name, which, landmarks_from)
     return [face.box for face in faces] if geometry == "network" else faces
 
 
@@ -113,12 +112,10 @@ def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | Non
 
 
 @torch.no_grad()
-def regress_head(models: Models, cropped: np.ndarray) -> FitStart | None:
-    """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network; None without one."""
-    if models.geometry is None:
-        return None
+def regress_head(models: Models, cropped: np.ndarray) -> FitStart:
+    """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network."""
     image = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
-    return FitStart(*(tensor.cpu() for tensor in models.geometry(image)))
+    return FitStart(*(tensor.cpu() for tensor in models.networks.geometry(image)))
 
 
 def reflectance_of(
@@ -147,8 +144,8 @@ def reflectance_of(
         return field
     if steady and steady.portrait:
         return PortraitField.of(models.face, head, field, own, *steady.portrait)
-    person = look_at_person(models.face, photo, head.fit)
-    return PortraitField.of(models.face, head, field, own, person, maps_of(person))
+    person = look_at_person(models.networks.parsing, models.face, photo, head.fit)
+    return PortraitField.of(models.face, head, field, own, person, maps_of(models.networks.portrait, person))
 
 
 def composition_of(
@@ -164,7 +161,7 @@ def composition_of(
     person = WholePerson(photo, reflectance) if isinstance(reflectance, PortraitField) else None
     matte = target.matte
     if matte is None:
-        matte = person.matte if person else person_matte(photo, head)
+        matte = person.matte if person else person_matte(models, photo, head)
     if target.alpha is not None:
         matte = matte * target.alpha
     return Composition(models.face, photo, head, replace(target, matte=matte), person)
@@ -269,15 +266,20 @@ def estimate_light(
     weights = joined(frames).least_squares(estimator.non_negative)
     if features is None:
         return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
+
+    def layers(x: Tensor) -> list[Tensor]:
+        return [layer.cpu() for layer in features.layers((x / exposure).to(models.device))]
+
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
-    refined = refine_light(evidence, weights, lambda x: features.layers(x / exposure), estimator.non_negative)
+    refined = refine_light(evidence, weights, layers, estimator.non_negative)
     light = RigLight(rig, refined.weights)
     return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
 
 
-def person_matte(photo: np.ndarray, head: Head) -> np.ndarray:
+def person_matte(models: Models, photo: np.ndarray, head: Head) -> np.ndarray:
     """Matte [H, W] of the person whose head was fitted in a photo."""
-    return segment(to_display(photo), head.fit.crop.to_photo(head.landmarks_px)).matte
+    landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
+    return segment(models.networks.parsing, to_display(photo), landmarks_px).matte
 
 
 def relight(

@@ -9,22 +9,18 @@ photo back.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.errors import InputError
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv
+from facerf_cli.face.topology import grid_uv
 from facerf_cli.field import Field
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
-from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.inputs import is_grey
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.own_light import OwnLight
@@ -36,7 +32,6 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 
-SHIPPED = Path(__file__).parent / "assets" / "portrait.safetensors"
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
@@ -198,14 +193,17 @@ class PortraitField:
 
 
 @torch.no_grad()
-def maps_of(person: SeenPerson) -> PortraitMaps:
+def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """The light transport of a person, as the Portrait Network sees it.
 
     It is the mean of the network's maps and of those that it sees in a mirror, whose errors differ.
     """
-    rig, network = rig_directions(_SUMMARY_LIGHTS), portrait_network()
+    rig = rig_directions(_SUMMARY_LIGHTS)
     inputs = person.inputs(rig, person.visibility(rig))
-    maps = network(inputs).averaged(network(inputs.mirrored()).mirrored())
+    device = next(network.parameters()).device
+    on_device = inputs.to(device)
+    both = network(on_device).averaged(network(on_device.mirrored()).mirrored())
+    maps = PortraitMaps(*(part.cpu() for part in both))
     maps = _with_clear_cloth(maps, inputs)
     return maps.without_colours() if is_grey(inputs.image[0]) else maps
 
@@ -229,12 +227,3 @@ def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> 
     side = head.face.texture.shape[-1]
     grid = round(len(grid_uv()) ** 0.5)
     return bake_attributes(places, grid, side).permute(1, 2, 0)
-
-
-@cache
-def portrait_network(path: Path = SHIPPED) -> PortraitNetwork:
-    """Load a Portrait Network, by default the shipped one; raises InputError where the file holds none."""
-    network = load_networks(path, LAYOUT_VERSION)[0].get("portrait")
-    if not isinstance(network, PortraitNetwork):
-        raise InputError(f"{path}: holds no Portrait Network of this version; train one, --stage portrait")
-    return network.eval()

@@ -14,7 +14,7 @@ from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import NearLights, far_samples
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField
@@ -30,9 +30,9 @@ class Person:
     """The astronaut, and what relights her."""
 
     def __init__(self) -> None:
-        self.models: Models = load_models(None, "builtin", torch.device("cpu"))
+        self.models: Models = load_models()
         self.photo = read_image(PHOTO).pixels
-        landmarks_px = find_faces(self.photo, "astronaut")[0].landmarks_px
+        landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, self.photo, "astronaut")[0].landmarks_px
         self.head: Head = fit_photo(self.models, self.photo, landmarks_px, self.models.sides(128))
         field = reflectance_of(self.models, self.head, "portrait", photo=self.photo)
         assert isinstance(field, PortraitField)

@@ -10,7 +10,7 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.field import Field, shrunk
 from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.own_light import light_of_frames, own_light
 from facerf_cli.pipeline import fit_photo
 from facerf_cli.portrait.find import find_faces
@@ -24,13 +24,13 @@ COLOUR = 0.25  # relative error of the lamp's colour: the photo shows it only ti
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models(None, "builtin", torch.device("cpu"))
+    return load_models()
 
 
 @pytest.fixture(scope="module")
 def face(models: Models) -> FaceTexture:
     photo = read_image(PHOTO).pixels
-    head = fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px)
+    head = fit_photo(models, photo, find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px)
     small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))
 

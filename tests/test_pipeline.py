@@ -15,7 +15,7 @@ from facerf_cli.field import photo_evidence, weighted_sum
 from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import estimate_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
 from facerf_cli.portrait.find import find_faces
@@ -26,7 +26,7 @@ PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models(None, "builtin", torch.device("cpu"))
+    return load_models()
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def photo() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def head(models: Models, photo: np.ndarray) -> Head:
-    landmarks_px = find_faces(photo, "astronaut")[0].landmarks_px
+    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px
     return fit_photo(models, photo, landmarks_px, models.sides(128))
 
 
@@ -148,7 +148,7 @@ def test_the_network_gets_what_the_paper_says(models: Models, head: Head) -> Non
     lit = replace(head, face=replace(face, texture=face.texture * blue))
     lights = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
     rotation = pose_to_rotation(40.0, 0.0, 0.0)
-    list(predict_olat(replace(models, network=network), lit, lights, rotation, network_alone=True))
+    list(predict_olat(models.with_networks(reflectance=network), lit, lights, rotation, network_alone=True))
     texture, normals, visible = network.encoded
     assert models.source_colours is not None
     cast = colour_cast(lit.face.texture[None], face.visible[None, None], models.source_colours)
@@ -163,7 +163,7 @@ def test_the_network_gets_what_the_paper_says(models: Models, head: Head) -> Non
 def test_without_colours_of_training_no_cast_is_removed(models: Models, head: Head) -> None:
     network = WritesDown()
     blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))
-    unknown = replace(models, network=network, source_colours=None)
+    unknown = replace(models.with_networks(reflectance=network), source_colours=None)
     list(predict_olat(unknown, replace(head, face=blue), rig_directions(4), network_alone=True))
     assert torch.equal(network.encoded[0], blue.texture[None])
 

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from facerf_cli.composite import Target
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import Models, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait_field import PortraitField, maps_of, portrait_network
+from facerf_cli.portrait_field import PortraitField, maps_of
 from facerf_cli.strips import filled, strips
 from facerf_cli.whole_person import WholePerson
 
@@ -29,7 +29,7 @@ PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models(None, "builtin", torch.device("cpu"))
+    return load_models()
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,12 @@ def photo() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def head(models: Models, photo: np.ndarray) -> Head:
-    return fit_photo(models, photo, find_faces(photo, "astronaut")[0].landmarks_px, models.sides(128))
+    return fit_photo(
+        models,
+        photo,
+        find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px,
+        models.sides(128),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +85,9 @@ def test_under_its_own_light_the_photo_comes_back(
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
-    head = fit_photo(models, grey, find_faces(grey, "grey")[0].landmarks_px, models.sides(64))
+    head = fit_photo(
+        models, grey, find_faces(SHIPPED_NETWORKS.parsing, grey, "grey")[0].landmarks_px, models.sides(64)
+    )
     field = reflectance_of(models, head, "portrait", photo=grey)
     image = relight(models, grey, head, lamp(60), Target(background="none"), field).pixels
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
@@ -93,7 +100,7 @@ def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more
     inputs = person.inputs(rig, person.visibility(rig))
     classes = torch.zeros_like(inputs.classes)
     classes[:, class_index(name)] = 1
-    maps = maps_of(cast(Any, Seen(replace(inputs, classes=classes))))
+    maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, classes=classes))))
     own = (inputs.image * maps.gain).mean(1, keepdim=True)
     assert (maps.bias > own + 1e-6).any() == may_be_more
 
@@ -101,7 +108,9 @@ def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
     rig = rig_directions(48)
     given = field.person.inputs(rig, field.person.visibility(rig))
-    seen, in_mirror = (maps_of(cast(Any, Seen(inputs))) for inputs in (given, given.mirrored()))
+    seen, in_mirror = (
+        maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(inputs))) for inputs in (given, given.mirrored())
+    )
     light, everywhere = azel_to_direction(50, 20)[None, None], torch.ones(1, 1, *seen.gain.shape[-2:])
     one, two = (maps.olats(light, everywhere) for maps in (seen, in_mirror.mirrored()))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3)  # rounding, through some 40 layers
@@ -215,10 +224,3 @@ def test_a_turned_head_is_the_fields(models: Models, head: Head, field: Portrait
     torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
     as_seen = field.relit(light.directions, light.weights[None])
     assert (as_seen - turned).abs().mean() > 1e-3
-
-
-def test_no_portrait_network(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such checkpoint"):
-        portrait_network(tmp_path / "none.safetensors")
-    with pytest.raises(InputError, match="--stage portrait"):
-        portrait_network(Path(__file__).parents[1] / "facerf_cli/assets/parsing.safetensors")

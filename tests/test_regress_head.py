@@ -9,14 +9,14 @@ import pytest
 import torch
 from torch import nn
 
-from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import from_box, from_landmarks
-from facerf_cli.face.landmarks import Face, FaceBox
+from facerf_cli.face.fit import fit_landmarks
+from facerf_cli.face.landmarks import Face
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.files.images import read_image
-from facerf_cli.models import Models, Sides, load_models
+from facerf_cli.models import SHIPPED_NETWORKS, Models, Sides, load_models
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.pipeline import find_for, fit_photo, head_of, regress_head, regress_photo
+from facerf_cli.pipeline import find_for, fit_photo, regress_head, regress_photo
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
@@ -26,7 +26,7 @@ PHOTO = np.full((300, 300, 3), 0.2, np.float32)
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models(None, "builtin", torch.device("cpu"))
+    return load_models()
 
 
 @pytest.fixture(scope="module")
@@ -35,18 +35,14 @@ def landmarks_px() -> np.ndarray:
     return project(turned + torch.tensor([0.0, 0.0, -1.2]), crop_camera(300)).double().numpy()
 
 
-def test_without_the_network_the_fit_starts_from_the_landmarks(models: Models) -> None:
-    assert regress_head(replace(models, geometry=None), PHOTO) is None
-
-
 def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: np.ndarray) -> None:
     torch.manual_seed(0)
-    seeing = replace(
-        models, geometry=GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval()
-    )
+    network = GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval()
+    seeing = models.with_networks(geometry=network)
     start = regress_head(seeing, from_landmarks(landmarks_px, 128).apply(PHOTO))
-    assert start and start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)
-    cold = fit_photo(replace(models, geometry=None), PHOTO, landmarks_px, SIDES).fit
+    assert start.rotation.shape == (1, 3, 3) and start.alpha.shape == (1, 3)
+    crop = from_landmarks(landmarks_px, SIDES.crop_px)
+    cold = fit_landmarks(models.face, crop.to_crop(landmarks_px), crop)
     warm = fit_photo(seeing, PHOTO, landmarks_px, SIDES).fit
     assert warm.error_iod == pytest.approx(cold.error_iod, abs=5e-4)
     moved_m = warm.vertices_camera(models.face) - cold.vertices_camera(models.face)
@@ -87,7 +83,7 @@ def vertices_of(models: Models, head: GeometryEstimate) -> torch.Tensor:
 
 def test_one_forward_pass_gives_the_head(models: Models) -> None:
     network = Knows(15.0)
-    head = regress_photo(replace(models, geometry=network), PHOTO, BOX, SIDES)
+    head = regress_photo(models.with_networks(geometry=network), PHOTO, BOX, SIDES)
     assert head.fit.crop == from_box(BOX, SIDES.crop_px) and head.cropped.shape == (128, 128, 3)
     wanted = vertices_of(models, network.head)
     torch.testing.assert_close(head.fit.vertices_camera(models.face), wanted)
@@ -99,7 +95,7 @@ def test_one_forward_pass_gives_the_head(models: Models) -> None:
 def test_another_network_gives_another_head(models: Models) -> None:
     """A fit to landmarks would undo the difference."""
     one, other = (
-        regress_photo(replace(models, geometry=Knows(yaw)), PHOTO, BOX, SIDES).fit for yaw in (0.0, 20.0)
+        regress_photo(models.with_networks(geometry=Knows(yaw)), PHOTO, BOX, SIDES).fit for yaw in (0.0, 20.0)
     )
     assert (one.rotation - other.rotation).abs().max() > 0.3
 
@@ -108,20 +104,15 @@ def test_another_face_model_gets_the_same_surface(models: Models) -> None:
     """The regressed coefficients are the built-in model's; vertices are matched by least squares."""
     network, face = Knows(15.0), models.face
     twice = replace(face, name="other", identity=2 * face.identity[:20], expression=face.expression[:12])
-    other = replace(models, geometry=network, face=twice)
+    other = replace(models.with_networks(geometry=network), face=twice)
     found = regress_photo(other, PHOTO, BOX, SIDES).fit.vertices_camera(twice)
     assert (found - vertices_of(models, network.head)).norm(dim=-1).max() < 1e-3
 
 
-def test_without_a_geometry_network_there_is_nothing_to_regress(models: Models) -> None:
-    with pytest.raises(UsageError, match="without a Geometry Network"):
-        head_of(replace(models, geometry=None), PHOTO, FaceBox(BOX, 1.0), SIDES)
-
-
 def test_a_box_gives_about_the_crop_of_its_landmarks() -> None:
     photo = read_image(ASTRONAUT).pixels
-    whole = find_faces(photo, "astronaut")[0]
-    box = find_for("network", photo, "astronaut")[0]
+    whole = find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0]
+    box = find_for(SHIPPED_NETWORKS.parsing, "network", photo, "astronaut")[0]
     assert not isinstance(box, Face) and box.box_px == whole.box_px and box.score == whole.score
     by_box, by_landmarks = from_box(box.box_px, 64), from_landmarks(whole.landmarks_px, 64)
     assert by_box.side_px == pytest.approx(by_landmarks.side_px, rel=0.15)

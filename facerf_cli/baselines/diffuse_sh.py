@@ -6,26 +6,19 @@ albedo. A face is the product of its albedo and shading: it has no highlights an
 
 import math
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
-from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sh import coefficients_to_rig, irradiance, rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.models import Models
-from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import COEFFICIENTS, ORDER, DiffuseNetwork, shading
 from facerf_cli.network.inputs import resize
 
-CHECKPOINT = Path(__file__).parents[1] / "assets" / "diffuse_sh.safetensors"
 _SEEN = 0.9  # visibility from which on a texel counts in the solution for the light
 _HOLD = 1e-4  # weight of the network's light, as a share of the evidence on a coefficient
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls
@@ -48,7 +41,7 @@ class Diffuse:
 
 def explain_by_diffuse_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
     """Estimate albedo and light by the models' network, or by the shipped one; `fit` is not used."""
-    return explain_texture(models.diffuse or load_diffuse_network(CHECKPOINT).to(models.device), face)
+    return explain_texture(models.networks.diffuse_sh, face)
 
 
 @torch.no_grad()
@@ -92,15 +85,3 @@ def refitted(reflectance: Diffuse, face: FaceTexture, coefficients: Tensor) -> T
             trust = (_OUTLIER * error.median() / error).clamp_max(1).square()
         found.append(light.float())
     return torch.stack(found, -1)
-
-
-@cache
-def load_diffuse_network(path: Path) -> DiffuseNetwork:
-    """Load the network from a checkpoint of `facerf train --stage diffuse-sh`; read once per process.
-
-    Raises InputError if the checkpoint holds no such network.
-    """
-    network: Any = load_networks(path, LAYOUT_VERSION)[0].get("diffuse_sh")
-    if not isinstance(network, DiffuseNetwork):
-        raise InputError(f"{path}: holds no diffuse network; give one by `facerf train --stage diffuse-sh`")
-    return network.eval()

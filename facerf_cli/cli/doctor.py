@@ -4,6 +4,7 @@ import platform
 import re
 import textwrap
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -121,8 +122,15 @@ def _rows(facts: Facts) -> Iterator[tuple[str, str, str]]:
     yield "device", "", f"{device['uses']}, {device['threads']} threads, {device['memory']} of memory"
     for row, (name, asset) in enumerate(facts["assets"].items()):
         yield "models" if row == 0 else "", name, _model(name, asset)
+    yield "networks", "", "  ".join(_served(facts["networks"]))
     yield "colour", "", f"OCIO configuration {facts['colour']['OCIO']}, {facts['colour']['spaces']} spaces"
     yield "cache", "", facts["cache"]["folder"]
+
+
+def _served(networks: Facts) -> Iterator[str]:
+    """The file that serves each network, with the first digits of its SHA-256."""
+    for name, file in networks.items():
+        yield _whole(f"{name.replace('_', '-')} {Path(file['file']).name} {file['sha256'][:8]}".strip())
 
 
 def _whole(text: str) -> str:

@@ -19,6 +19,7 @@ from facerf_cli.cli.options import (
     settings_of,
 )
 from facerf_cli.cli.photo_options import (
+    FITTING,
     FaceOption,
     GeometryOption,
     LandmarksFromOption,
@@ -104,7 +105,7 @@ def fit_geometry(
         options,
         photo.settings,
         OneRecipe(work),
-        prepare=photo.preparation(dry_run),
+        prepare=photo.preparation(dry_run, FITTING),
         name=name,
     )
     raise typer.Exit(code)

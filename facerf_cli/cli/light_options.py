@@ -8,7 +8,7 @@ import typer
 
 from facerf_cli.baselines import Kind
 from facerf_cli.cli.options import METHOD
-from facerf_cli.cli.photo_options import PhotoOptions, check_companion
+from facerf_cli.cli.photo_options import PhotoOptions, check_companion, networks_of
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
@@ -43,6 +43,12 @@ class LightOptions:
     vgg_weights: str | None = None
     keep_eyes: bool = False
     matte: Path | None = None
+
+    @property
+    def networks(self) -> frozenset[str]:
+        """Names of the networks that these options use."""
+        features = self.refine == "features" and self.vgg_weights is None
+        return networks_of([self.reflectance]) | (frozenset({"light_features"}) if features else frozenset())
 
     def check(self) -> None:
         """Raise UsageError for options that do not go together or would fail every photo."""

@@ -65,7 +65,8 @@ class Settings:
     verbosity: int = field(default=0, metadata=NOT_IN_RECIPE)  # -1 errors only, 0 notes, 1 everything
     log_json: bool = field(default=False, metadata=NOT_IN_RECIPE)
     device: DeviceName = field(default="auto", metadata=NOT_IN_RECIPE)
-    checkpoint: Path | None = None  # None: the one in assets/
+    checkpoints: tuple[Path, ...] = ()  # files; the networks that they lack are the shipped ones
+    checkpoints_by_default: bool = field(default=False, metadata=NOT_IN_RECIPE)  # of a configuration file
     seed: int = 0
     null_separated: bool = field(default=False, metadata=NOT_IN_RECIPE)  # names on standard input
     shard: Shard = field(default=Shard(), metadata=NOT_IN_RECIPE)

@@ -1,6 +1,6 @@
 """Options of every verb that reads photos: the face, its landmarks, the face model, the texture."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,6 +12,13 @@ from facerf_cli.cli.options import FACE, METHOD, Settings
 from facerf_cli.errors import UsageError
 
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
+FITTING = frozenset({"parsing", "geometry"})  # networks that find and fit faces
+# Networks of the reflectance models.
+NETWORKS = {
+    "field": frozenset({"reflectance"}),
+    "portrait": frozenset({"reflectance", "portrait"}),
+    "diffuse-sh": frozenset({"diffuse_sh"}),
+}
 
 FaceOption = Annotated[
     str,
@@ -92,13 +99,13 @@ class PhotoOptions:
             raise UsageError("--landmarks: --geometry network uses none; leave one out")
         check_companion(self.landmarks, "--landmarks")
 
-    def preparation(self, dry_run: bool) -> Callable[[], None]:
-        """A function that loads what every photo needs; in a dry run without the networks."""
+    def preparation(self, dry_run: bool, uses: Collection[str]) -> Callable[[], None]:
+        """A function that loads what every photo needs, in a dry run without the networks."""
 
         def prepare() -> None:
             from facerf_cli.cli.items.photos import prepare_photos
 
-            prepare_photos(self, with_networks=not dry_run)
+            prepare_photos(self, uses, with_networks=not dry_run)
 
         return prepare
 
@@ -110,6 +117,11 @@ class PhotoOptions:
         written last and mark the photo as finished.
         """
         return "_face0" if self.face == "all" else ""
+
+
+def networks_of(kinds: Iterable[str]) -> frozenset[str]:
+    """Names of the networks that reading photos by some reflectance models uses."""
+    return FITTING.union(*(NETWORKS.get(kind, ()) for kind in kinds))
 
 
 def check_companion(given: Path | None, option: str) -> None:

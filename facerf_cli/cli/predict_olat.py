@@ -30,6 +30,7 @@ from facerf_cli.cli.photo_options import (
     LandmarksOption,
     PhotoOptions,
     TextureSizeOption,
+    networks_of,
 )
 from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.cli.report import Outcome
@@ -170,6 +171,7 @@ def predict_olat(
         )
     work = PredictOlat(photo, lights, pose, chosen, size, network_alone, precision, format_, page)
     options = BatchOptions(output, overwrite, dry_run, jobs)
+    kinds = ["portrait" if page or chosen == "photo" else "field"]
     code = run_batch(
         "predict-olat",
         inputs,
@@ -178,7 +180,7 @@ def predict_olat(
         options,
         settings,
         OneRecipe(work),
-        prepare=photo.preparation(dry_run),
+        prepare=photo.preparation(dry_run, networks_of(kinds)),
         name=name,
     )
     raise typer.Exit(code)

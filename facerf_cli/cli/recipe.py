@@ -50,7 +50,7 @@ class OneRecipe:
 def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
     """List the fields of a dataclass, of dataclasses in it too, that shape outputs.
 
-    A file counts by its content. A checkpoint of None stands for the networks that facerf ships.
+    A file counts by its content. Behind the checkpoints stand the networks that facerf ships.
     """
     recipe: Recipe = {"results": RESULTS_VERSION}
     _add_fields(recipe, settings, digest_of)
@@ -82,8 +82,8 @@ def _add_fields(recipe: Recipe, settings: Any, digest_of: DigestOf) -> None:
             continue
         if dataclasses.is_dataclass(value):
             _add_fields(recipe, value, digest_of)
-        elif field.name == "checkpoint" and value is None:
-            recipe["checkpoint"] = _content(sorted(SHIPPED.glob("*.safetensors")), digest_of)
+        elif field.name == "checkpoints":
+            recipe["checkpoint"] = _content([*value, *sorted(SHIPPED.glob("*.safetensors"))], digest_of)
         else:
             recipe[field.name] = _plain(value, digest_of)
 

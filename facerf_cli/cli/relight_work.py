@@ -11,7 +11,7 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling
 from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.output_options import OutputOptions
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
 from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import Shot, follow_all, recipe_of_shots
@@ -104,6 +104,12 @@ class Relight:
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
+    @property
+    def _networks(self) -> frozenset[str]:
+        """Names of the networks that these options use."""
+        lights = [setup.envmap.options for setup in self.setups if isinstance(setup.envmap, PhotoLight)]
+        return networks_of([self.reflectance]).union(*(light.networks for light in lights))
+
     def readable(self, dry_run: bool) -> "Relight":
         """Load the models, and keep the setups whose maps can be read.
 
@@ -113,7 +119,7 @@ class Relight:
         from facerf_cli.cli.items.outputs import check_output
 
         check_output(self.output)
-        self.photo.preparation(dry_run)()
+        self.photo.preparation(dry_run, self._networks)()
         follow_all(self.shots, self.photo, dry_run)
         if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
             return self

@@ -1,7 +1,6 @@
 """`facerf segment`: who and what a photo shows: matte and classes of a person, as files."""
 
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import typer
@@ -95,7 +94,11 @@ def segment(
     check_shots(shots, photo)
     work = Segment(photo, shots)
     options = BatchOptions(output, overwrite, dry_run, jobs, FRAMES_IN_A_ROW if shots else 1)
-    prepare = partial(follow_all, shots, photo, dry_run)
+
+    def prepare() -> None:
+        photo.preparation(dry_run, ("parsing",))()
+        follow_all(shots, photo, dry_run)
+
     code = run_files(
         "segment", items, work, work.outputs_of, options, photo.settings, work.recipes_of, prepare
     )

@@ -24,6 +24,7 @@ from facerf_cli.cli.photo_options import (
     LandmarksFromOption,
     LandmarksOption,
     PhotoOptions,
+    networks_of,
 )
 from facerf_cli.cli.recipe import OneRecipe
 from facerf_cli.cli.report import Outcome
@@ -110,7 +111,7 @@ def view(
     elif any(item.name == Path(_INDEX).stem for item in items):
         raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
     options = BatchOptions(folder, overwrite, dry_run, jobs)
-    prepare = photo.preparation(dry_run)
+    prepare = photo.preparation(dry_run, networks_of(["portrait"]))
     code = run_files("view", items, work, work.outputs_of, options, photo.settings, OneRecipe(work), prepare)
     if not one and not dry_run and sums_up(items, work.outputs_of, options, photo.settings):
         from facerf_cli.cli.items.view_photos import write_index

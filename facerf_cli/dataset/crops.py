@@ -33,6 +33,7 @@ from facerf_cli.files.documents import Document, Points68, digest, read_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.workers import in_shards
@@ -311,7 +312,7 @@ def _detect(cache: Path, photos: list[Path]) -> None:
         landmarks_px = None
         try:
             pixels = read_image(photo).pixels
-            face = find_faces(pixels, str(photo))[0]
+            face = find_faces(SHIPPED_NETWORKS.parsing, pixels, str(photo))[0]
             crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
             write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
             landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()

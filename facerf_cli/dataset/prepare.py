@@ -36,6 +36,7 @@ from facerf_cli.files.pages import filled_page
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
@@ -194,7 +195,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
     for light, weight in zip(person.lights, weights, strict=True):
         lit += weight * person.capture.frame(person.name, camera, light)
-    faces = detect_faces(to_display(lit))
+    faces = detect_faces(SHIPPED_NETWORKS.parsing, to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 

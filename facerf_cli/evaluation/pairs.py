@@ -21,6 +21,7 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.files.image_metadata import oiio_error, utf8_path
 from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
@@ -83,11 +84,11 @@ def collect_pairs(
     return pairs
 
 
-def compare_pair(pair: ImagePair, find_landmarks: bool = False) -> Comparison:
+def compare_pair(pair: ImagePair, finder: ParsingNetwork | None = None) -> Comparison:
     """Read a pair. EXR, HDR and .npy are scene-linear, other images are decoded by their colour space.
 
     The mask is the mask's image (its values as they are, the mean of its channels), else the truth's alpha,
-    else everything. `find_landmarks` detects the truth's face, for Face dis, and raises InputError where
+    else everything. `finder` detects the truth's face, for Face dis, and raises InputError where
     there is none.
     """
     truth = _read(pair.truth)
@@ -96,7 +97,7 @@ def compare_pair(pair: ImagePair, find_landmarks: bool = False) -> Comparison:
         mask = _read(pair.mask, colourspace="linear").pixels.mean(-1).clip(0, 1)
     if mask is None:
         mask = np.ones(truth.pixels.shape[:2], np.float32)
-    landmarks_px = find_faces(truth.pixels, str(pair.truth))[0].landmarks_px if find_landmarks else None
+    landmarks_px = find_faces(finder, truth.pixels, str(pair.truth))[0].landmarks_px if finder else None
     return Comparison(
         Case(pair.name, pair.person, pair.facts),
         truth.pixels,

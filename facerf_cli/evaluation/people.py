@@ -29,6 +29,7 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.metrics import tone_of
 from facerf_cli.models import Models, Sides
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
     Estimator,
@@ -219,6 +220,7 @@ class Person:
     name: str
     geometry: Geometry | None
     sides: Sides
+    parsing: ParsingNetwork
     keep_eyes: bool = False
     landmarks_from: LandmarksFrom = "facerf"
     _lit: dict[str, Portrait] = field(default_factory=dict)
@@ -251,7 +253,7 @@ class Person:
         if self.geometry is None:
             face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
         else:
-            face = find_for(self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
+            face = find_for(self.parsing, self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
         return Portrait(name, LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
 
     def source(self, pair: Pair) -> np.ndarray:

@@ -289,7 +289,8 @@ def compare_sitter(
     questions = list(sitter.questions())
     frontal = sitter.image("frontal")
     name = str(database.folder / subject)
-    face = find_for(geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
+    parsing = methods[0].models.networks.parsing
+    face = find_for(parsing, geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
     for source in dict.fromkeys(question.source for question in questions):
         asked = [question for question in questions if question.source == source]
         photo = sitter.image(source)

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.landmarks import Face, choose_face
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import FoundFace, LandmarksFrom, detect_faces, face_near
 
 _ROWS, _COLUMNS = 12, 16  # of a thumbnail
@@ -134,8 +135,13 @@ class Follower:
     """Finds the same face in frame after frame; `last` are its landmarks [68, 2] where it was seen last."""
 
     def __init__(
-        self, which: str, landmarks_from: LandmarksFrom = "facerf", last: np.ndarray | None = None
+        self,
+        parsing: ParsingNetwork,
+        which: str,
+        landmarks_from: LandmarksFrom = "facerf",
+        last: np.ndarray | None = None,
     ) -> None:
+        self._parsing = parsing
         self._which, self._from, self._last = which, landmarks_from, last
 
     def see(self, image_srgb: np.ndarray) -> Sighting | None:
@@ -146,7 +152,7 @@ class Follower:
         """
         face: Face | None = None
         if self._last is not None and self._from == "facerf":
-            face = face_near(image_srgb, self._last)
+            face = face_near(self._parsing, image_srgb, self._last)
             if face is not None and not _may_be(face, self._last):
                 face = None
         if face is None:
@@ -159,7 +165,8 @@ class Follower:
 
     def _searched(self, image_srgb: np.ndarray) -> Face | None:
         last = self._last
-        faces = detect_faces(image_srgb, self._from, everyone=last is not None or self._which != "largest")
+        everyone = last is not None or self._which != "largest"
+        faces = detect_faces(self._parsing, image_srgb, self._from, everyone)
         if last is None:
             few = self._which.isdecimal() and int(self._which) >= len(faces)
             return None if few or not faces else choose_face(faces, self._which, "frame")[0]

@@ -121,7 +121,7 @@ class ShotView:
         self.head: Callable[[int], Head] = lru_cache(_KEPT)(self._seen_head)  # without what covers its skin
         self.segmentation: Callable[[int], Segmentation] = lru_cache(_KEPT)(self._segmentation)
         self._person = lru_cache(_KEPT)(self._seen_person)
-        self._maps = lru_cache(_KEPT)(lambda frame: maps_of(self._person(frame)))
+        self._maps = lru_cache(_KEPT)(lambda frame: maps_of(models.networks.portrait, self._person(frame)))
 
     def _seen_head(self, frame: int) -> Head:
         model, fit, photo = self._models.face, self._fit(frame), self._read(frame)
@@ -199,7 +199,7 @@ class ShotView:
         """Classes of a frame alone, and the small image that they were seen in."""
         image = self._display(frame)
         small = small_image(image)
-        return seen_classes(image, self.landmarks_px(frame), small), small
+        return seen_classes(self._models.networks.parsing, image, self.landmarks_px(frame), small), small
 
     def _segmentation(self, frame: int) -> Segmentation:
         around = self._around(frame)
@@ -210,7 +210,13 @@ class ShotView:
 
     def _seen_person(self, frame: int) -> SeenPerson:
         fit, segmentation = self._fit(frame), self.segmentation(frame)
-        return look_at_person(self._models.face, self._read(frame), fit, segmentation=segmentation)
+        return look_at_person(
+            self._models.networks.parsing,
+            self._models.face,
+            self._read(frame),
+            fit,
+            segmentation=segmentation,
+        )
 
     def _steady_maps(self, frame: int) -> PortraitMaps:
         """Maps of a frame, averaged with its neighbours' in the square, which follows the head."""

@@ -5,7 +5,7 @@ pickle is loaded.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,15 @@ from torch.overrides import TorchFunctionMode
 from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.json_reader import parse_json
 from facerf_cli.network.appearance_network import AppearanceNetwork
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.network.files import FORMAT, read_metadata
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
 
-FORMAT = "facerf-checkpoint-1"
 _FILLS = (Tensor.uniform_, Tensor.normal_)
 _COPIES = 3  # of a file: its tensors, floats of its halves, and the networks that take them
 
@@ -51,8 +50,10 @@ def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[
     save_checkpoint(path, tensors, {"networks": described, **metadata})
 
 
-def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module], dict[str, Any]]:
-    """Read the networks of a checkpoint by name, on the CPU, and its metadata.
+def load_networks(
+    path: Path, layout_version: int, names: Collection[str] | None = None
+) -> tuple[dict[str, nn.Module], dict[str, Any]]:
+    """Read the networks of a checkpoint, or those of some names, on the CPU, and its metadata.
 
     Raises InputError if it is not a checkpoint of this UV layout and of this version's networks.
     """
@@ -63,6 +64,7 @@ def load_networks(path: Path, layout_version: int) -> tuple[dict[str, nn.Module]
         networks = {
             name: _restore(name, described, _tensors_of(tensors, name))
             for name, described in metadata["networks"].items()
+            if names is None or name in names
         }
     except (LookupError, ArithmeticError, TypeError, RuntimeError, ValueError, AttributeError):
         raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
@@ -78,24 +80,17 @@ def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read tensors (floats in single precision) and metadata; raises InputError for any other file."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such checkpoint; give a .safetensors file that `facerf train` wrote")
+    metadata = read_metadata(path)
     try:
         memory.require(str(path), _COPIES * path.stat().st_size, "a smaller checkpoint")
         with safe_open(path, framework="pt") as file:
-            header = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        metadata = parse_json(header["facerf"])
-        if not isinstance(metadata, dict):
-            raise ValueError("its metadata is not a JSON object")
         if not all(tensor.isfinite().all() for tensor in tensors.values()):
             raise ValueError("it holds values that are not finite")
-    except (SafetensorError, OSError, KeyError, ValueError, RecursionError, RuntimeError) as error:
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise InputError(
             f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"
         ) from None
-    if header.get("format") != FORMAT:
-        raise InputError(f"{path}: written by another version of facerf; train or fetch the checkpoint again")
     return {k: (t.float() if t.dtype == torch.float16 else t) for k, t in tensors.items()}, metadata
 
 

@@ -17,6 +17,7 @@ from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
 from facerf_cli.face.detector import detected_boxes
 from facerf_cli.face.landmarks import Face, FaceBox, check_display, choose_face, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.parse import Seen, Square, look
 
 LandmarksFrom = Literal["facerf", "dlib"]
@@ -55,6 +56,7 @@ class FoundFace(Face):
 
 
 def find_faces(
+    parsing: ParsingNetwork,
     pixels_linear: np.ndarray,
     name: str,
     which: str = "largest",
@@ -64,14 +66,17 @@ def find_faces(
 
     Raises InputError, with the image's name, where no face is found.
     """
-    faces = detect_faces(to_display(pixels_linear), landmarks_from, everyone=which != "largest")
+    faces = detect_faces(parsing, to_display(pixels_linear), landmarks_from, everyone=which != "largest")
     if not faces:
         raise InputError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
     return choose_face(faces, which, name)
 
 
 def detect_faces(
-    image_srgb: np.ndarray, landmarks_from: LandmarksFrom = "facerf", everyone: bool = False
+    parsing: ParsingNetwork,
+    image_srgb: np.ndarray,
+    landmarks_from: LandmarksFrom = "facerf",
+    everyone: bool = False,
 ) -> list[Face]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
@@ -82,10 +87,10 @@ def detect_faces(
         from facerf_cli.face.dlib_landmarks import detect_landmarks  # an extra
 
         return detect_landmarks(image_srgb)
-    return list(faces_of(image_srgb, everyone))
+    return list(faces_of(parsing, image_srgb, everyone))
 
 
-def faces_of(image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
+def faces_of(parsing: ParsingNetwork, image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
     Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
@@ -93,8 +98,8 @@ def faces_of(image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
     """
     found: list[Seen] = []
     for squares in _attempts(image_srgb):
-        seen = [one for one in _looked_at(image_srgb, squares) if _is_face(one, image_srgb)]
-        refined = [again for one in _distinct(seen) if (again := _refined(image_srgb, one))]
+        seen = [one for one in _looked_at(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
+        refined = [again for one in _distinct(seen) if (again := _refined(parsing, image_srgb, one))]
         found = _distinct([*found, *refined])
         if not everyone and _sure(found):
             break
@@ -102,11 +107,11 @@ def faces_of(image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
     return sorted(faces, key=lambda face: face.box_px[0])
 
 
-def face_near(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> FoundFace | None:
+def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> FoundFace | None:
     """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
     check_display(image_srgb)
-    (seen,) = look(image_srgb, [_around(landmarks_px)])
-    again = _refined(image_srgb, seen) if _is_face(seen, image_srgb) else None
+    (seen,) = look(parsing, image_srgb, [_around(landmarks_px)])
+    again = _refined(parsing, image_srgb, seen) if _is_face(seen, image_srgb) else None
     return _as_face(again) if again else None
 
 
@@ -121,21 +126,21 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     yield _tiles(image)
 
 
-def _looked_at(image: np.ndarray, squares: list[Square]) -> list[Seen]:
-    return look(image, squares) if squares else []
+def _looked_at(parsing: ParsingNetwork, image: np.ndarray, squares: list[Square]) -> list[Seen]:
+    return look(parsing, image, squares) if squares else []
 
 
-def _refined(image: np.ndarray, seen: Seen) -> Seen | None:
+def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: Seen) -> Seen | None:
     """Look twice more at a face, large and upright; None where it turns out to be none."""
     for last in (False, True):
-        seen = look(image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
+        seen = look(parsing, image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
         if not _is_face(seen, image):
             return None
     if seen.relative_error > _MOST_ERROR:
         return None
     landmarks_px = seen.landmarks_px[:68]
     others = (_around(landmarks_px, *pair) for pair in zip(_MORE_SIDES, _MORE_TURNS_RAD, strict=True))
-    return averaged([seen, *look(image, list(others))])
+    return averaged([seen, *look(parsing, image, list(others))])
 
 
 def averaged(views: list[Seen]) -> Seen:

@@ -3,23 +3,19 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
-from pathlib import Path
+from functools import cached_property
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.errors import InputError
-from facerf_cli.face.topology import LAYOUT_VERSION, MIRROR_68
-from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
+from facerf_cli.portrait.classes import MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.strips import block_means
 
-SHIPPED = Path(__file__).parents[1] / "assets" / "parsing.safetensors"
 LANDMARKS = 68 + len(MORE_LANDMARKS)
 _POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
@@ -97,18 +93,6 @@ class Seen:
         return float(np.median(self.error_px[:68])) / max(self.extent_px, 1e-6)
 
 
-@cache
-def parsing_network(path: Path = SHIPPED) -> ParsingNetwork:
-    """Load a Parsing Network, by default the shipped one; raises InputError where the file holds none."""
-    network = load_networks(path, LAYOUT_VERSION)[0].get("parsing")
-    if not isinstance(network, ParsingNetwork) or (
-        network.settings.classes,
-        network.settings.landmarks,
-    ) != (len(CLASSES), LANDMARKS):
-        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
-    return network.eval()
-
-
 def sharpness_of(crops: Tensor) -> Tensor:
     """Contrast of finest over that of coarser detail [B] in the middle of crops [B, 3, S, S].
 
@@ -128,15 +112,17 @@ def _smooth(grey: Tensor, reach: int) -> Tensor:
 
 
 @torch.inference_mode()
-def look(image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False) -> list[Seen]:
+def look(
+    network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False
+) -> list[Seen]:
     """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
-    network = parsing_network()
+    device = next(network.parameters()).device
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
     sharpness = sharpness_of(crops)
-    found: Parsing = network(crops)
+    found = Parsing(*(part.cpu() for part in network(crops.to(device))))
     logits, places, log_error = found.logits[:, None], found.landmarks.double(), found.log_error.double()
     if mirrored:
-        other: Parsing = network(crops.flip(-1))
+        other = Parsing(*(part.cpu() for part in network(crops.flip(-1).to(device))))
         logits = torch.cat([logits, other.logits.flip(-1)[:, None]], 1)
         flipped = other.landmarks.double()[:, MIRROR] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
         places = (places + flipped) / 2

@@ -13,6 +13,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.own_shading import own_shading
@@ -78,6 +79,7 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def look_at_person(
+    parsing: ParsingNetwork,
     model: MorphableModel,
     photo: np.ndarray,
     fit: FaceFit,
@@ -91,7 +93,7 @@ def look_at_person(
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = square or portrait_square(landmarks_px)
-    segmentation = segmentation or segment(to_display(photo), landmarks_px)
+    segmentation = segmentation or segment(parsing, to_display(photo), landmarks_px)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")

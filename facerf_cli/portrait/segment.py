@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.ears import with_ears
 from facerf_cli.portrait.matte import refine_matte, shrunk
@@ -72,20 +73,22 @@ class Segmentation:
         return {f"class.{name}": partial(self.layer, name) for name in CLASSES[1:]}
 
 
-def segment(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
+def segment(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3]."""
     small = small_image(image_srgb)
-    return segmentation_of(seen_classes(image_srgb, landmarks_px, small), image_srgb, small)
+    return segmentation_of(seen_classes(parsing, image_srgb, landmarks_px, small), image_srgb, small)
 
 
-def seen_classes(image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor) -> Tensor:
+def seen_classes(
+    parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
+) -> Tensor:
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
     height, width = image_srgb.shape[:2]
     body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
     chest = _around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
-    seen = look(image_srgb, [body, chest, *near])
+    seen = look(parsing, image_srgb, [body, chest, *near])
     wide, middle, *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
     classes = _only_background().repeat(1, *size)
     wide.part_of(classes).copy_(wide.classes)

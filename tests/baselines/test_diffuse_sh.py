@@ -1,20 +1,14 @@
-from pathlib import Path
-
-import pytest
 import torch
 import torch.nn.functional as F
 
 from facerf_cli.baselines.diffuse_sh import (
-    CHECKPOINT,
     Diffuse,
     explain_texture,
-    load_diffuse_network,
     refitted,
 )
-from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.models import DEFAULT_CHECKPOINT
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.diffuse_sh import shading
 from facerf_cli.raster.camera import pose_to_rotation
 
@@ -55,14 +49,6 @@ def test_turned_with_its_lights_a_face_looks_the_same() -> None:
     assert not torch.allclose(straight, face.relit(rig, weights, turn), atol=1e-2)
 
 
-def test_a_checkpoint_without_the_network_is_named() -> None:
-    with pytest.raises(InputError, match="give one by `facerf train --stage diffuse-sh`"):
-        load_diffuse_network(DEFAULT_CHECKPOINT)
-    with pytest.raises(InputError, match="no such checkpoint"):
-        load_diffuse_network(Path("nobody.safetensors"))
-    assert CHECKPOINT.parent == DEFAULT_CHECKPOINT.parent
-
-
 def test_the_light_is_solved_for_in_spite_of_what_is_clipped_or_covered() -> None:
     normals, albedo, true = ball(24), 0.1 + 0.3 * torch.rand(3, 24, 24), 0.3 * torch.randn(9, 3)
     true[0] += 4.0
@@ -82,7 +68,7 @@ def test_the_light_is_solved_for_in_spite_of_what_is_clipped_or_covered() -> Non
 
 
 def test_what_is_shipped_explains_an_evenly_lit_face_by_an_even_light() -> None:
-    network = load_diffuse_network(CHECKPOINT)
+    network = SHIPPED_NETWORKS.diffuse_sh
     skin = torch.tensor([0.45, 0.3, 0.22]).view(3, 1, 1).expand(3, 64, 64)
     normals = F.interpolate(network.mean_normals[None], (64, 64), mode="area")[0]
     found = explain_texture(network, FaceTexture(skin, torch.ones(64, 64), F.normalize(normals, dim=0)))

@@ -11,6 +11,7 @@ from safetensors.numpy import save_file
 from facerf_cli import __version__
 from facerf_cli.cli.doctor import EXTRAS, MISSING
 from facerf_cli.cli.items import doctor_facts as doctor
+from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main
 
 ROOT = Path(__file__).parents[2]
@@ -19,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
     path = tmp_path / "mine.safetensors"
-    facts = {"licence": "MIT", "provenance": {"heads": "240 heads"}}
+    facts = {"licence": "MIT", "provenance": {"heads": "240 heads"}, "networks": {"reflectance": {}}}
     save_file({}, path, {"format": "facerf-checkpoint-1", "facerf": json.dumps(facts)})
     return path
 
@@ -41,7 +42,11 @@ def test_the_screen_leaves_nested_provenance_to_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "trained.safetensors"
-    facts = {"licence": "MIT", "provenance": {"heads": "9 heads", "started_from": {"heads": "7 heads"}}}
+    facts = {
+        "licence": "MIT",
+        "provenance": {"heads": "9 heads", "started_from": {"heads": "7 heads"}},
+        "networks": {"reflectance": {}},
+    }
     save_file({}, path, {"format": "facerf-checkpoint-1", "facerf": json.dumps(facts)})
     assert main(["doctor", "--checkpoint", str(path)]) == 0
     words = " ".join(capsys.readouterr().out.split())
@@ -53,6 +58,9 @@ def test_the_screen_leaves_nested_provenance_to_json(
 def test_the_same_as_json(checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json", "--checkpoint", str(checkpoint)]) == 0
     facts = json.loads(capsys.readouterr().out)
+    served = facts["networks"]["reflectance"]
+    assert served == {"file": str(checkpoint), "sha256": file_sha256(checkpoint)}
+    assert facts["networks"]["parsing"]["file"] == "parsing.safetensors"
     assert facts["assets"]["checkpoint"]["licence"] == "MIT" and "torch" in facts["packages"]
 
 

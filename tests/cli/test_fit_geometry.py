@@ -13,6 +13,7 @@ from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import render_texture
 from tests.exr_layers import exr_layers
@@ -27,7 +28,7 @@ Capture = pytest.CaptureFixture[str]
 def landmarks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the photo's landmarks."""
     folder = tmp_path_factory.mktemp("landmarks")
-    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     return folder
 

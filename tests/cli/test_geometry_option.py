@@ -1,6 +1,7 @@
 """`--geometry network` of the verbs on photos: heads regressed without landmarks."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,11 @@ import torch
 from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import load_fit
-from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
-from facerf_cli.models import DEFAULT_CHECKPOINT, Models, Sides, load_models
-from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint, save_networks
+from facerf_cli.models import SHIPPED_NETWORKS, Sides, load_models
+from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
+from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -37,12 +38,11 @@ def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
     assert fit(tmp_path, "--geometry", "network") == 0
     found = load_fit(tmp_path / "astronaut_fit.npz")
     photo = read_image(PHOTO).pixels
-    assert found.crop == from_box(find_faces(photo, "astronaut")[0].box_px, 512)
-    models = load_models(None, "builtin", torch.device("cpu"))
-    assert models.geometry is not None
+    assert found.crop == from_box(find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].box_px, 512)
+    models = load_models()
     crop = torch.from_numpy(found.crop.apply(photo)).permute(2, 0, 1)[None]
     with torch.no_grad():
-        estimate = models.geometry(crop)
+        estimate = models.networks.geometry(crop)
     torch.testing.assert_close(found.rotation, estimate.rotation[0])
     torch.testing.assert_close(found.translation_m, estimate.translation_m[0])
     torch.testing.assert_close(found.alpha[: estimate.alpha.shape[1]], estimate.alpha[0])
@@ -52,7 +52,7 @@ def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("no_predictor")
 def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> None:
-    tensors, metadata = load_checkpoint(DEFAULT_CHECKPOINT)
+    tensors, metadata = load_checkpoint(SHIPPED["reflectance"])
     joint = tmp_path / "joint.safetensors"
     save_checkpoint(joint, tensors, metadata | {"geometry": "network", "texture_side": 128, "crop_px": 192})
     assert fit(tmp_path / "out", "--checkpoint", str(joint)) == 0
@@ -66,12 +66,6 @@ def test_what_contradicts_the_network_is_refused(tmp_path: Path, capsys: pytest.
     points.write_text(json.dumps(np.zeros((68, 2)).tolist()))
     assert fit(tmp_path / "out", "--geometry", "network", "--landmarks", str(points)) == 2
     assert "--landmarks: --geometry network uses none" in capsys.readouterr().err
-    networks, metadata = load_networks(DEFAULT_CHECKPOINT, LAYOUT_VERSION)
-    del networks["geometry"]
-    alone = tmp_path / "alone.safetensors"
-    save_networks(alone, networks, {"layout_version": metadata["layout_version"]})
-    assert fit(tmp_path / "out", "--geometry", "network", "--checkpoint", str(alone)) == 2
-    assert "without a Geometry Network" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -88,7 +82,7 @@ def test_what_contradicts_the_network_is_refused(tmp_path: Path, capsys: pytest.
 def test_a_checkpoint_that_expects_nonsense_is_refused(
     tmp_path: Path, wrong: dict[str, object], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    tensors, metadata = load_checkpoint(DEFAULT_CHECKPOINT)
+    tensors, metadata = load_checkpoint(SHIPPED["reflectance"])
     save_checkpoint(tmp_path / "wrong.safetensors", tensors, metadata | wrong)
     assert fit(tmp_path / "out", "--checkpoint", str(tmp_path / "wrong.safetensors")) == 1
     (line,) = [x for x in capsys.readouterr().err.splitlines() if "invalid" in x]
@@ -96,5 +90,5 @@ def test_a_checkpoint_that_expects_nonsense_is_refused(
 
 
 def test_sides_keep_the_proportion_of_training() -> None:
-    models = Models(None, None, None, None, "x", {}, torch.device("cpu"), Sides(128, 192))  # type: ignore[arg-type]
+    models = replace(load_models(), trained_sides=Sides(128, 192))
     assert models.sides() == Sides(128, 192) and models.sides(256) == Sides(256, 384)

@@ -15,6 +15,7 @@ from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
@@ -35,7 +36,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_networks(folder / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
     torn = {"layout_version": LAYOUT_VERSION, "networks": {"reflectance": network.as_metadata()}}
     save_checkpoint(folder / "torn.safetensors", {}, torn)
-    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     return folder
 

@@ -14,6 +14,7 @@ from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.pipeline import relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.synth.sky.skies import kind_of
@@ -28,7 +29,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a checkpoint, the photo's landmarks and two maps."""
     folder = tmp_path_factory.mktemp("given")
     save_toy_checkpoint(folder / "lambert.safetensors")
-    face = find_faces(read_image(PHOTO).pixels, "astronaut")[0]
+    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
     (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
     (folder / "maps").mkdir()
     grey = np.full((8, 16, 3), 0.3, np.float32)

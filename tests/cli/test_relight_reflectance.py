@@ -8,15 +8,14 @@ import pytest
 import torch
 
 from facerf_cli.baselines import prt
-from facerf_cli.baselines.diffuse_sh import CHECKPOINT
 from facerf_cli.baselines.prt import TransferSettings
 from facerf_cli.baselines.synthesis import DETAIL
-from facerf_cli.cli.items.photo_lights import LIGHT_FEATURES
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.files import SHIPPED
 from tests.cli import test_relight as relighting
 
 given = relighting.given  # the fixture
@@ -70,7 +69,7 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
         line = ["relight", str(relighting.PHOTO), "-o", str(tmp_path / name), *fixed, *more]
         return main(["--checkpoint", str(checkpoint), *line])
 
-    for name, checkpoint in (("mine", tmp_path / "mine.safetensors"), ("shipped", CHECKPOINT)):
+    for name, checkpoint in (("mine", tmp_path / "mine.safetensors"), ("shipped", SHIPPED["diffuse_sh"])):
         assert relight(name, checkpoint, "--reflectance", "diffuse-sh") == 0
     mine, shipped = (tmp_path / name / "astronaut_light_70_0.exr" for name in ("mine", "shipped"))
     assert not np.allclose(read_image(mine).pixels, read_image(shipped).pixels, rtol=0.1)
@@ -78,9 +77,9 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
     capsys.readouterr()
     assert relight("field", tmp_path / "mine.safetensors") == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "mine: a checkpoint without a Reflectance Network" in line
-    assert relight("other", LIGHT_FEATURES, "--reflectance", "diffuse-sh") == 1
-    assert "give a checkpoint of `facerf train`" in capsys.readouterr().err
+    assert "mine.safetensors: holds a network of diffuse-sh, but" in line
+    assert relight("other", SHIPPED["light_features"], "--reflectance", "diffuse-sh") == 2
+    assert "holds a network S_f, but" in capsys.readouterr().err
 
 
 def test_the_portrait_is_the_default(given: Path, tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.metrics import si_mse, si_mse_channels
-from facerf_cli.models import Sides
+from facerf_cli.models import SHIPPED_NETWORKS, Sides
 from facerf_cli.raster.camera import pose_to_rotation
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
@@ -317,7 +317,10 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     )
     from facerf_cli.dataset.pairs import image_path, read_pairs, weights_path
 
-    person, (first, second) = Person(dataset, "0000", None, Sides(128, 32)), read_pairs(dataset)
+    person, (first, second) = (
+        Person(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.parsing),
+        read_pairs(dataset),
+    )
     directions, weights = person.light(second)
     assert directions.shape == (12, 3)
     weights_path(dataset).unlink()
@@ -336,7 +339,10 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
         if traits is None:
             del content["subjects"]["0000"]["traits"]
         (folder / "dataset.json").write_text(json.dumps(content))
-        assert Person(read_dataset(folder), "0000", None, Sides(128, 96)).facts["tone"] == tone
+        assert (
+            Person(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.parsing).facts["tone"]
+            == tone
+        )
     content["subjects"]["0000"]["traits"] = ["dark"]
     (folder / "dataset.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="traits"):

@@ -147,7 +147,9 @@ def small(tmp_path: Path) -> YaleB:
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
     monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
-    monkeypatch.setattr(pipeline, "person_matte", lambda photo, head: np.ones(photo.shape[:2], np.float32))
+    monkeypatch.setattr(
+        pipeline, "person_matte", lambda models, photo, head: np.ones(photo.shape[:2], np.float32)
+    )
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
@@ -196,7 +198,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
-    models = load_models(None, "builtin", torch.device("cpu"))
+    models = load_models()
     sitter = Sitter(small, "yaleB07")
     photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
     head = fit_photo(models, photo, someone().landmarks_px)

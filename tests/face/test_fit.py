@@ -32,6 +32,7 @@ from facerf_cli.face.gauss_newton import (
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, grid_triangles
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import rasterize
@@ -255,7 +256,7 @@ def test_jaw_points_at_the_border_of_a_tight_crop_are_dropped():
 
 
 def test_a_smile_is_followed(model):
-    face = detect_faces(skimage.data.astronaut())[0]
+    face = detect_faces(SHIPPED_NETWORKS.parsing, skimage.data.astronaut())[0]
     crop = from_landmarks(face.landmarks_px, 256)
     fit = fit_landmarks(model, crop.to_crop(face.landmarks_px), crop)
     assert fit.error_iod <= 0.045

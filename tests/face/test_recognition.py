@@ -12,6 +12,7 @@ from facerf_cli.face import dlib_landmarks, recognition
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.files.images import read_image
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -20,7 +21,7 @@ PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 
 @pytest.fixture(scope="module")
 def landmarks_px() -> np.ndarray:
-    return find_faces((PHOTO**2.2).astype(np.float32), "astronaut")[0].landmarks_px
+    return find_faces(SHIPPED_NETWORKS.parsing, (PHOTO**2.2).astype(np.float32), "astronaut")[0].landmarks_px
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> Non
     found = []
     for name in ("obama.jpg", "obama2.jpg"):
         pixels = read_image(shared_data / "photos" / name).pixels
-        face = find_faces(pixels, name)[0]
+        face = find_faces(SHIPPED_NETWORKS.parsing, pixels, name)[0]
         found.append(face_descriptor(to_display(pixels) / 255.0, face.landmarks_px))
     assert descriptor_distance(*found) < 0.6 < min(descriptor_distance(each, descriptor) for each in found)
 

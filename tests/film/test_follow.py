@@ -7,6 +7,7 @@ from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.film import follow
 from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
+from facerf_cli.models import SHIPPED_NETWORKS
 
 BLANK = np.zeros((100, 160, 3), np.uint8)
 
@@ -28,13 +29,13 @@ def watch(
     shown = iter(frames)
     now: list[list[Face]] = []
 
-    def nearest(image: np.ndarray, last: np.ndarray) -> Face | None:
+    def nearest(parsing: object, image: np.ndarray, last: np.ndarray) -> Face | None:
         close = [face for face in now[-1] if np.abs(face.landmarks_px.mean(0) - last.mean(0)).max() < 15]
         return close[0] if near and close else None
 
     monkeypatch.setattr(follow, "face_near", nearest)
     monkeypatch.setattr(follow, "detect_faces", lambda *_, **__: now[-1])
-    follower, found = Follower(which), []
+    follower, found = Follower(SHIPPED_NETWORKS.parsing, which), []
     for faces in shown:
         now.append([face_at(px) for px in faces])
         seen = follower.see(BLANK)

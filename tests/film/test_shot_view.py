@@ -13,7 +13,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.film import shot_view
 from facerf_cli.film.follow import LONGEST_GAP, Sighting
 from facerf_cli.film.shot_view import KEY_FRAMES, ShotView
-from facerf_cli.models import Models, Sides
+from facerf_cli.models import SHIPPED_NETWORKS, Models, Sides
 from tests.film.test_follow import face_of
 
 FRAMES = 60
@@ -37,7 +37,9 @@ class Watched:
         self.held.append(weakref.ref(photo))
         return photo
 
-    def look(self, photo: np.ndarray, landmarks_px: np.ndarray, small: torch.Tensor) -> torch.Tensor:
+    def look(
+        self, parsing: object, photo: np.ndarray, landmarks_px: np.ndarray, small: torch.Tensor
+    ) -> torch.Tensor:
         number = int(photo[0, 0, 0])
         self.looked.append(number)
         classes = torch.stack([torch.full((6, 8), float(number)), torch.full((6, 8), 1000.0 - number)])
@@ -46,7 +48,9 @@ class Watched:
 
 
 def view_of(watched: Watched, sightings: list[Sighting | None]) -> ShotView:
-    return ShotView(cast(Models, None), Sides(64, 128), watched.read, sightings)
+    return ShotView(
+        cast(Models, SimpleNamespace(networks=SHIPPED_NETWORKS)), Sides(64, 128), watched.read, sightings
+    )
 
 
 def seen(count: int) -> list[Sighting | None]:

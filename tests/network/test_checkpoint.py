@@ -9,8 +9,8 @@ from safetensors.torch import save_file
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.models import DEFAULT_CHECKPOINT
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
+from facerf_cli.network.files import SHIPPED
 
 
 def test_round_trip_in_half_precision(tmp_path: Path) -> None:
@@ -55,16 +55,16 @@ def test_what_is_no_checkpoint_is_refused_in_one_line(
 def test_loading_draws_no_values_and_leaves_torchs_compiler_out() -> None:
     """Values drawn for weights that the file replaces cost seconds; those of the file are all there."""
     before = torch.get_rng_state()
-    networks, _ = load_networks(DEFAULT_CHECKPOINT, LAYOUT_VERSION)
+    networks, _ = load_networks(SHIPPED["reflectance"], LAYOUT_VERSION)
     assert torch.equal(torch.get_rng_state(), before)
-    stored, _ = load_checkpoint(DEFAULT_CHECKPOINT)
+    stored, _ = load_checkpoint(SHIPPED["reflectance"])
     for name, network in networks.items():
         for key, value in network.state_dict().items():
             assert torch.equal(value, stored[f"{name}.{key}"]), key
     code = f"""
 from pathlib import Path
 from facerf_cli.network.checkpoint import load_networks
-load_networks(Path({str(DEFAULT_CHECKPOINT)!r}), {LAYOUT_VERSION})
+load_networks(Path({str(SHIPPED["reflectance"])!r}), {LAYOUT_VERSION})
 import sys
 print(*sorted({{"torch._dynamo", "sympy"}} & sys.modules.keys()))
 """

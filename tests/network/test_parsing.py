@@ -7,6 +7,7 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.models import load_models
 from facerf_cli.network import parsing
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
@@ -87,11 +88,8 @@ def test_settings_that_make_no_network_are_refused(change: dict[str, object], tm
         ParsingNetwork.from_metadata(described)
 
 
-def test_a_file_without_the_network_is_named(tmp_path: Path) -> None:
-    from facerf_cli.portrait.parse import parsing_network
-
-    save_networks(
-        tmp_path / "a.safetensors", {"parsing": ParsingNetwork(SMALL)}, {"layout_version": LAYOUT_VERSION}
-    )
+def test_a_network_of_other_classes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.safetensors"
+    save_networks(path, {"parsing": ParsingNetwork(SMALL)}, {"layout_version": LAYOUT_VERSION})
     with pytest.raises(InputError, match="no Parsing Network of this version"):
-        parsing_network(tmp_path / "a.safetensors")
+        load_models([path]).networks.load(["parsing"])

@@ -9,6 +9,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.confidence import Confidence, confidence_in
 from facerf_cli.portrait.find import FoundFace, detect_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square
@@ -67,10 +68,13 @@ def test_the_words_follow_the_score() -> None:
 
 def test_a_blurred_photo_is_doubtful_and_says_why() -> None:
     photo = skimage.data.astronaut()[:300, 60:360].astype(np.float32)
-    (sharp,) = detect_faces(photo.astype(np.uint8))
+    (sharp,) = detect_faces(SHIPPED_NETWORKS.parsing, photo.astype(np.uint8))
     assert isinstance(sharp, FoundFace) and confidence_in(sharp).factors["blurred"] == 1
     blurs = [0.01 * sharp.seen.extent_px, 0.02 * sharp.seen.extent_px]
-    found = [detect_faces(gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0] for blur in blurs]
+    found = [
+        detect_faces(SHIPPED_NETWORKS.parsing, gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0]
+        for blur in blurs
+    ]
     little, much = (confidence_in(one) for one in found if isinstance(one, FoundFace))
     assert little.factors["blurred"] > 0.5 > much.factors["blurred"]
     assert much.word != "sure" and much.reason == "blurred"

@@ -14,6 +14,7 @@ from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.dlib_landmarks import predictor_path
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import averaged, detect_faces, find_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square
 from tests.portrait.seen import seen_of
@@ -29,7 +30,7 @@ def source(request):
 
 @pytest.fixture(scope="module")
 def landmarks_px(source):
-    (face,) = detect_faces(PHOTO, source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, source)
     return face.landmarks_px
 
 
@@ -48,7 +49,7 @@ def resized(image, scale):
 
 
 def test_a_mirrored_photo_has_mirrored_landmarks(source, landmarks_px):
-    (face,) = detect_faces(PHOTO[:, ::-1], source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO[:, ::-1], source)
     back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
     assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
     assert error_iod(back, landmarks_px) < 0.02
@@ -59,7 +60,7 @@ def test_turned_photos(source, landmarks_px, turns):
     height, width = PHOTO.shape[:2]
     x, y = landmarks_px.T
     expected = {1: (y, width - x), 2: (width - x, height - y), 3: (height - y, x)}[turns]
-    (face,) = detect_faces(np.rot90(PHOTO, turns), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.rot90(PHOTO, turns), source)
     # dlib looks at the photo turned back; facerf's network finds an upright square of its own
     assert error_iod(face.landmarks_px, np.stack(expected, -1)) < (0.02 if source == "dlib" else 0.05)
     left, top, right, bottom = face.box_px
@@ -68,7 +69,7 @@ def test_turned_photos(source, landmarks_px, turns):
 
 def test_a_badge_beside_a_sure_face_is_no_face(source, landmarks_px):
     (face,) = detect_faces(
-        skimage.data.astronaut(), source
+        SHIPPED_NETWORKS.parsing, skimage.data.astronaut(), source
     )  # whose sleeve badge alone the detector would take
     assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.02
 
@@ -76,32 +77,32 @@ def test_a_badge_beside_a_sure_face_is_no_face(source, landmarks_px):
 def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(source, landmarks_px):
     buffer = io.BytesIO()
     Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
-    (face,) = detect_faces(np.array(Image.open(buffer)), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.array(Image.open(buffer)), source)
     assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
 
 
 def test_a_small_face(source, landmarks_px):
-    (face,) = detect_faces(resized(PHOTO, 0.4), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, resized(PHOTO, 0.4), source)
     assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
 
 
 def test_a_large_image(source, landmarks_px):
     large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
-    (face,) = detect_faces(large, source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, large, source)
     assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
 
 
 def test_a_tight_crop(source, landmarks_px):
     low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
-    (face,) = detect_faces(PHOTO[low[1] : high[1], low[0] : high[0]], source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO[low[1] : high[1], low[0] : high[0]], source)
     assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
 
 
 def test_a_dark_photo(source, landmarks_px):
     linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
-    (face,) = detect_faces(np.round(PHOTO * 0.03).astype(np.uint8), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.round(PHOTO * 0.03).astype(np.uint8), source)
     assert error_iod(face.landmarks_px, landmarks_px) < 0.08
-    (face,) = find_faces(linear * 1e-3, "dark.exr", landmarks_from=source)
+    (face,) = find_faces(SHIPPED_NETWORKS.parsing, linear * 1e-3, "dark.exr", landmarks_from=source)
     assert error_iod(face.landmarks_px, landmarks_px) < 0.02
 
 
@@ -109,24 +110,28 @@ def test_several_faces_from_left_to_right(source, landmarks_px):
     small = np.zeros_like(PHOTO)
     small[100:300, 90:270] = resized(PHOTO, 0.5)
     pair = np.concatenate([small, PHOTO], 1)
-    faces = detect_faces(pair, source)
+    faces = detect_faces(SHIPPED_NETWORKS.parsing, pair, source)
     assert len(faces) == 2 and faces[0].area_px < faces[1].area_px
-    assert len(detect_faces(pair, source, everyone=True)) == 2
+    assert len(detect_faces(SHIPPED_NETWORKS.parsing, pair, source, everyone=True)) == 2
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5000, 3), (5000, 1, 3), (200, 300, 3)])
 def test_no_face_names_the_image_and_a_way_out(shape):
     with pytest.raises(InputError, match=r"holiday\.png: no face found.*--landmarks"):
-        find_faces(np.random.default_rng(0).random(shape, np.float32), "holiday.png")
+        find_faces(
+            SHIPPED_NETWORKS.parsing, np.random.default_rng(0).random(shape, np.float32), "holiday.png"
+        )
 
 
 def test_only_display_images_are_searched():
     with pytest.raises(ValueError, match="uint8"):
-        detect_faces(np.zeros((5, 5, 3), np.float32), source)
+        detect_faces(SHIPPED_NETWORKS.parsing, np.zeros((5, 5, 3), np.float32), source)
 
 
 def test_both_find_the_same_landmarks():
-    own, other = (detect_faces(PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib"))
+    own, other = (
+        detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib")
+    )
     off = np.linalg.norm(own - other, axis=1) / iod_px(other)
     assert off[INNER].mean() < 0.06 and off.mean() < 0.08
 
@@ -134,9 +139,9 @@ def test_both_find_the_same_landmarks():
 def test_without_the_extra_only_its_option_fails(monkeypatch):
     monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
     dlib_landmarks._predictor.cache_clear()
-    assert detect_faces(PHOTO)
+    assert detect_faces(SHIPPED_NETWORKS.parsing, PHOTO)
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
-        detect_faces(PHOTO, "dlib")
+        detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, "dlib")
 
 
 def test_the_predictor_is_found_without_importing_its_package():
@@ -156,10 +161,12 @@ def test_views_are_weighed_by_what_is_expected_of_them():
 
 def test_a_face_that_is_larger_than_the_photo():
     """From the eyes to the mouth; the photo looked at as a whole alone is seen upside down."""
-    (whole,) = detect_faces(PHOTO)
+    (whole,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO)
     face = whole.landmarks_px
     x0, x1 = (int(face[corner, 0]) for corner in (37, 44))
     y0, y1 = int(face[37, 1]) - 4, int(face[57, 1])
-    (near,) = detect_faces(np.kron(PHOTO[y0:y1, x0:x1], np.ones((3, 3, 1), np.uint8)))
+    (near,) = detect_faces(
+        SHIPPED_NETWORKS.parsing, np.kron(PHOTO[y0:y1, x0:x1], np.ones((3, 3, 1), np.uint8))
+    )
     off = np.linalg.norm(near.landmarks_px / 3 + [x0, y0] - face, axis=1)
     assert off[INNER].mean() < 0.12 * iod_px(face)

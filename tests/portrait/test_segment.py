@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen, Square
@@ -29,7 +30,7 @@ def squares(monkeypatch: pytest.MonkeyPatch) -> list[Square]:
     """A network that sees a head, a garment below it, and another person on the left."""
     looked: list[Square] = []
 
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         looked.extend(wanted)
         found = []
         for square in wanted:
@@ -54,7 +55,7 @@ def photo() -> np.ndarray:
 
 
 def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
-    found = segment(photo(), FACE)
+    found = segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
     assert found.matte.shape == (HEIGHT, WIDTH)
     assert found.layer("hair")[45, 160] > 0.9 and found.layer("skin")[85, 160] > 0.9
     assert found.layer("garment")[200, 160] > 0.9 and found.matte[200, 230] < 0.1
@@ -64,12 +65,12 @@ def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
 
 
 def test_another_person_is_left_out(squares: list[Square]) -> None:
-    found = segment(photo(), FACE)
+    found = segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
     assert found.matte[120, 30] < 0.05 and found.layer("hand").max() < 0.05
 
 
 def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(squares: list[Square]) -> None:
-    segment(photo(), FACE)
+    segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
     body, *_, near = squares
     assert near.side_px < body.side_px <= WIDTH
     for square in (body, near):
@@ -91,7 +92,7 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
 def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         found = []
         for square in wanted:
             x, y = photo_share(square)
@@ -104,14 +105,14 @@ def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
         return found
 
     monkeypatch.setattr(module, "look", look)
-    classes = module.seen_classes(photo(), FACE, module.small_image(photo()))
+    classes = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))
     matte = 1 - classes[0]
     assert matte[200, 30] < 0.05 and matte[70, 160] > 0.9 and matte[220, 160] > 0.9
     assert matte[70, 209] > 0.5
 
 
 def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         smallest = min(square.side_px for square in wanted)
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
         return [
@@ -120,7 +121,9 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
         ]
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 70, 160]
+    at_face = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
+        :, 70, 160
+    ]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
     assert at_face[CLASSES.index("neck")] > 0.2
 
@@ -128,7 +131,7 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_stay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         found = []
         for square in wanted:
             x, y = photo_share(square)
@@ -141,12 +144,12 @@ def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_sta
         return found
 
     monkeypatch.setattr(module, "look", look)
-    matte = 1 - module.seen_classes(photo(), FACE, module.small_image(photo()))[0]
+    matte = 1 - module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[0]
     assert matte[180, 150] > 0.99 and matte[80, 190] < 0.5 and matte[180, 235] < 0.5
 
 
 def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
         found = [seen_of(square, {"hair": everywhere}) for square in wanted]
         for seen in found:
@@ -155,7 +158,9 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
         return found
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 70, 160]
+    at_face = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
+        :, 70, 160
+    ]
     assert at_face[0] == pytest.approx(0.5, abs=1e-3)
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
 
@@ -170,7 +175,7 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
 def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
     monkeypatch: pytest.MonkeyPatch, name: str, share: float, matte: float
 ) -> None:
-    def look(image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
         found = [seen_of(square, {}) for square in wanted]
         for seen in found:
             seen.classes[0], seen.classes[CLASSES.index(name)] = 1 - share, share
@@ -178,6 +183,8 @@ def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
 
     monkeypatch.setattr(module, "look", look)
     monkeypatch.setattr(module, "_of_one_person", lambda classes, *_: classes)
-    at_chest = module.seen_classes(photo(), FACE, module.small_image(photo()))[:, 150, 160]
+    at_chest = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
+        :, 150, 160
+    ]
     assert 1 - at_chest[0] == pytest.approx(matte, abs=1e-3)
     assert at_chest[CLASSES.index(name)] == pytest.approx(matte, abs=1e-3)

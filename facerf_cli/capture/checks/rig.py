@@ -21,6 +21,7 @@ from facerf_cli.face.joint_fit import PosedCamera, fit_views
 from facerf_cli.face.landmarks import choose_face, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 
 _TURN_DEG = 20.0  # sound rigs give 1 to 11, on Extended Yale B and synthetic faces
@@ -143,7 +144,7 @@ class FaceNormals:
 def find_face_normals(frames: CameraFrames, posed: PosedCamera) -> FaceNormals | None:
     """Fit the mean face to the landmarks in the mean of all frames; None without a face."""
     rgb = np.repeat(frames.lit[..., None], 3, -1).clip(0)
-    faces = detect_faces(to_display(rgb)) if rgb.max() > 0 else []
+    faces = detect_faces(SHIPPED_NETWORKS.parsing, to_display(rgb)) if rgb.max() > 0 else []
     if not faces:
         return None
     landmarks_px = choose_face(faces, "largest", frames.camera)[0].landmarks_px * frames.lit_scale

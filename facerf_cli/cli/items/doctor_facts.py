@@ -1,6 +1,7 @@
 """The device, assets, colour configuration and cache that `facerf doctor` shows."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,6 @@ import OpenImageIO as oiio
 import platformdirs
 import torch
 
-from facerf_cli import portrait_field
 from facerf_cli.cli.doctor import MISSING
 from facerf_cli.cli.options import Settings, torch_device
 from facerf_cli.errors import FacerfError
@@ -17,23 +17,27 @@ from facerf_cli.face.detector import DETECTOR_LICENCE
 from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, predictor_path
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.face.recognition import RECOGNITION_LICENCE
-from facerf_cli.models import DEFAULT_CHECKPOINT
+from facerf_cli.models import described_file
 from facerf_cli.network.checkpoint import load_checkpoint
-from facerf_cli.portrait import parse
+from facerf_cli.network.files import SHIPPED, serving_files
 
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:
     """The facts of this machine by section."""
+    try:
+        serving = serving_files(settings.checkpoints, user="facerf")
+        networks: dict[str, Any] = {name: described_file(path) for name, path in serving.items()}
+    except FacerfError as error:
+        serving, networks = SHIPPED, {"": {"file": f"{MISSING}: {error}", "sha256": ""}}
     return {
         "device": _device(settings),
         "assets": {
             "face model": _face_model(BUILTIN_PATH),
-            "checkpoint": _checkpoint(settings.checkpoint or DEFAULT_CHECKPOINT),
-            "parsing": _of_people(parse.SHIPPED),
-            "portrait": _of_people(portrait_field.SHIPPED),
+            **_checkpoints(serving),
             "detector": {"licence": DETECTOR_LICENCE},
             "dlib": _extra_models(),
         },
+        "networks": networks,
         "colour": _colour_configuration(),
         "cache": {"folder": platformdirs.user_cache_dir("facerf")},
     }
@@ -62,6 +66,15 @@ def _face_model(path: Path) -> dict[str, str]:
         return {"name": f"{MISSING}: damaged, {error}", "file": str(path)}
 
 
+def _checkpoints(serving: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+    """The checkpoints whose licences are shown; those of people say whose shapes these have."""
+    people = ("name", "licence", "size")
+    return {"checkpoint": _checkpoint(serving["reflectance"])} | {
+        name: {key: value for key, value in _checkpoint(serving[name]).items() if key in people}
+        for name in ("parsing", "portrait")
+    }
+
+
 def _checkpoint(path: Path) -> dict[str, Any]:
     try:
         _, metadata = load_checkpoint(path)
@@ -69,12 +82,6 @@ def _checkpoint(path: Path) -> dict[str, Any]:
         return {"name": f"{MISSING}: {error}"}
     provenance = metadata.get("provenance", {})
     return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
-
-
-def _of_people(path: Path) -> dict[str, Any]:
-    """A network that was trained on whole synthetic people; its licence says whose shapes they have."""
-    found = _checkpoint(path)
-    return {name: value for name, value in found.items() if name in ("name", "licence", "size")}
 
 
 def _extra_models() -> dict[str, str]:

@@ -20,7 +20,7 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.cli.items.photos import face_model
 from facerf_cli.cli.options import Settings
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.cli.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import InputError, UsageError
@@ -44,7 +44,7 @@ from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.image_metadata import embed_xmp
 from facerf_cli.files.images import write_exr
 from facerf_cli.logs import LOGGER_NAME, Provenance, json_line
-from facerf_cli.models import DEFAULT_CHECKPOINT
+from facerf_cli.network.files import checkpoint_file, serving_files
 
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
 KEPT, STRIPS = "pictures", "strips"
@@ -230,7 +230,8 @@ def keep_images(
 
 def _checkpoint_of(method: str, settings: Settings) -> str:
     """The checkpoint of a method's images, as far as the method's name shows it."""
-    return (settings.checkpoint or DEFAULT_CHECKPOINT).stem if method in ("field", "portrait") else method
+    name = {"field": "reflectance", "portrait": "portrait"}.get(method)
+    return serving_files(settings.checkpoints)[name].stem if name else method
 
 
 def _place(kind: str, case: str) -> str:
@@ -302,10 +303,10 @@ def _about(work: _Measure) -> About:
     """The run's command and networks, without the time: equal runs give equal files."""
     facts: dict[str, Any] = {}
     if work.options.kinds:
-        own = work.settings.checkpoint or DEFAULT_CHECKPOINT
-        facts[f"checkpoint {own.stem}"] = f"SHA-256 {_sha256(own)}"
+        for own in serving_files(work.settings.checkpoints, networks_of(work.options.kinds)).values():
+            facts[f"checkpoint {own.stem}"] = f"SHA-256 {_sha256(own)}"
         for path in work.options.checkpoints:
-            facts[f"checkpoint against {path.stem}"] = f"SHA-256 {_sha256(path)}"
+            facts[f"checkpoint against {path.stem}"] = f"SHA-256 {_sha256(checkpoint_file(path))}"
     facts["values compared"] = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}[
         work.options.space
     ]

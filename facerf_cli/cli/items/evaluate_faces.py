@@ -14,8 +14,8 @@ from facerf_cli.cli.items.evaluate import run_protocol
 from facerf_cli.cli.items.evaluation_settings import EvaluateOptions, SplitOptions
 from facerf_cli.cli.items.photo_lights import feature_network
 from facerf_cli.cli.items.photos import fit_faces, load_models_once, prepare_photos, read_photo
-from facerf_cli.cli.light_options import Refine
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.light_options import LightOptions, Refine
+from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
@@ -35,6 +35,7 @@ from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.transfer import TABLE_2_TRANSFER, couples_of, transfer
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.models import load_models
+from facerf_cli.network.files import checkpoint_file
 from facerf_cli.pipeline import Estimator
 
 T = TypeVar("T")
@@ -90,7 +91,10 @@ def _run(work: "FaceWork", items: Sequence[Item], chosen: int | None) -> int:
     settings = work.settings
 
     def prepare() -> None:
-        prepare_photos(settings.photo, with_networks=False)
+        uses = networks_of(settings.options.kinds)
+        if settings.refine == "features" and settings.options.vgg_weights is None:
+            uses |= {"light_features"}
+        prepare_photos(settings.photo, uses, with_networks=not settings.options.dry_run)
         if not settings.options.dry_run:
             compare_of(settings)
 
@@ -147,7 +151,8 @@ class FaceWork:
         models, photo = load_methods(self.settings)[0].models, self.settings.photo
         geometry = None if self.settings.data.joint_fit else photo.geometry or models.default_geometry
         sides = models.sides(photo.texture_side)
-        return Person(dataset, name, geometry, sides, self.settings.options.keep_eyes, photo.landmarks_from)
+        parsing, keep_eyes = models.networks.parsing, self.settings.options.keep_eyes
+        return Person(dataset, name, geometry, sides, parsing, keep_eyes, photo.landmarks_from)
 
 
 def faces_of(item: Item, settings: FaceSettings) -> Iterator[SourceFace]:
@@ -196,8 +201,13 @@ def methods_of(
     """
     models = load_models_once(photo)
     non_negative, refined, vgg_weights = estimating
-    estimator = Estimator(non_negative, feature_network(vgg_weights)[0] if refined else None)
-    others = [(path.stem, load_models(path, photo.face_model, models.device)) for path in checkpoints]
+    estimator = Estimator(
+        non_negative, feature_network(LightOptions(photo, vgg_weights=vgg_weights))[0] if refined else None
+    )
+    others = [
+        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device))
+        for path in checkpoints
+    ]
     return (
         *(Method(kind, kind, models, estimator) for kind in kinds),
         *(Method(name, "field", other, estimator) for name, other in others),
@@ -213,7 +223,7 @@ def _mean_methods(
     for method in methods:
         models = method.models
         if checkpoint is not None and method.kind == "field":
-            models = load_models(checkpoint, photo.face_model, models.device)
+            models = load_models((checkpoint_file(checkpoint),), photo.face_model, models.device)
         found.append(replace(method, models=replace(models, face=models.face.pose_only())))
     return tuple(found)
 

@@ -11,9 +11,9 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.evaluate import run_protocol
 from facerf_cli.cli.items.evaluate_faces import methods_of
 from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
-from facerf_cli.cli.items.photos import prepare_photos
+from facerf_cli.cli.items.photos import load_models_once, prepare_photos
 from facerf_cli.cli.options import Settings
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
@@ -41,7 +41,7 @@ def run_yale_b(
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
 
     def prepare() -> None:
-        prepare_photos(photo, with_networks=False)
+        prepare_photos(photo, networks_of(options.kinds), with_networks=not options.dry_run)
         if not options.dry_run:
             methods_of(photo, options.kinds, options.checkpoints)
 
@@ -99,7 +99,7 @@ def run_pairs(
     items = [Item(truth, options.output / f"part-{n:02d}", f"part-{n:02d}") for n, _ in enumerate(starts)]
     parts = {item.name: tuple(pairs[start : start + size]) for item, start in zip(items, starts, strict=True)}
     names = tuple(map(folder_name, predictions))
-    work = _Pairs(names, tuple(predictions), masks, facts, face_distance, parts)
+    work = _Pairs(names, tuple(predictions), masks, facts, face_distance, settings, parts)
     return run_protocol(tables, items, work, options, settings)
 
 
@@ -112,8 +112,12 @@ class _Pairs:
     masks: Path | None
     facts: Path | None
     face_distance: bool
+    settings: Settings
     parts: Mapping[str, tuple[ImagePair, ...]] = field(metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
+        finder = (
+            load_models_once(PhotoOptions(self.settings)).networks.parsing if self.face_distance else None
+        )
         for pair in self.parts[item.name]:
-            yield compare_pair(pair, self.face_distance)
+            yield compare_pair(pair, finder)

@@ -26,7 +26,7 @@ def write_fits(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, 
     faces = fit_faces(item, image, options)
     for face in reversed(faces):
         _write(item, image, face, options)
-    return [face.tag for face in faces], facts_of(faces)
+    return [face.tag for face in faces], facts_of(faces, options)
 
 
 def _write(item: Item, image: LinearImage, face: FittedFace, options: PhotoOptions) -> None:

@@ -69,7 +69,7 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
         for page in pages:
             write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
         outputs += [stack, sheet, *pages]
-    return outputs, facts_of(faces) | {"lights": len(directions)}
+    return outputs, facts_of(faces, work.photo) | {"lights": len(directions)}
 
 
 def _from_in_front(item: Item, directions: Tensor) -> Tensor:

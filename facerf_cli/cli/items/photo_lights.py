@@ -15,6 +15,7 @@ from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.photos import (
     FittedFace,
     directions_of,
+    facts_of_networks,
     fit_faces,
     load_models_once,
     prepare_photos,
@@ -41,9 +42,10 @@ from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
 from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
-from facerf_cli.training.pretrained import load_features, load_vgg
+from facerf_cli.training.pretrained import load_vgg
 
 TILE_PX = 256
 _LABEL_PX = 20
@@ -91,16 +93,15 @@ def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.n
     return np.asarray(srgb_to_linear(shown.astype(np.float32)))
 
 
-LIGHT_FEATURES = Path(__file__).parents[2] / "assets" / "light_features.safetensors"
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
 log = logging.getLogger(LOGGER_NAME)
 
 
 def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
     """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
-    prepare_photos(options.photo, with_networks)
+    prepare_photos(options.photo, options.networks, with_networks)
     if with_networks and options.refine == "features":
-        feature_network(options.vgg_weights)
+        feature_network(options)
 
 
 def write_shot_light(
@@ -121,7 +122,7 @@ def write_shot_light(
         found = _write(item, image, face, options, width_px, sh_order, more)
         tags.append(face.tag)
         facts.append(found | {"frames": view.key_frames})
-    return tags, facts[0] if len(facts) == 1 else {"takes": facts}
+    return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
@@ -129,7 +130,8 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     image = read_photo(item, options.photo)
     faces = fit_faces(item, image, options.photo)
     facts = [_write(item, image, face, options, width_px, sh_order) for face in reversed(faces)][::-1]
-    return [face.tag for face in faces], facts[0] if len(facts) == 1 else {"faces": facts}
+    found = facts[0] if len(facts) == 1 else {"faces": facts}
+    return [face.tag for face in faces], found | facts_of_networks(options.photo)
 
 
 @cache
@@ -146,7 +148,7 @@ def _estimate(
 ) -> tuple[LightEstimate, dict[str, Any]]:
     """The light of one fitted face, and facts for the report."""
     models = load_models_once(options.photo)
-    features, name = feature_network(options.vgg_weights) if options.refine == "features" else (None, None)
+    features, name = feature_network(options) if options.refine == "features" else (None, None)
     try:
         estimate = estimate_light(
             models,
@@ -207,11 +209,13 @@ def _facts(
 
 
 @cache
-def feature_network(vgg_weights: str | None) -> tuple[FeatureNetwork, str]:
-    """V_f if its weights were given, else the shipped S_f; and its name for the report."""
-    if vgg_weights is not None:
-        return load_vgg(vgg_weights), "V_f (VGG-16, ImageNet)"
-    return load_features(LIGHT_FEATURES, "light_features"), "S_f (shipped)"
+def feature_network(options: LightOptions) -> tuple[FeatureNetwork, str]:
+    """V_f if its weights were given, else S_f; and its name for the report."""
+    networks = load_models_once(options.photo).networks
+    if options.vgg_weights is not None:
+        return load_vgg(options.vgg_weights).to(networks.device), "V_f (VGG-16, ImageNet)"
+    path = networks.files["light_features"]
+    return networks.light_features, f"S_f ({'shipped' if path == SHIPPED['light_features'] else path.name})"
 
 
 def _write(

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from facerf_cli.cli.options import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.colour import named_space
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
@@ -27,7 +27,8 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.logs import LOGGER_NAME, Provenance
-from facerf_cli.models import NO_GEOMETRY_NETWORK, Models, load_models
+from facerf_cli.models import Models, load_models
+from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
@@ -84,21 +85,25 @@ class FittedFace:
         return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found, pose_deg[0])}
 
 
-def prepare_photos(options: PhotoOptions, with_networks: bool = True) -> None:
-    """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
+def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: bool = True) -> None:
+    """Load what every photo needs, and the networks of some names.
+
+    Raises UsageError or InputError for what would fail all photos, and for a checkpoint without use.
+    """
     if options.colourspace is not None:
         named_space(options.colourspace, options.ocio_config)
     face_model(options)
+    settings = options.settings
+    if not settings.checkpoints_by_default:
+        serving_files(settings.checkpoints, uses, "this line")
     if with_networks:
-        models = load_models_once(options)
-        if options.geometry == "network" and models.geometry is None:
-            raise UsageError(f"--geometry network: {models.checkpoint_name} is {NO_GEOMETRY_NETWORK}")
+        load_models_once(options).networks.load(uses)
 
 
 @cache
 def load_models_once(options: PhotoOptions) -> Models:
     """The face model and the networks of the checkpoint, on the device, once a process."""
-    return load_models(options.settings.checkpoint, options.face_model, torch_device(options.settings))
+    return load_models(options.settings.checkpoints, options.face_model, torch_device(options.settings))
 
 
 @cache
@@ -136,16 +141,17 @@ def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[t
     if options.landmarks is not None:
         faces = [_given(item, image, options.landmarks)]
     else:
-        faces = find_faces(image.pixels, str(item.input_path), options.face, options.landmarks_from)
+        parsing = load_models_once(options).networks.parsing
+        faces = find_faces(parsing, image.pixels, str(item.input_path), options.face, options.landmarks_from)
     for face, name in zip(faces, _names(item, faces), strict=True):
         _say_confidence(name, face)
     return list(zip(_tags(len(faces), options), faces, strict=True))
 
 
-def facts_of_found(faces: Sequence[FaceBox]) -> dict[str, Any]:
+def facts_of_found(faces: Sequence[FaceBox], options: PhotoOptions) -> dict[str, Any]:
     """The report's entries of a photo whose faces were only found."""
     facts = [confidence_facts(face) for face in faces]
-    return facts[0] if len(facts) == 1 else {"faces": facts}
+    return (facts[0] if len(facts) == 1 else {"faces": facts}) | facts_of_networks(options)
 
 
 def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
@@ -185,9 +191,15 @@ def fit_facts(fit: FaceFit) -> dict[str, Any]:
     return {**error, "quality": fit.quality}
 
 
-def facts_of(faces: list[FittedFace]) -> dict[str, Any]:
+def facts_of(faces: list[FittedFace], options: PhotoOptions) -> dict[str, Any]:
     """The report's entries of a photo: of its one face, or of each in a list."""
-    return faces[0].facts() if len(faces) == 1 else {"faces": [face.facts() for face in faces]}
+    facts = faces[0].facts() if len(faces) == 1 else {"faces": [face.facts() for face in faces]}
+    return facts | facts_of_networks(options)
+
+
+def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
+    """The report's entry of the networks that were used: file and digest of each."""
+    return {"networks": load_models_once(options).networks.served()}
 
 
 def stamp(item: Item) -> dict[str, str | int]:
@@ -205,9 +217,10 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
     if options.landmarks is not None:
         yield _given(item, image, options.landmarks)
     else:
-        geometry = options.geometry or load_models_once(options).default_geometry
+        models = load_models_once(options)
+        geometry, parsing = options.geometry or models.default_geometry, models.networks.parsing
         yield from find_for(
-            geometry, image.pixels, str(item.input_path), options.face, options.landmarks_from
+            parsing, geometry, image.pixels, str(item.input_path), options.face, options.landmarks_from
         )
 
 

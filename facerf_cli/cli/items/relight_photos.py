@@ -109,11 +109,11 @@ def _relight_photo(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
     written: Written = {}
     if work.composite == "photo":
         shown = _together(item, image, faces, work)
-        return dict(_write_setups(item, "", shown, work, metadata, chosen_ev)), facts_of(faces)
+        return dict(_write_setups(item, "", shown, work, metadata, chosen_ev)), facts_of(faces, work.photo)
     for face in reversed(faces):  # the first one's files mark the photo as finished
         shown = _show_face(item, image, face, work)
         written.update(_write_setups(item, face.tag, shown, work, metadata, chosen_ev))
-    return written, facts_of(faces)
+    return written, facts_of(faces, work.photo)
 
 
 def _seen(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:

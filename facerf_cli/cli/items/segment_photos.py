@@ -9,7 +9,14 @@ import numpy as np
 
 from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.items.outputs import canvas
-from facerf_cli.cli.items.photos import facts_of_found, find_people, read_photo, stamp
+from facerf_cli.cli.items.photos import (
+    facts_of_found,
+    facts_of_networks,
+    find_people,
+    load_models_once,
+    read_photo,
+    stamp,
+)
 from facerf_cli.cli.items.shot_frames import segmented_frame
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot, shot_of
@@ -42,13 +49,14 @@ def write_segments(
     if place := shot_of(shots, item):
         image, face, found = segmented_frame(*place, options)
         _write(item, "", image, to_display(image.pixels), face, found)
-        return [""], {}
+        return [""], facts_of_networks(options)
     image = read_photo(item, options, _KEPT_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
+    parsing = load_models_once(options).networks.parsing
     for tag, face in reversed(people):
-        _write(item, tag, image, display, face, segment(display, face.landmarks_px))
-    return [tag for tag, _ in people], facts_of_found([face for _, face in people])
+        _write(item, tag, image, display, face, segment(parsing, display, face.landmarks_px))
+    return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
 
 
 def _write(

@@ -22,6 +22,7 @@ from facerf_cli.files.images import LinearImage
 from facerf_cli.film.follow import LONGEST_GAP, CutFinder, Follower, Sighting, gaps, takes
 from facerf_cli.film.shot_view import ShotView
 from facerf_cli.logs import LOGGER_NAME, STDERR, json_line
+from facerf_cli.models import described_file
 from facerf_cli.portrait.segment import Segmentation
 
 _DECODED = 12  # frames of a film that are kept as they were decoded
@@ -88,14 +89,15 @@ def _followed(
     """Rows of the frames that follow those of some rows; after a cut the face is chosen as in a new film."""
     take = rows[[0, *_cuts(rows)][-1] :]
     last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
-    follower = Follower(options.face, options.landmarks_from, last)
+    parsing = load_models_once(options).networks.parsing
+    follower = Follower(parsing, options.face, options.landmarks_from, last)
     frames = ShotFrames(shot, options)
     show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
     finder = CutFinder(len(shot.frames), show)
     for number in _shown(range(len(rows), len(shot.frames)), shot, settings):
         cut = shot.cuts and finder.is_cut(number)
         if cut:
-            follower = Follower(options.face, options.landmarks_from)
+            follower = Follower(parsing, options.face, options.landmarks_from)
         yield _row(number, _see(shot, number, show, follower, options), cut)
 
 
@@ -123,6 +125,7 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
         "landmarks_from": options.landmarks_from,
         "landmarks": options.landmarks,
         "colourspace": options.colourspace,
+        "parsing": described_file(load_models_once(options).networks.files["parsing"])["sha256"],
     }
 
 

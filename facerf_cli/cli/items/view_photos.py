@@ -65,7 +65,7 @@ def write_pages(item: Item, work: "MakePage") -> tuple[list[Path], dict[str, Any
         path = item.output(face.tag + ".html")
         write_page(path, item, models, image.pixels, face, work.size_px)
         paths.append(path)
-    return paths[::-1], facts_of(faces)
+    return paths[::-1], facts_of(faces, work.photo)
 
 
 def write_page(

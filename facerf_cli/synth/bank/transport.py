@@ -23,6 +23,7 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.square import SIDE_PX, SIDES
@@ -181,10 +182,10 @@ def person_in(photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
 
     All is seen in the square around the landmarks, or in a given one. Raises InputError without a face.
     """
-    face = find_faces(photo, "portrait")[0]
+    face = find_faces(SHIPPED_NETWORKS.parsing, photo, "portrait")[0]
     crop = from_landmarks(face.landmarks_px, _CROP_PX)
     fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-    return look_at_person(_builtin(), photo, fit, square)
+    return look_at_person(SHIPPED_NETWORKS.parsing, _builtin(), photo, fit, square)
 
 
 def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:

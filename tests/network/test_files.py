@@ -1,0 +1,79 @@
+"""Which file serves each network."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.main import main
+from facerf_cli.network.files import FORMAT, SHIPPED, checkpoint_file, serving_files
+
+
+def checkpoint(path: Path, *networks: str, trained: tuple[str, ...] = ()) -> Path:
+    """A checkpoint whose header says which networks it holds, and which of them its last training trained."""
+    facts = {"networks": {name: {} for name in networks}, "training": [{"networks": ["geometry"]}]}
+    facts["training"] = [*facts["training"], {"networks": trained}] if trained else []
+    save_file({"x": np.zeros(1, np.float32)}, path, {"format": FORMAT, "facerf": json.dumps(facts)})
+    return path
+
+
+def test_each_file_counts_for_what_its_last_training_trained(tmp_path: Path) -> None:
+    first = checkpoint(tmp_path / "a.st", "reflectance", "geometry", trained=("reflectance",))
+    second = checkpoint(tmp_path / "b.st", "reflectance", "portrait", trained=("portrait",))
+    found = serving_files([second, first])
+    assert found == SHIPPED | {"reflectance": first, "geometry": first, "portrait": second}
+    third = checkpoint(tmp_path / "c.st", "geometry", trained=("geometry",))
+    assert serving_files([first, second, third])["geometry"] == third  # before the copy of the first
+
+
+def test_a_file_that_says_nothing_of_its_training_counts_for_all_it_holds(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path / "a.st", "reflectance", "geometry")
+    assert {name for name, file in serving_files([path]).items() if file == path} == {
+        "reflectance",
+        "geometry",
+    }
+
+
+def test_two_files_that_trained_the_same_network_are_refused(tmp_path: Path) -> None:
+    paths = [checkpoint(tmp_path / name, "parsing", trained=("parsing",)) for name in ("a.st", "b.st")]
+    with pytest.raises(UsageError, match=r"b\.st: holds a Parsing Network, as does .*a\.st"):
+        serving_files(paths)
+
+
+def test_a_file_without_use_is_refused_by_name(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path / "a.st", "portrait")
+    with pytest.raises(UsageError, match=r"a\.st: .* Portrait Network, but facerf segment uses the Pars"):
+        serving_files([path], ("parsing",), "facerf segment")
+
+
+def test_a_runs_folder_stands_for_its_best_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no best\.safetensors in this folder"):
+        serving_files([checkpoint_file(tmp_path)])
+    best = checkpoint(tmp_path / "best.safetensors", "portrait")
+    assert serving_files([checkpoint_file(tmp_path)])["portrait"] == best
+
+
+@pytest.mark.parametrize("verb", ["envmap", "segment", "train", "evaluate", "synth-stage", "check"])
+def test_every_verb_refuses_a_file_without_use(
+    tmp_path: Path, verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = checkpoint(tmp_path / "a.st", "appearance_features")
+    assert main([verb, "x", "-o", str(tmp_path / "out"), "--checkpoint", str(path)]) == 2
+    assert "a.st: holds a network appearance_features, but" in capsys.readouterr().err
+    assert main([verb, "x", "--checkpoint", str(tmp_path / "none.st")]) == 1
+    assert "none.st: no such checkpoint" in capsys.readouterr().err
+    (tmp_path / "empty.st").touch()
+    assert main([verb, "x", "--checkpoint", str(tmp_path / "empty.st")]) == 1
+    assert "empty.st: not a facerf checkpoint (the file is empty)" in capsys.readouterr().err
+
+
+def test_a_file_of_the_configuration_may_serve_other_verbs(tmp_path: Path) -> None:
+    path = checkpoint(tmp_path / "a.st", "portrait")
+    config = tmp_path / "facerf.toml"
+    config.write_text(f'[global]\ncheckpoint = ["{path}"]\n')
+    assert main(["--config", str(config), "config"]) == 0
+    line = ["envmap", "--count", "1", "--size", "64", "-o", str(tmp_path / "out")]
+    assert main(["--config", str(config), *line]) == 0
