@@ -9,13 +9,20 @@ from safetensors.torch import load_file, save_file
 from facerf_cli.cli.items import train_run
 from facerf_cli.cli.train import TrainOptions
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.images import read_image
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
+from facerf_cli.network.files import SHIPPED
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
+
+PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
 
 @pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])
@@ -213,6 +220,24 @@ def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, t
     assert metadata["provenance"]["fitted_with"].startswith("builtin-mean")
 
 
+def require_served(tmp_path: Path, name: str) -> None:
+    """Relight a photo with the network that a run trained; the shipped ones give another image."""
+    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0].landmarks_px
+    points = tmp_path / "points.json"
+    points.write_text(json.dumps(landmarks_px.tolist()))
+    line = ["relight", str(PHOTO), "--landmarks", str(points), "--light", "40,20", "--exposure", "0"]
+    images = []
+    for folder, checkpoint in (("shipped", []), ("trained", ["--checkpoint", str(tmp_path / "run")])):
+        assert main([*line, *checkpoint, "-o", str(tmp_path / folder)]) == 0
+        images.append(read_image(tmp_path / folder / "astronaut_light_40_20.exr").pixels)
+    assert abs(images[0] - images[1]).max() > 0.01
+    (row,) = map(json.loads, (tmp_path / "trained/report.jsonl").read_text().splitlines())
+    path = tmp_path / "run/best.safetensors"
+    assert row["networks"].pop(name) == {"file": str(path), "sha256": file_sha256(path)}
+    assert set(row["networks"]) == {"reflectance", "geometry", "parsing", "portrait"} - {name}
+    assert all(served["file"] == SHIPPED[other].name for other, served in row["networks"].items())
+
+
 def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> None:
     """Its people are made up here; `tests/synth/bank/test_portraits.py` has a real one."""
     bank = tmp_path / "bank"
@@ -231,6 +256,7 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> No
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
     assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
+    require_served(tmp_path, "parsing")
 
 
 def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> None:
@@ -251,6 +277,7 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> N
     assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["portrait"] and "CC0" in metadata["licence"]
+    require_served(tmp_path, "portrait")
 
 
 def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path) -> None:
