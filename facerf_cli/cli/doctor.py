@@ -95,7 +95,7 @@ def as_screen(facts: Facts) -> str:
     """The facts as aligned text; sizes and nested provenance are left to --json."""
     lines: list[str] = []
     for section, part, text in _rows(facts):
-        head = f"{section:<{_HEAD}}{part:<{_HEAD}}" if part else f"{section:<{_HEAD}}"
+        head = f"{section:<{_HEAD}}{part + ' ':<{_HEAD}}" if part else f"{section:<{_HEAD}}"
         lines += textwrap.wrap(
             text, _WIDTH, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
         )
@@ -120,8 +120,11 @@ def _rows(facts: Facts) -> Iterator[tuple[str, str, str]]:
         return
     device = facts["device"]
     yield "device", "", f"{device['uses']}, {device['threads']} threads, {device['memory']} of memory"
-    for row, (name, asset) in enumerate(facts["assets"].items()):
-        yield "models" if row == 0 else "", name, _model(name, asset)
+    models: dict[str, list[str]] = {}
+    for name, asset in facts["assets"].items():
+        models.setdefault(_model(name, asset), []).append(name)
+    for row, (text, names) in enumerate(models.items()):
+        yield "models" if row == 0 else "", ", ".join(names), text
     yield "networks", "", "  ".join(_served(facts["networks"]))
     yield "colour", "", f"OCIO configuration {facts['colour']['OCIO']}, {facts['colour']['spaces']} spaces"
     yield "cache", "", facts["cache"]["folder"]
@@ -130,7 +133,11 @@ def _rows(facts: Facts) -> Iterator[tuple[str, str, str]]:
 def _served(networks: Facts) -> Iterator[str]:
     """The file that serves each network, with the first digits of its SHA-256."""
     for name, file in networks.items():
-        yield _whole(f"{name.replace('_', '-')} {Path(file['file']).name} {file['sha256'][:8]}".strip())
+        if name == MISSING:
+            yield f"{MISSING}: {file['file']}"
+        else:
+            stem, digits = Path(file["file"]).stem, file["sha256"][:8]
+            yield _whole(f"{name} {digits}" if stem == name else f"{name} {stem} {digits}")
 
 
 def _whole(text: str) -> str:

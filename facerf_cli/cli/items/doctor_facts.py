@@ -28,7 +28,7 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
         serving = serving_files(settings.checkpoints, user="facerf")
         networks: dict[str, Any] = {name: described_file(path) for name, path in serving.items()}
     except FacerfError as error:
-        serving, networks = SHIPPED, {"": {"file": f"{MISSING}: {error}", "sha256": ""}}
+        serving, networks = SHIPPED, {MISSING: {"file": str(error), "sha256": ""}}
     return {
         "device": _device(settings),
         "assets": {
