@@ -9,6 +9,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import all_or_none
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.main import main
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -17,7 +18,8 @@ PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 @pytest.fixture(scope="module")
 def landmarks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("landmarks") / "face.json"
-    path.write_text(str(find_faces(read_image(PHOTO).pixels, "astronaut")[0].landmarks_px.tolist()))
+    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
+    path.write_text(str(face.landmarks_px.tolist()))
     return path
 
 
