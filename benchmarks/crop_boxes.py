@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import torch
 from _common import arguments, photos
 
 from facerf_cli.dataset.dataset import read_dataset
@@ -38,7 +37,7 @@ def main() -> None:
     parser.add_argument("--checkpoint", type=Path, help="default: the shipped one")
     parser.add_argument("--dataset", type=Path, help="of prepare-dataset")
     given = parser.parse_args()
-    models = load_models(given.checkpoint, "builtin", torch.device("cpu"))
+    models = load_models([given.checkpoint] if given.checkpoint else ())
     places, moves, errors = [], [], []
     for name, photo in images(photos(given.photos), given.dataset):
         try:
@@ -101,8 +100,6 @@ def report(name: str, values: np.ndarray) -> None:
 def error_percent(models: Models, photo: np.ndarray, face: Face, crop: Crop) -> float:
     """Mean distance of the regressed head's landmarks to the detected ones."""
     regressed = regress_head(models, crop.apply(photo))
-    if regressed is None:
-        raise SystemExit(f"{models.checkpoint_name}: holds no Geometry Network; give another --checkpoint")
     found_px = crop.to_photo(regressed_fit(models.face, regressed, crop).landmarks_px.numpy())
     left, right = OUTER_EYE_CORNERS
     eyes_px = np.linalg.norm(face.landmarks_px[left] - face.landmarks_px[right])

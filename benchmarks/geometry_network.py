@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, help="of prepare-dataset")
     parser.add_argument("--cameras", default="C0,C2,C3", help="of the dataset")
     given = parser.parse_args()
-    network = load_models(given.checkpoint, "builtin", torch.device("cpu")).geometry
+    network = load_models([given.checkpoint] if given.checkpoint else ()).networks.geometry
     if not isinstance(network, GeometryNetwork):
         raise SystemExit(f"{given.checkpoint}: holds no Geometry Network; give another --checkpoint")
     print(f"{sum(p.numel() for p in network.parameters()):,} parameters")

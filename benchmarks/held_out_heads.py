@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--lights", type=int, default=6, help="targets of each sample")
     given = parser.parse_args()
     bank = first_heads(required(given.bank, "a bank of heads", "--bank"), given.held_out)
-    network = load_models(given.checkpoint, "builtin", torch.device("cpu")).network
+    network = load_models([given.checkpoint] if given.checkpoint else ()).networks.reflectance
     textures = list(measure(network, bank, given.draws, given.lights))
     print_tables(textures)
 
