@@ -206,12 +206,12 @@ def relight(
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     fit = _posed(head.fit, pose)
     target = Target(fit, "face" if alone or pose is not None else "photo", background=background)
-    photo = _checked(photo)
+    photo, rig = _checked(photo), light._rig()
     if not np.allclose(head.fit.crop.apply(photo), head.cropped, rtol=0, atol=_ALIKE * head.cropped.max()):
         raise ValueError("photo is not the one that the head was fitted in; fit it again")
     with torch.no_grad():
         of_head = pipeline.reflectance_of(models, head, reflectance, network_alone, photo=photo)
-        image = pipeline.relight(models, photo, head, light._rig(), target, of_head)
+        image = pipeline.relight(models, photo, head, rig, target, of_head)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])
 
 
