@@ -12,7 +12,7 @@ from typing import NoReturn, TypeVar
 
 from safetensors.torch import load_file
 
-from facerf_cli.metrics import Interval
+from facerf_cli.image.metrics import Interval
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import head_fields
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from skimage.transform import SimilarityTransform, warp
 
-from facerf_cli.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.files.images import read_image
-from facerf_cli.resize import fitted, resized
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.image.resample import fitted, resized
 
 SIDE_PX = 512  # of the longer side of a photo
 NOISE = 0.006  # standard deviation, display values: 1.5 of 255

@@ -31,8 +31,8 @@ from facerf_cli.dataset.pairs import Pair, load_pairs
 from facerf_cli.evaluation.people import CropView, Person
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.image.metrics import mean_interval, si_mse
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.metrics import mean_interval, si_mse
 from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import explain, relight
 

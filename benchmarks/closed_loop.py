@@ -27,10 +27,10 @@ from torch import Tensor
 from facerf_cli.composite import Composition
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image, write_display
+from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
-from facerf_cli.metrics import light_error_deg
 from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.files import SHIPPED

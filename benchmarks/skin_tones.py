@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from _common import arguments, required
 
-from facerf_cli.colour import ExposureRule, luminance
 from facerf_cli.composite import Target
+from facerf_cli.image.colour import ExposureRule, luminance
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.models import Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.files.images import read_image, write_display
+from facerf_cli.image.resample import fitted, resized
 from facerf_cli.main import main
-from facerf_cli.resize import fitted, resized
 
 HERE = Path(__file__).parent
 HEIGHT_PX = 360

@@ -21,6 +21,7 @@ from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.files import images
+from facerf_cli.image.strips import filled
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
@@ -30,7 +31,6 @@ from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.strips import filled
 
 Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"]

@@ -25,7 +25,6 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from facerf_cli.colour import ExposureRule, chosen_exposure_ev, luminance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
@@ -34,10 +33,11 @@ from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
+from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
+from facerf_cli.image.strips import Band, Layer, filled
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
-from facerf_cli.strips import Band, Layer, filled
 
 _DARK = 0.08  # e above, a share of the source's mean
 _NOISY = 2.0  # times e: the luminance below which colours of pixels are noise

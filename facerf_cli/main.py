@@ -3,7 +3,7 @@
 A verb is a function in `facerf_cli/cli/`, named like the verb and listed under its panel in `VERBS`. typer
 needs every verb's signature before it parses the line, so this module imports all of them. To keep
 `facerf --help` fast, the modules directly in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy):
-the work of a verb is in `cli/items/`, behind a deferred import. A test checks it.
+the work of a verb is in `work/`, behind a deferred import. A test checks it.
 """
 
 import atexit
@@ -20,7 +20,8 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from facerf_cli import __version__, memory
+from facerf_cli import __version__
+from facerf_cli.batch.settings import DeviceName, Settings
 from facerf_cli.cli import evaluate, face_model
 from facerf_cli.cli.check import check
 from facerf_cli.cli.config import config, read_config
@@ -29,16 +30,7 @@ from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.options import (
-    EPILOG,
-    HELP_NAMES,
-    DeviceName,
-    Settings,
-    unwrapped,
-    was_given,
-    with_groups,
-    with_machines,
-)
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups, with_machines
 from facerf_cli.cli.photo_options import FITTING, NETWORKS, networks_of
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
@@ -49,8 +41,9 @@ from facerf_cli.cli.synth_stage import synth_stage
 from facerf_cli.cli.train import train
 from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.logs import LOGGER_NAME, configure_logging, unexpected
-from facerf_cli.stopping import end_again, end_on_signals
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
+from facerf_cli.run.stopping import end_again, end_on_signals
 
 _PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
 # The verbs by panel of the help, in the order of a user's day.

@@ -11,15 +11,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.face.landmarks import display_ev, to_display
+from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
+from facerf_cli.image.strips import Band, Layer
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import PersonColours, local_lines
 from facerf_cli.portrait.occluders import uncovered_rows
 from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
-from facerf_cli.strips import Band, Layer
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli import memory
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
+from facerf_cli.run import memory
 
 # A shell that starts the tests in the background ignores SIGINT, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

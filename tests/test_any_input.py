@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from facerf_cli.batch.naming import NamePattern
+from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.cli.light_entries import lit_images
-from facerf_cli.cli.naming import NamePattern
-from facerf_cli.cli.options import Shard
 from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.landmarks import read_landmarks
@@ -28,7 +28,7 @@ from facerf_cli.files.light_files import (
     write_numbers,
 )
 from facerf_cli.files.toml_files import read_rig
-from facerf_cli.logs import escaped, json_line, shown
+from facerf_cli.run.logs import escaped, json_line, shown
 
 # The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.
 DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)

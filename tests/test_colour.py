@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli import colour as ours
 from facerf_cli.errors import UsageError
+from facerf_cli.image import colour as ours
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there

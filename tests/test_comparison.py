@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import typer.main
 
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.files.images import PHOTO_LIMIT_PX
 from facerf_cli.main import app
 

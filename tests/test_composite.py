@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.colour import luminance
 from facerf_cli.composite import (
     Background,
     Composition,
@@ -27,6 +26,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
 from facerf_cli.face.view import FaceView, photo_camera, view_face
+from facerf_cli.image.colour import luminance
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation, project

@@ -12,7 +12,8 @@ import pytest
 import typer
 
 from facerf_cli import __version__, main
-from facerf_cli.cli.options import Settings, settings_of
+from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
 
 ROOT = Path(main.__file__).parents[1]

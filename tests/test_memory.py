@@ -10,12 +10,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import MAX_ARRAYS, load_face_model
 from facerf_cli.files.images import read_image
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
+from facerf_cli.run import memory
 
 HEIGHT, WIDTH = 30, 50
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.metrics import (
+from facerf_cli.image.metrics import (
     PSNR_HIGHEST_DB,
     best_scale,
     dssim,

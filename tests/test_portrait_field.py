@@ -13,6 +13,7 @@ from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
+from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.portrait import PortraitInputs
@@ -21,7 +22,6 @@ from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relig
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait_field import PortraitField, maps_of
-from facerf_cli.strips import filled, strips
 from facerf_cli.whole_person import WholePerson
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
@@ -178,7 +178,7 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
         return [composition.image(relit).pixels, *layers.values()]
 
     at_once = shown()
-    monkeypatch.setattr("facerf_cli.strips.STRIP_PX", 1)
+    monkeypatch.setattr("facerf_cli.image.strips.STRIP_PX", 1)
     assert len(list(strips(photo.shape))) > 4
     for one, other in zip(at_once, shown(), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))

@@ -15,10 +15,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from facerf_cli.cli.options import Shard
+from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.logs import configure_logging
-from facerf_cli.ray_workers import connect, in_ray
+from facerf_cli.run.logs import configure_logging
+from facerf_cli.run.ray_workers import connect, in_ray
 from tests.cli.toy_batch import run
 from tests.processes import wait_until
 
@@ -187,7 +187,7 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
 
 @needs_ray
 def test_what_answers_need_not_be_ray(tmp_path: Path) -> None:
-    code = "from facerf_cli.ray_workers import connect\nimport sys\nconnect(sys.argv[1])"
+    code = "from facerf_cli.run.ray_workers import connect\nimport sys\nconnect(sys.argv[1])"
     with socket.create_server(("127.0.0.1", 0)) as server:
         command = [sys.executable, "-c", code, f"127.0.0.1:{server.getsockname()[1]}"]
         result = subprocess.run(command, capture_output=True, text=True)
@@ -226,7 +226,7 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
         exceptions=SimpleNamespace(**known, **dict.fromkeys(others, Other)),
         is_initialized=lambda: False,
     )
-    monkeypatch.setattr("facerf_cli.ray_workers.connect", lambda *_: ray)
+    monkeypatch.setattr("facerf_cli.run.ray_workers.connect", lambda *_: ray)
     with pytest.raises(
         FacerfError, match=r"^--ray a:1: the cluster was lost \(The node died\); start it again"
     ):

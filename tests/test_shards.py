@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.workers import in_shards
+from facerf_cli.run.workers import in_shards
 
 
 def _fail_or_wait(items: list[Path]) -> None:

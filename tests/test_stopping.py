@@ -16,7 +16,7 @@ WRITER = """
 import ctypes, sys, time
 from pathlib import Path
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.stopping import end_on_signals
+from facerf_cli.run.stopping import end_on_signals
 
 end_on_signals(0.2)
 try:
@@ -39,7 +39,7 @@ SWALLOWER = """
 import sys, time
 from pathlib import Path
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.stopping import end_on_signals
+from facerf_cli.run.stopping import end_on_signals
 
 class Slow:
     def __del__(self):  # Python ignores what is raised here

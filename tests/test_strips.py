@@ -9,10 +9,10 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from facerf_cli import strips as module
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
+from facerf_cli.image import strips as module
+from facerf_cli.image.strips import enlarged, filled, strips, whole
 from facerf_cli.portrait.matte import PersonColours, refine_matte, shrunk
-from facerf_cli.strips import enlarged, filled, strips, whole
 from tests.oracles.person_colours import slow_person_colours
 
 HEIGHT, WIDTH = 150, 70

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.logs import LOGGER_NAME, configure_logging
-from facerf_cli.workers import Workers, in_order, spread
+from facerf_cli.run.logs import LOGGER_NAME, configure_logging
+from facerf_cli.run.workers import Workers, in_order, spread
 
 
 def work(item: str) -> str:
@@ -71,7 +71,7 @@ def _refuse(pipe: object, level: int, threads: int) -> None:
 
 
 def test_processes_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("facerf_cli.workers._serve", _refuse)
+    monkeypatch.setattr("facerf_cli.run.workers._serve", _refuse)
     with pytest.raises(FacerfError, match=r"could not start \(exit code 3\); try --jobs 1"):
         list(run("a", "b"))
 

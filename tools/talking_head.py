@@ -11,8 +11,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from facerf_cli.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project

@@ -22,7 +22,7 @@ from pathlib import Path
 from benchmarks.faults import mutations
 from benchmarks.faults.doors import DOORS, Door
 from facerf_cli.errors import FacerfError
-from facerf_cli.logs import LOGGER_NAME, shown
+from facerf_cli.run.logs import LOGGER_NAME, shown
 
 MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 60.0, 2000
 _LONGEST_MESSAGE = 3000

@@ -184,8 +184,8 @@ def _configuration(path: Path) -> None:
 
 
 def _index(path: Path) -> None:
-    from facerf_cli.cli.folder_index import FolderIndex, check_outputs
-    from facerf_cli.cli.options import Shard
+    from facerf_cli.batch.made_from import FolderIndex, check_outputs
+    from facerf_cli.batch.settings import Shard
 
     list(check_outputs(path.parent))
     index = FolderIndex(path.parent, "segment", Shard(), lambda _: [{"verb": "segment", "files": {}}])
@@ -194,7 +194,7 @@ def _index(path: Path) -> None:
 
 
 def _report(path: Path) -> None:
-    from facerf_cli.cli.report import open_report
+    from facerf_cli.batch.report import open_report
 
     open_report(path, "segment", [], [], lambda _: [])
 
@@ -207,10 +207,10 @@ def _figures(path: Path) -> None:
 
 def _names(path: Path) -> None:
     """The file's content is a name: of an input, in a report, a page and a message."""
-    from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
-    from facerf_cli.cli.naming import NamePattern
-    from facerf_cli.cli.report import rows_of
-    from facerf_cli.logs import json_line, shown
+    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.batch.naming import NamePattern
+    from facerf_cli.batch.report import rows_of
+    from facerf_cli.run.logs import json_line, shown
     from facerf_cli.viewer.page import IndexEntry, index_page
 
     name = os.fsdecode(path.read_bytes().replace(b"/", b"").replace(b"\0", b"")[:180]) + ".png"
@@ -236,10 +236,10 @@ def _names(path: Path) -> None:
 
 def _words(path: Path) -> None:
     """The file's content is the value of an option."""
-    from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
+    from facerf_cli.batch.naming import NamePattern
+    from facerf_cli.batch.settings import Shard
     from facerf_cli.cli.light_entries import lit_images
-    from facerf_cli.cli.naming import NamePattern
-    from facerf_cli.cli.options import Shard
     from facerf_cli.cli.output_options import parse_formats
     from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
     from facerf_cli.errors import FacerfError

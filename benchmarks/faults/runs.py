@@ -16,7 +16,7 @@ from typing import Literal
 
 from benchmarks._common import ASTRONAUT
 from benchmarks.faults import samples
-from facerf_cli.cli.report import REPORT_NAME
+from facerf_cli.batch.report import REPORT_NAME
 from facerf_cli.files import atomic
 
 PART = ".*part-*"  # name of a temporary folder
@@ -157,7 +157,7 @@ def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -
         os.dup2(null, 1)
         os.dup2(descriptor, 2)
         from facerf_cli.main import main
-        from facerf_cli.stopping import end_on_signals
+        from facerf_cli.run.stopping import end_on_signals
 
         end_on_signals(2.0)
         before()

@@ -15,7 +15,6 @@ import OpenImageIO as oiio
 import torch
 from safetensors.torch import save
 
-from facerf_cli.colour import LINEAR_P3
 from facerf_cli.evaluation.report import FORMAT
 from facerf_cli.face.fit import fit_from_arrays, save_fit
 from facerf_cli.face.importers.ict import VERTICES
@@ -25,6 +24,7 @@ from facerf_cli.files.image_metadata import embed_xmp
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.image.colour import LINEAR_P3
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.checkpoint import save_networks

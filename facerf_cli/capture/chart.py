@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 from skimage.draw import polygon
 
-from facerf_cli.colour import colour_science, lab_d65, luminance
+from facerf_cli.image.colour import colour_science, lab_d65, luminance
 
 CHART_NAME = "ColorChecker24 - After November 2014"
 _ITERATIONS = 12  # of matrix and light; the next one changes them by less than a thousandth

@@ -40,10 +40,10 @@ from facerf_cli.capture.chart import (
     shrunk,
     squares_px,
 )
-from facerf_cli.colour import luminance
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import write_display
+from facerf_cli.image.colour import luminance
 
 CAMERA_FIELD = "{camera}"
 # Thresholds beyond which a chart's image is refused.

@@ -22,12 +22,12 @@ import numpy as np
 
 from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
 from facerf_cli.capture.stage_json import STAGE_FORMAT
-from facerf_cli.colour import LINEAR, find_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
 from facerf_cli.files.regular import read_text
-from facerf_cli.logs import counted
+from facerf_cli.image.colour import LINEAR, find_space
+from facerf_cli.run.logs import counted
 
 _LONE_CAMERA = "C0"  # id where the pattern has no {camera}
 _LONE_SUBJECT = "subject"  # id where it has no {subject}, and the folder's name cannot be one

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.errors import InputError
-from facerf_cli.logs import counted
+from facerf_cli.run.logs import counted
 
 Severity = Literal["error", "warning"]
 LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # lights, and share of the rig's, that a usable OLAT stack has

@@ -31,11 +31,11 @@ from pydantic import AfterValidator, Field, PlainValidator, model_validator
 from facerf_cli.capture.capture import FIELDS, Capture, find_subjects, require_pattern
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.yale_b import read_yale_capture
-from facerf_cli.colour import named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
 from facerf_cli.files.images import PHOTO_LIMIT_PX
+from facerf_cli.image.colour import named_space
 
 StageFormat = Literal["facerf-stage-1"]
 STAGE_FORMAT: StageFormat = "facerf-stage-1"

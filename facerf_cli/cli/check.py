@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.batch import print_path
-from facerf_cli.cli.folder_index import check_outputs
+from facerf_cli.batch.made_from import check_outputs
+from facerf_cli.batch.run import print_path
 from facerf_cli.errors import UsageError
-from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 

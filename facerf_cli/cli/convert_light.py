@@ -6,8 +6,10 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import OneRecipe
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
 from facerf_cli.cli.options import (
     LIGHT,
     DryRunOption,
@@ -17,8 +19,6 @@ from facerf_cli.cli.options import (
     refuse_given,
     settings_of,
 )
-from facerf_cli.cli.recipe import OneRecipe
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 
@@ -62,7 +62,7 @@ class ConvertLight:
 
     def __call__(self, item: Item) -> Outcome:
         """Read the light and write it."""
-        from facerf_cli.cli.items.convert_lights import write_forms
+        from facerf_cli.work.convert_lights import write_forms
 
         return Outcome(self.outputs_of(item), {"light": write_forms(item, self)})
 

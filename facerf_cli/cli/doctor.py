@@ -11,7 +11,7 @@ import typer
 
 from facerf_cli import __version__
 from facerf_cli.cli.options import settings_of
-from facerf_cli.logs import json_line
+from facerf_cli.run.logs import json_line
 
 MISSING = "MISSING"
 _NO_BREAK = "\N{NO-BREAK SPACE}"
@@ -39,7 +39,7 @@ def doctor(
     """
     facts = _installation()
     if MISSING not in facts["packages"].values():  # the rest needs all packages
-        from facerf_cli.cli.items.doctor_facts import examine
+        from facerf_cli.work.doctor_facts import examine
 
         facts |= examine(settings_of(context))
     print(json_line(facts) if as_json else as_screen(facts))

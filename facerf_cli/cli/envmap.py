@@ -45,6 +45,6 @@ def envmap(
     """
     if size % 2:
         raise UsageError(f"--size {size}: the height is half of it; give an even number")
-    from facerf_cli.cli.items.draw_envmaps import write_envmaps
+    from facerf_cli.work.draw_envmaps import write_envmaps
 
     write_envmaps(output, count, kind, size, settings_of(context).seed, overwrite, dry_run)

@@ -8,10 +8,12 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.cli.batch import BatchOptions, run_files
-from facerf_cli.cli.inputs import Item
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.naming import file_pattern
+from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_files
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
-from facerf_cli.cli.naming import file_pattern
 from facerf_cli.cli.options import (
     FACE,
     LIGHT,
@@ -33,8 +35,6 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import (
     NoCutsOption,
     PhotosArgument,
@@ -67,7 +67,7 @@ class EstimateLight:
 
     def prepare(self, dry_run: bool) -> None:
         """Load the models, before the first photo; in a dry run check the options only."""
-        from facerf_cli.cli.items.photo_lights import prepare_light
+        from facerf_cli.work.photo_lights import prepare_light
 
         prepare_light(self.options, with_networks=not dry_run)
         follow_all(self.shots, self.options.photo, dry_run)
@@ -78,7 +78,7 @@ class EstimateLight:
 
     def __call__(self, item: Item) -> Outcome:
         """Estimate the light of every chosen face, or that of a shot."""
-        from facerf_cli.cli.items.photo_lights import write_lights, write_shot_light
+        from facerf_cli.work.photo_lights import write_lights, write_shot_light
 
         for shot in self.shots:
             if item.output_base == shot.base:

@@ -7,13 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.items.evaluation_settings import (
-    DATA,
-    MEASURES,
-    METHODS,
-    EvaluateOptions,
-    SplitOptions,
-)
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, Refine, RefineOption
 from facerf_cli.cli.options import (
     EPILOG,
@@ -35,6 +28,7 @@ from facerf_cli.cli.photo_options import (
 )
 from facerf_cli.errors import UsageError
 from facerf_cli.option import Only
+from facerf_cli.work.evaluation_settings import DATA, MEASURES, METHODS, EvaluateOptions, SplitOptions
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
 
@@ -294,7 +288,7 @@ def yale_b(
     _refuse_without_field(context, options, "network_alone")
     if options.reflectance is None and not options.against:
         options = replace(options, reflectance=["portrait"])
-    from facerf_cli.cli.items.evaluate_images import run_yale_b
+    from facerf_cli.work.evaluate_images import run_yale_b
 
     photo = PhotoOptions(
         settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
@@ -362,7 +356,7 @@ def pairs(
     options = replace(options, reflectance=[])
     options.check()
     options.require_output_apart([*predictions, truth, *([] if masks is None else [masks])])
-    from facerf_cli.cli.items.evaluate_images import run_pairs
+    from facerf_cli.work.evaluate_images import run_pairs
 
     settings = settings_of(context)
     raise typer.Exit(run_pairs(predictions, truth, options, settings, masks, facts, face_distance))
@@ -436,7 +430,7 @@ def _run(
     """
     photo.check()
     LightOptions(photo, non_negative=non_negative, refine=refine).check()
-    from facerf_cli.cli.items.evaluate_faces import FaceSettings, run_on_people, run_on_photos
+    from facerf_cli.work.evaluate_faces import FaceSettings, run_on_people, run_on_photos
 
     settings = FaceSettings(
         protocol, options, photo, data, network_alone, non_negative, refine, mean_checkpoint

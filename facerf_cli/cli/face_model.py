@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.errors import UsageError
-from facerf_cli.logs import LOGGER_NAME, json_line
+from facerf_cli.run.logs import LOGGER_NAME, json_line
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 log = logging.getLogger(LOGGER_NAME)
@@ -62,7 +62,7 @@ def import_model(
     if output.suffix != ".npz":
         raise UsageError(f"-o {output}: not a face model; give a file that ends in .npz")
     _refuse_existing(output, overwrite)
-    from facerf_cli.cli.items.face_model_files import import_to
+    from facerf_cli.work.face_model_files import import_to
 
     model = import_to(output, kind, source, landmarks)
     log.info(
@@ -96,7 +96,7 @@ def list_models(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object a line instead.")] = False,
 ) -> None:
     """List the built-in face model, the imported ones in the working folder and those to fetch."""
-    from facerf_cli.cli.items.face_model_files import list_rows
+    from facerf_cli.work.face_model_files import list_rows
 
     rows = list_rows()
     if as_json:
@@ -129,7 +129,7 @@ def show_model(
         raise UsageError(f"-o {output}: not an image; give a file that ends in {', '.join(_IMAGES)}")
     if output is not None:
         _refuse_existing(output, overwrite)
-    from facerf_cli.cli.items.face_model_files import show
+    from facerf_cli.work.face_model_files import show
 
     show(model, output)
 

@@ -9,16 +9,17 @@ from typing import Annotated, Protocol, Self
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, all_finished, run_files
-from facerf_cli.cli.folder_index import FolderIndex
-from facerf_cli.cli.inputs import FILM_SUFFIXES, Item
-from facerf_cli.cli.options import IMAGE, Overwrite, Settings, folder_not_file
+from facerf_cli.batch.inputs import FILM_SUFFIXES, Item
+from facerf_cli.batch.made_from import FolderIndex
+from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, all_finished, run_files
+from facerf_cli.batch.settings import Overwrite, Settings
+from facerf_cli.cli.options import IMAGE, folder_not_file
 from facerf_cli.cli.output_options import Format
-from facerf_cli.cli.recipe import DigestOf, Recipe, RecipesOf
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import UsageError
-from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME
 
 _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
 _RATE = Fraction(24)
@@ -100,7 +101,7 @@ class FilmOutput:
     def join(self, images: Sequence[Path], shots: Sequence[Shot], key: str) -> None:
         """Write the film from its frames, in order, and remove them."""
         from facerf_cli.files.film_writer import Timing, film_timing, write_film
-        from facerf_cli.logs import Provenance
+        from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None
         timing = film_timing(source) if source else Timing.steady(len(images), self.rate or _RATE)

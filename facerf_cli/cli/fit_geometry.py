@@ -5,8 +5,10 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import OneRecipe
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -27,8 +29,6 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     TextureSizeOption,
 )
-from facerf_cli.cli.recipe import OneRecipe
-from facerf_cli.cli.report import Outcome
 
 _OUTPUTS = (
     "_texture.exr",
@@ -55,7 +55,7 @@ class FitGeometry:
 
     def __call__(self, item: Item) -> Outcome:
         """Fit every chosen face."""
-        from facerf_cli.cli.items.fit_photos import write_fits
+        from facerf_cli.work.fit_photos import write_fits
 
         tags, facts = write_fits(item, self.photo)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

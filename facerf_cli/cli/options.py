@@ -4,25 +4,21 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from facerf_cli import memory
-from facerf_cli.cli.recipe import NOT_IN_RECIPE
+from facerf_cli.batch.settings import Overwrite, Settings, Shard
 from facerf_cli.errors import UsageError
 from facerf_cli.option import Only, Option, option_fields
-from facerf_cli.workers import Workers
 
-T = TypeVar("T")
 _FILE_SUFFIX = re.compile(
     r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
     r"|mp4|mov|m4v|webm|avi|mkv)",
     re.IGNORECASE,
 )
-_SHARE = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 EPILOG = (
     "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help') may stand before "
     "or after the verb."
@@ -33,61 +29,12 @@ HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 # and --help have none: they stand first, under Options.
 LIGHT, IMAGE, FACE, METHOD, BATCH = "Light", "Image", "Face", "Method", "Batch"
 
-DeviceName = Literal["auto", "cpu", "cuda", "mps"]
-
-
-@dataclass(frozen=True)
-class Shard:
-    """The share of the items that this process takes: every `of`th, from `number` on, which counts from 1."""
-
-    number: int = 1
-    of: int = 1
-
-    @staticmethod
-    def parse(text: str | None) -> "Shard":
-        """Parse `K/N`; None takes all items. Raises UsageError for anything else."""
-        if text is None:
-            return Shard()
-        number, slash, of = text.partition("/")
-        if not (slash and _SHARE.fullmatch(text) and 1 <= int(number) <= int(of)):
-            raise UsageError(f"--shard {text}: not a share; give K/N with K from 1 to N, such as 3/8")
-        return Shard(int(number), int(of))
-
-    def share(self, items: Sequence[T]) -> Sequence[T]:
-        """This process's items."""
-        return items[self.number - 1 :: self.of]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """The global options and the choice of workers; `ctx.obj` in every verb."""
-
-    verbosity: int = field(default=0, metadata=NOT_IN_RECIPE)  # -1 errors only, 0 notes, 1 everything
-    log_json: bool = field(default=False, metadata=NOT_IN_RECIPE)
-    device: DeviceName = field(default="auto", metadata=NOT_IN_RECIPE)
-    checkpoints: tuple[Path, ...] = ()  # files; the networks that they lack are the shipped ones
-    checkpoints_by_default: bool = field(default=False, metadata=NOT_IN_RECIPE)  # of a configuration file
-    seed: int = 0
-    null_separated: bool = field(default=False, metadata=NOT_IN_RECIPE)  # names on standard input
-    shard: Shard = field(default=Shard(), metadata=NOT_IN_RECIPE)
-    ray: str | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: this machine, without Ray
-    memory_bytes: int | None = field(default=None, metadata=NOT_IN_RECIPE)  # of a job; None: a share of all
-
-    def job_bytes(self, jobs: int) -> int:
-        """The budget of memory of each of so many jobs."""
-        return memory.default_limit(jobs) if self.memory_bytes is None else self.memory_bytes
-
 
 def settings_of(context: typer.Context) -> Settings:
     """The global options of this call."""
     settings = context.obj
     assert isinstance(settings, Settings)
     return settings
-
-
-def workers_of(settings: Settings, jobs: int, in_a_row: int = 1) -> Workers:
-    """The workers that `--jobs`, `--ray` and `--device` ask for."""
-    return Workers(jobs, settings.ray, int(settings.device == "cuda"), in_a_row)
 
 
 def was_given(context: typer.Context, name: str) -> bool:
@@ -106,19 +53,6 @@ def refuse_given(context: typer.Context, names: Sequence[str], why: str) -> None
     for name in names:
         if was_given(context, name):
             raise UsageError(f"{flag(name)} {why}")
-
-
-def torch_device(settings: Settings) -> Any:
-    """Seed torch and return the device of `--device`; `auto` takes cuda, then mps, then cpu."""
-    import torch
-
-    torch.manual_seed(settings.seed)
-    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    name = next(kind for kind in present if present[kind]) if settings.device == "auto" else settings.device
-    if not present[name]:
-        found = ", ".join(kind for kind in present if present[kind])
-        raise UsageError(f"--device {name}: torch finds no such device; give one of: {found}")
-    return torch.device(name)
 
 
 InputsArgument = Annotated[
@@ -150,7 +84,6 @@ OutputOption = Annotated[
         callback=folder_not_file,
     ),
 ]
-Overwrite = Literal["never", "changed", "always"]
 NameOption = Annotated[
     str | None,
     typer.Option(

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from facerf_cli.batch.recipe import NOT_IN_RECIPE
 from facerf_cli.cli.options import IMAGE, refuse_given
-from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 
 Format = Literal["exr", "png", "png16", "tiff", "jpg"]
@@ -133,7 +133,7 @@ def config_of(path: Path | None) -> str:
         return ""
     if not path.is_file():
         raise UsageError(f"--ocio {path}: no such file; give an OpenColorIO configuration")
-    from facerf_cli import ocio
+    from facerf_cli.image import display as ocio
 
     ocio.check(str(path))
     return str(path)

@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.naming import OF_PHOTOS, NamePattern
-from facerf_cli.cli.options import FACE, METHOD, Settings
+from facerf_cli.batch.naming import OF_PHOTOS, NamePattern
+from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.options import FACE, METHOD
 from facerf_cli.errors import UsageError
 
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
@@ -103,7 +104,7 @@ class PhotoOptions:
         """A function that loads what every photo needs, in a dry run without the networks."""
 
         def prepare() -> None:
-            from facerf_cli.cli.items.photos import prepare_photos
+            from facerf_cli.work.photos import prepare_photos
 
             prepare_photos(self, uses, with_networks=not dry_run)
 

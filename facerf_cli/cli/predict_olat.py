@@ -6,8 +6,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import OneRecipe
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
 from facerf_cli.cli.options import (
     IMAGE,
     LIGHT,
@@ -32,8 +34,6 @@ from facerf_cli.cli.photo_options import (
     TextureSizeOption,
     networks_of,
 )
-from facerf_cli.cli.recipe import OneRecipe
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import UsageError
 
@@ -69,7 +69,7 @@ class PredictOlat:
 
     def __call__(self, item: Item) -> Outcome:
         """Predict every chosen face."""
-        from facerf_cli.cli.items.olat_stacks import write_stacks
+        from facerf_cli.work.olat_stacks import write_stacks
 
         return Outcome(*write_stacks(item, self))
 

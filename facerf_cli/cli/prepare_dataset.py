@@ -79,8 +79,8 @@ def prepare_dataset(
     lacks most frames, or in which no face is found, is left out, too; dataset.json lists both. A subject with
     less than half of the lights, or fewer than 10, fails. findings.jsonl has the findings of the checks.
     """
-    from facerf_cli.cli.batch import BatchOptions
-    from facerf_cli.cli.items.prepare_capture import describe_capture, prepare_capture
+    from facerf_cli.batch.run import BatchOptions
+    from facerf_cli.work.prepare_capture import describe_capture, prepare_capture
 
     if describe:
         others = [name for name in context.params if name not in _DESCRIBES]

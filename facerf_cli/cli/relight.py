@@ -11,14 +11,14 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind, RelightKind
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.made_from import FolderIndex
+from facerf_cli.batch.naming import NamePattern
+from facerf_cli.batch.run import BatchOptions, all_finished, print_path, run_files
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
-from facerf_cli.cli.batch import BatchOptions, all_finished, print_path, run_files
 from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
-from facerf_cli.cli.folder_index import FolderIndex
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
 from facerf_cli.cli.lights import LightSetup, Sampling, collect_setups, photo_lights
-from facerf_cli.cli.naming import NamePattern
 from facerf_cli.cli.options import (
     BATCH,
     IMAGE,
@@ -388,7 +388,7 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
         or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
     ]
     if missing:
-        from facerf_cli.cli.items.light_weights import readable, write_balls
+        from facerf_cli.work.light_weights import readable, write_balls
 
         drawn = readable(missing)
         paths = [path_of(setup) for setup in drawn]

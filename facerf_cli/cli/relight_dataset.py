@@ -37,9 +37,9 @@ def relight_dataset(
     the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
     and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
     """
-    from facerf_cli.cli.batch import BatchOptions
-    from facerf_cli.cli.items.relight_pairs import relight_subjects
+    from facerf_cli.batch.run import BatchOptions
     from facerf_cli.dataset.pairs import RELIT
+    from facerf_cli.work.relight_pairs import relight_subjects
 
     batch = BatchOptions(dataset / RELIT, overwrite, dry_run, jobs)
     raise typer.Exit(relight_subjects(dataset, pairs, batch, settings_of(context)))

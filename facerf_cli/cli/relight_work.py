@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import Literal
 
 from facerf_cli.baselines import RelightKind
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.naming import NamePattern, split_frame
+from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.batch.report import Outcome
 from facerf_cli.cli.backgrounds import BackgroundChoice
-from facerf_cli.cli.inputs import Item
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling
-from facerf_cli.cli.naming import NamePattern, split_frame
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions, networks_of
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import Shot, follow_all, recipe_of_shots
 from facerf_cli.cli.values import Exposure
 from facerf_cli.errors import FacerfError, UsageError
@@ -115,8 +115,8 @@ class Relight:
 
         A dry run loads no networks, and so estimates no light of a photo.
         """
-        from facerf_cli.cli.items.light_weights import readable
-        from facerf_cli.cli.items.outputs import check_output
+        from facerf_cli.work.light_weights import readable
+        from facerf_cli.work.outputs import check_output
 
         check_output(self.output)
         self.photo.preparation(dry_run, self._networks)()
@@ -130,7 +130,7 @@ class Relight:
 
     def __call__(self, item: Item) -> Outcome:
         """Relight a photo, a frame or a stack."""
-        from facerf_cli.cli.items.relight_photos import relight_item
+        from facerf_cli.work.relight_photos import relight_item
 
         written, facts = relight_item(item, self.for_stale(item))
         outputs = [path.with_suffix(suffix) for path in written for suffix in self.output.suffixes]

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, run_files
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.naming import file_pattern
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.naming import file_pattern
+from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_files
 from facerf_cli.cli.options import (
     DryRunOption,
     InputColourspaceOption,
@@ -18,8 +20,6 @@ from facerf_cli.cli.options import (
     settings_of,
 )
 from facerf_cli.cli.photo_options import FaceOption, LandmarksFromOption, LandmarksOption, PhotoOptions
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.cli.report import Outcome
 from facerf_cli.cli.shots import (
     FRAMES_IN_A_ROW,
     NoCutsOption,
@@ -52,7 +52,7 @@ class Segment:
 
     def __call__(self, item: Item) -> Outcome:
         """Segment the person of every chosen face."""
-        from facerf_cli.cli.items.segment_photos import write_segments
+        from facerf_cli.work.segment_photos import write_segments
 
         tags, facts = write_segments(item, self.photo, self.shots)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

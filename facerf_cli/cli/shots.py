@@ -9,11 +9,12 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.inputs import FILM_SUFFIXES, PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.cli.naming import NamePattern, fields_of, split_frame
-from facerf_cli.cli.options import BATCH, Settings
+from facerf_cli.batch.inputs import FILM_SUFFIXES, PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.naming import NamePattern, fields_of, split_frame
+from facerf_cli.batch.recipe import DigestOf, Recipe
+from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.options import BATCH
 from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.recipe import DigestOf, Recipe
 from facerf_cli.errors import UsageError
 
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
@@ -147,7 +148,7 @@ def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
 def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
     """Follow the face through each shot; what was followed before is kept."""
     if shots and not dry_run:
-        from facerf_cli.cli.items.shot_frames import follow_shot
+        from facerf_cli.work.shot_frames import follow_shot
 
         for shot in shots:
             follow_shot(shot, photo, photo.settings)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import (
     BATCH,
     IMAGE,
@@ -59,7 +59,7 @@ def synth_stage(
     """
     if transport and stage.renderer != "bake":
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
-    from facerf_cli.cli.items.synth_subjects import photograph_people
+    from facerf_cli.work.synth_subjects import photograph_people
 
     batch = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)

@@ -9,7 +9,8 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from facerf_cli.cli.options import Settings, flag, settings_of, was_given
+from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.options import flag, settings_of, was_given
 from facerf_cli.cli.photo_options import Geometry
 from facerf_cli.errors import UsageError
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
@@ -299,7 +300,7 @@ def train(
         validate_every=validate_every or training.validate_every,
         bf16=training.bf16 and form != "paper" if bf16 is None else bf16,  # its gradients overflow
     )
-    from facerf_cli.cli.items.train_run import run_training
+    from facerf_cli.work.train_run import run_training
 
     run_training(
         TrainOptions(

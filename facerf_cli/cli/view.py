@@ -6,8 +6,10 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.batch import BatchOptions, run_files, sums_up
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.recipe import OneRecipe
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_files, sums_up
 from facerf_cli.cli.options import (
     IMAGE,
     DryRunOption,
@@ -26,8 +28,6 @@ from facerf_cli.cli.photo_options import (
     PhotoOptions,
     networks_of,
 )
-from facerf_cli.cli.recipe import OneRecipe
-from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import UsageError
 
 _PAGE, _INDEX = ".html", "index.html"
@@ -46,7 +46,7 @@ class MakePage:
 
     def __call__(self, item: Item) -> Outcome:
         """Write the page of every chosen face."""
-        from facerf_cli.cli.items.view_photos import write_pages
+        from facerf_cli.work.view_photos import write_pages
 
         paths, facts = write_pages(item, self)
         return Outcome(paths, facts)
@@ -114,7 +114,7 @@ def view(
     prepare = photo.preparation(dry_run, networks_of(["portrait"]))
     code = run_files("view", items, work, work.outputs_of, options, photo.settings, OneRecipe(work), prepare)
     if not one and not dry_run and sums_up(items, work.outputs_of, options, photo.settings):
-        from facerf_cli.cli.items.view_photos import write_index
+        from facerf_cli.work.view_photos import write_index
 
         write_index(folder / _INDEX, items, work)
     raise typer.Exit(code)

@@ -32,11 +32,11 @@ from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.workers import in_shards
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.workers import in_shards
 
 _LOG_SCALE, _SHIFT = 0.07, (0.1, 0.03)  # standard deviations; shifts right and down in sides of the crop
 _MOST = 2.0  # standard deviations

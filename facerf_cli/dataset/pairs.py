@@ -38,7 +38,7 @@ from facerf_cli.files.documents import checked, digest
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.logs import LOGGER_NAME, attributes_of_sum, json_line
+from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
 _TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import Selection
-from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
@@ -33,13 +32,14 @@ from facerf_cli.files.drawings import contact_sheet, mark_light
 from facerf_cli.files.images import HALF_MAX, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.pages import filled_page
+from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 
 _TILE_PX = 192
 _SHEET_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # front, left and right, in camera space

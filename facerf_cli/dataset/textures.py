@@ -37,11 +37,11 @@ from facerf_cli.files.images import HALF_MAX, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.logs import LOGGER_NAME, json_line
 from facerf_cli.raster.texture import inpaint, normal_map, unwrap
+from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
-from facerf_cli.workers import in_shards, one_thread
 
 # Images unwrapped together: so many, but no more samples in memory than _VALUES_AT_ONCE.
 _IMAGES_AT_ONCE = 16

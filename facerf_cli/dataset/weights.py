@@ -30,8 +30,8 @@ from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.light.envmap import rotated_weights, texel_integrals
+from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.sky.skies import ProceduralMaps, draw_sky
-from facerf_cli.workers import one_thread
 
 _MOST_MAPS = 1_000_000
 _HEADS_AVERAGED = 16  # enough to find the vertical

@@ -28,8 +28,8 @@ from facerf_cli.evaluation.people import (
 from facerf_cli.evaluation.summary import PublishedFigure
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.image.metrics import tone_drift_deg
 from facerf_cli.light.sphere import direction_to_azel
-from facerf_cli.metrics import tone_drift_deg
 from facerf_cli.models import Models
 
 LAMBERT = "lambert"

@@ -25,9 +25,8 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.image.metrics import tone_of
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.logs import LOGGER_NAME
-from facerf_cli.metrics import tone_of
 from facerf_cli.models import Models, Sides
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import (
@@ -44,6 +43,7 @@ from facerf_cli.pipeline import (
 from facerf_cli.portrait.find import LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.appearance.people import skin_albedo
 
 

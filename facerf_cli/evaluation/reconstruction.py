@@ -11,14 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import torch
 
-from facerf_cli.colour import luminance
 from facerf_cli.composite import Target
 from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.people import Method, SourceFace, common_mask
 from facerf_cli.evaluation.summary import PublishedFigure, paper_table_2
 from facerf_cli.face.head import Head
+from facerf_cli.image.colour import luminance
+from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.metrics import light_error_deg
 
 FULL, MEAN = "all components", "mean face"
 _CELEBA = "130 images of CelebA-HQ; other data than ours"

@@ -19,7 +19,7 @@ from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, metric_name
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, read_document
 from facerf_cli.files.pages import filled_page
-from facerf_cli.logs import json_line
+from facerf_cli.run.logs import json_line
 
 Format = Literal["facerf-evaluation-3"]
 FORMAT: Format = "facerf-evaluation-3"

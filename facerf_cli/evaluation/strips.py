@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 from PIL import Image
 
-from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.evaluation.measure import Comparison, Row
 from facerf_cli.evaluation.summary import metric_named
-from facerf_cli.metrics import best_scale
+from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.image.metrics import best_scale
 
 ERROR_HIGHEST = 0.2  # of display values 0..1: the end of the false colours
 # Dark to bright by violet and orange; the lightness only rises, so that the error also reads in grey.

@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.evaluation.measure import METRICS, Metric, Row
-from facerf_cli.logs import counted
-from facerf_cli.metrics import Interval, mean_interval
+from facerf_cli.image.metrics import Interval, mean_interval
+from facerf_cli.run.logs import counted
 
 
 @dataclass(frozen=True)

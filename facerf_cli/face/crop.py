@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LANDMARKS_M, TOP_M
+from facerf_cli.image.strips import strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
-from facerf_cli.strips import strips
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's pixels
 # A detector's box in `from_landmarks` crops (benchmarks/crop_boxes.py): the crop's side in sides of the box,

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from facerf_cli.face.crop import Box
-from facerf_cli.strips import block_means
+from facerf_cli.image.strips import block_means
 
 DETECTOR_LICENCE = "dlib HOG frontal face detector: Boost Software License 1.0"
 _ENLARGE = 2.0  # largest enlargement of a small image

@@ -7,11 +7,11 @@ import torch
 import trimesh
 from torch import Tensor
 
-from facerf_cli.colour import auto_exposure_ev
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel
 from facerf_cli.face.topology import CONTOUR, grid_triangles
 from facerf_cli.face.view import photo_camera, view_face
+from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 

@@ -10,13 +10,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, check_landmarks
 from facerf_cli.files.documents import Document, Points68, checked
 from facerf_cli.files.json_reader import read_json
 from facerf_cli.files.regular import require_regular
-from facerf_cli.strips import strips
+from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.image.strips import strips
 
 _MAX_BYTES = 1 << 20  # of a landmark file
 _BLOCK_PX = 1 << 16  # converted at a time, so that they stay in the processor's cache

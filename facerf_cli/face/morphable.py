@@ -18,10 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
-from facerf_cli.logs import one_line
+from facerf_cli.run import memory
+from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"

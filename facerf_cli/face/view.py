@@ -9,13 +9,13 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli import memory
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
+from facerf_cli.image.strips import Band, strips
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
-from facerf_cli.strips import Band, strips
+from facerf_cli.run import memory
 
 _TINY = 1e-8
 _FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.logs import shown
+from facerf_cli.run.logs import shown
 
 _MEMORY_BYTES = 6 << 30
 _TIME_S = 300

@@ -20,7 +20,7 @@ from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.stopping import clean_by, end_again
+from facerf_cli.run.stopping import clean_by, end_again
 
 _ABANDONED_S = (
     24 * 3600

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.heif import HEIF_BYTES, decode_heif, is_heif
 from facerf_cli.files.image_metadata import is_ultra_hdr, oiio_error, require_whole_png, utf8_path
 from facerf_cli.files.regular import require_regular
-from facerf_cli.logs import LOGGER_NAME, one_line
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
 

@@ -24,7 +24,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from facerf_cli import __version__
 from facerf_cli.errors import FacerfError
-from facerf_cli.logs import LOGGER_NAME, STDERR, one_line
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, one_line
 
 if sys.platform != "win32":
     import fcntl

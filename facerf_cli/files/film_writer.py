@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.colour import unit_floats
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode
 from facerf_cli.files.film import Film, exact, require_av
 from facerf_cli.files.images import PHOTO_LIMIT_PX
+from facerf_cli.image.colour import unit_floats
 
 _BT709, _LIMITED = 1, 1  # matrix, primaries and transfer; range (ITU-T H.273)
 _CLOCK = 90_000  # ticks a second, in which the times of frames are written

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from facerf_cli.logs import LOGGER_NAME, shown
+from facerf_cli.run.logs import LOGGER_NAME, shown
 
 if sys.platform != "win32":
     import fcntl

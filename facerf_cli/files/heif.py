@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 
-from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.apart import arrays_apart
 from facerf_cli.files.heif_arrays import CODES, PIXELS, PROFILE, SIZE
+from facerf_cli.run import memory
 
 HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 _READERS = "facerf_cli.files.heif_arrays"  # in a process of their own

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facerf_cli.colour import (
+from facerf_cli.image.colour import (
     ACES,
     ACESCG,
     ADOBE_RGB,

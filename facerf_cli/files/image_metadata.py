@@ -18,7 +18,10 @@ from xml.sax.saxutils import quoteattr
 
 import OpenImageIO as oiio
 
-from facerf_cli.colour import (
+from facerf_cli.errors import InputError
+from facerf_cli.files.heif import decode_heif, is_heif
+from facerf_cli.files.icc import space_of_profile
+from facerf_cli.image.colour import (
     ADOBE_RGB,
     CINEON,
     DISPLAY_P3,
@@ -29,10 +32,7 @@ from facerf_cli.colour import (
     find_space,
     linear_space,
 )
-from facerf_cli.errors import InputError
-from facerf_cli.files.heif import decode_heif, is_heif
-from facerf_cli.files.icc import space_of_profile
-from facerf_cli.logs import LOGGER_NAME, one_line
+from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 Attributes = Mapping[str, str | int | float]
 

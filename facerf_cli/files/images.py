@@ -13,22 +13,6 @@ from typing import Any, Literal
 import numpy as np
 import OpenImageIO as oiio
 
-from facerf_cli.colour import (
-    ACES,
-    ACESCG,
-    LINEAR,
-    LINEAR_P3,
-    LINEAR_REC2020,
-    PLAIN_VIEW,
-    ColourSpace,
-    View,
-    auto_exposure_ev,
-    encode_display,
-    from_linear_rec709,
-    named_space,
-    to_linear_rec709,
-    unit_floats,
-)
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode, full_frame, upright
@@ -44,8 +28,24 @@ from facerf_cli.files.image_metadata import (
     states_space,
     utf8_path,
 )
-from facerf_cli.logs import LOGGER_NAME, one_line
-from facerf_cli.strips import rows_of, strips
+from facerf_cli.image.colour import (
+    ACES,
+    ACESCG,
+    LINEAR,
+    LINEAR_P3,
+    LINEAR_REC2020,
+    PLAIN_VIEW,
+    ColourSpace,
+    View,
+    auto_exposure_ev,
+    encode_display,
+    from_linear_rec709,
+    named_space,
+    to_linear_rec709,
+    unit_floats,
+)
+from facerf_cli.image.strips import rows_of, strips
+from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 PHOTO_LIMIT_PX = 64_000_000
 ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.logs import one_line
+from facerf_cli.run.logs import one_line
 
 _MAX_BYTES = 512 << 20  # of a file
 _MAX_OPCODES = 200_000  # FLAME has a few thousand

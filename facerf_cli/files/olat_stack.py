@@ -20,8 +20,6 @@ import torch
 from pydantic import PlainValidator
 from torch import Tensor
 
-from facerf_cli import memory
-from facerf_cli.colour import REC709_CHROMATICITIES
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
@@ -29,7 +27,9 @@ from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
 from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import is_regular, require_regular
-from facerf_cli.logs import one_line
+from facerf_cli.image.colour import REC709_CHROMATICITIES
+from facerf_cli.run import memory
+from facerf_cli.run.logs import one_line
 
 Format = Literal["facerf-olat-1"]
 FORMAT: Format = "facerf-olat-1"

@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
+from facerf_cli.image.strips import Band, enlarged, whole
 from facerf_cli.light.envmap import look_up, mean_radiance
-from facerf_cli.strips import Band, enlarged, whole
 
 _SHARP_PX = 3.0  # standard deviation of a blur up to which an image is drawn at its full size
 _TURN = 2 * math.pi

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
+from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 

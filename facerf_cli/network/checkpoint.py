@@ -15,7 +15,6 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from facerf_cli import memory
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.appearance_network import AppearanceNetwork
@@ -26,6 +25,7 @@ from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
+from facerf_cli.run import memory
 
 _FILLS = (Tensor.uniform_, Tensor.normal_)
 _COPIES = 3  # of a file: its tensors, floats of its halves, and the networks that take them

@@ -5,7 +5,7 @@ from functools import cache
 
 import torch
 
-from facerf_cli.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
 
-from facerf_cli.strips import between, enlarged, strips
+from facerf_cli.image.strips import between, enlarged, strips
 
 _REACH = 0.03  # of the guided filter, in longest sides of the guide
 _SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed

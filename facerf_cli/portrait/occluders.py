@@ -6,10 +6,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.crop import Crop
+from facerf_cli.image.strips import Band, enlarged
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Band, enlarged
 
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered

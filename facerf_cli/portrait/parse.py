@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.topology import MIRROR_68
+from facerf_cli.image.strips import block_means
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import block_means
 
 LANDMARKS = 68 + len(MORE_LANDMARKS)
 _POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs

@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, label
 from torch import Tensor
 
+from facerf_cli.image.strips import Band, enlarged
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.ears import with_ears
@@ -21,7 +22,6 @@ from facerf_cli.portrait.outline import with_outline
 from facerf_cli.portrait.parse import Seen, Square, look
 from facerf_cli.portrait.regions import depth_px, joined_to
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.strips import Band, enlarged
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
 # centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show

@@ -22,8 +22,8 @@ from facerf_cli.files.json_reader import read_json
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.raster.texture import bake_attributes
+from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh

@@ -21,8 +21,8 @@ from torch.utils.data import DataLoader, Dataset
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.logs import LOGGER_NAME
 from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.training.objective import INPUTS, Batch, Objective, seeded
 from facerf_cli.training.processes import (
     broadcast_from_first,

@@ -13,8 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.colour import srgb_to_linear
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits

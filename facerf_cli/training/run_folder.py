@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
 from facerf_cli.files.json_reader import parse_json
-from facerf_cli.logs import LOGGER_NAME, json_line
-from facerf_cli.stopping import unhurried
+from facerf_cli.image.colour import linear_to_srgb
+from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.stopping import unhurried
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)

@@ -13,22 +13,22 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli.colour import (
+from facerf_cli.composite import Composition, Relit
+from facerf_cli.face.head import Head
+from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     FACE_PERCENTILE,
     linear_to_srgb,
     luminance,
     srgb_to_linear,
 )
-from facerf_cli.composite import Composition, Relit
-from facerf_cli.face.head import Head
+from facerf_cli.image.resample import fitted, resized, shrunk_photo
+from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait_field import PortraitField
-from facerf_cli.resize import fitted, resized, shrunk_photo
-from facerf_cli.strips import whole
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept

@@ -1,7 +1,7 @@
 // The page: an image under any light is guide * sum over lights of weight * ratio (basis.py), drawn by WebGL2.
 
 const MOST_LIGHTS = 9;
-const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour (colour.py)
+const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour (image/colour.py)
 const WHITENING = 0.3;
 const PLACES = [[-60, 10], [40, 25], [145, 25], [-145, 25], [0, 80], [75, -10], [-90, 40], [0, -50], [180, 15]]; // of new lights
 

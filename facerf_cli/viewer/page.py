@@ -15,14 +15,14 @@ import numpy as np
 from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
-from facerf_cli.colour import (
+from facerf_cli.files.documents import json_text
+from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     AUTO_EXPOSURE_TARGET_LINEAR,
     FACE_PERCENTILE,
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.files.documents import json_text
 from facerf_cli.viewer.basis import Basis, Samples
 
 _HERE = Path(__file__).parent

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 import facerf_cli as facerf
-from facerf_cli.colour import SOFT_VIEW, encode_display, srgb_to_linear
+from facerf_cli.image.colour import SOFT_VIEW, encode_display, srgb_to_linear
 from facerf_cli.models import Models
 
 

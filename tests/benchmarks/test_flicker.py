@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from _film_of_photo import camera_at, panned
 from flicker import ROUGH, changes, flicker, flow_between, steady_twin, warped_errors
 
-from facerf_cli.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from tools.talking_head import Clip
 
 FRAMES, SIDE = 7, 96

@@ -21,7 +21,7 @@ from facerf_cli.capture.chart import (
     sample,
     shrunk,
 )
-from facerf_cli.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
+from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
 
 with warnings.catch_warnings():

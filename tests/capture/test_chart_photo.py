@@ -21,9 +21,9 @@ from facerf_cli.capture.chart import (
 )
 from facerf_cli.capture.chart_photo import find_chart, find_lattices, read_charts, write_chart_overlays
 from facerf_cli.capture.stage_json import read_capture
-from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.image.colour import linear_to_srgb
 from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, background, chart_image
 from tests.capture.test_chart import kept_luminance
 from tests.capture.test_stage_json import GOOD, capture_at

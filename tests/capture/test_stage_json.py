@@ -11,10 +11,10 @@ import torch
 
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
-from facerf_cli.colour import matrix_to_rec709, named_space
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import read_document, write_document
 from facerf_cli.files.images import write_exr
+from facerf_cli.image.colour import matrix_to_rec709, named_space
 
 K = [[500.0, 0, 33], [0, 500.0, 30], [0, 0, 1]]
 # A camera 2 m before the origin, upright: OpenCV's y is down and its z looks toward the origin (world -z).

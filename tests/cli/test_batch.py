@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.options import Settings
-from facerf_cli.cli.recipe import Recipe
-from facerf_cli.cli.report import Outcome
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import Recipe
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.logs import configure_logging
+from facerf_cli.run.logs import configure_logging
 from tests.processes import wait_until
 
 
@@ -166,10 +166,10 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SLOW_VERB = """
 import sys, time
 from pathlib import Path
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.report import Outcome
 from facerf_cli.cli.options import Settings
-from facerf_cli.cli.recipe import Recipe
+from facerf_cli.batch.recipe import Recipe
 from facerf_cli.files.atomic import atomic_path
 
 def outputs_of(item):

@@ -10,9 +10,9 @@ from safetensors.numpy import save_file
 
 from facerf_cli import __version__
 from facerf_cli.cli.doctor import EXTRAS, MISSING
-from facerf_cli.cli.items import doctor_facts as doctor
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main
+from facerf_cli.work import doctor_facts as doctor
 
 ROOT = Path(__file__).parents[2]
 

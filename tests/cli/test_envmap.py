@@ -4,12 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.items.draw_envmaps import write_sheet
 from facerf_cli.cli.lights import collect_setups
 from facerf_cli.files.atomic import _machine
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
 from facerf_cli.synth.sky.skies import draw_sky
+from facerf_cli.work.draw_envmaps import write_sheet
 
 
 def test_writes_seeded_maps_and_skips_finished_ones(

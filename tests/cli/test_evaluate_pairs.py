@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.main import main
+from facerf_cli.work.evaluation_settings import EvaluateOptions
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
 
 Said = pytest.CaptureFixture[str]

@@ -14,12 +14,8 @@ import pytest
 from PIL import Image
 
 from facerf_cli import pipeline
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items import evaluate_faces
-from facerf_cli.cli.items.evaluate_faces import FaceSettings, faces_of, load_methods
-from facerf_cli.cli.items.evaluation_settings import EvaluateOptions, SplitOptions
-from facerf_cli.cli.items.photos import load_models_once
-from facerf_cli.cli.options import Settings
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
@@ -31,6 +27,10 @@ from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from facerf_cli.models import Models
 from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.work import evaluate_faces
+from facerf_cli.work.evaluate_faces import FaceSettings, faces_of, load_methods
+from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
+from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
 

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.items import evaluate as evaluation_run
-from facerf_cli.cli.items.evaluate import keep_images
-from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
-from facerf_cli.cli.options import Settings
+from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, configure_logging
+from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
+from facerf_cli.work import evaluate as evaluation_run
+from facerf_cli.work.evaluate import keep_images
+from facerf_cli.work.evaluation_settings import EvaluateOptions
 from tests.evaluation.toy_protocol import (
     HEIGHT,
     LAYOUT,

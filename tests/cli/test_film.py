@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from skimage.data import astronaut
 
-from facerf_cli.cli.items import relight_photos
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
+from facerf_cli.work import relight_photos
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli import folder_index
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.options import Settings, Shard
+from facerf_cli.batch import made_from as folder_index
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import NOT_IN_RECIPE, differences, recipe_of
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.recipe import NOT_IN_RECIPE, differences, recipe_of
-from facerf_cli.cli.report import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main

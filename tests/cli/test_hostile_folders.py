@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
+from facerf_cli.batch.naming import NamePattern
+from facerf_cli.batch.report import report_name
+from facerf_cli.batch.run import _exist, print_path
+from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
-from facerf_cli.cli.batch import _exist, print_path
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES, collect_items
-from facerf_cli.cli.naming import NamePattern
-from facerf_cli.cli.options import Shard
-from facerf_cli.cli.report import report_name
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.pairs import read_array
 from facerf_cli.face.fit import load_fit
@@ -23,7 +23,7 @@ from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.olat_stack import is_olat_stack, read_olat_stack
 from facerf_cli.files.regular import is_regular, require_regular
 from facerf_cli.files.toml_files import read_toml
-from facerf_cli.logs import json_line, shown
+from facerf_cli.run.logs import json_line, shown
 from tests.cli.toy_batch import run
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.light_weights import near_lights_of, strengths, weights_over_rig
+from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.light_entries import lit_images, preset_names
 from facerf_cli.cli.lights import collect_setups
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
 from facerf_cli.light.studio import StudioLight
+from facerf_cli.work.light_weights import near_lights_of, strengths, weights_over_rig
 
 
 def single(text: str) -> StudioLight:

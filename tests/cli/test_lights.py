@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
+from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.values import parse_lights
@@ -19,6 +18,7 @@ from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
+from facerf_cli.work.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
 
 HEIGHT_PX = 16
 

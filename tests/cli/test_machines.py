@@ -9,11 +9,12 @@ import pytest
 import typer
 
 from facerf_cli import main
-from facerf_cli.cli.batch import BatchOptions, sums_up
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.options import JobsOption, Settings, Shard, settings_of, with_machines
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.run import BatchOptions, sums_up
+from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.cli.options import JobsOption, settings_of, with_machines
 from facerf_cli.errors import UsageError
-from facerf_cli.logs import configure_logging
+from facerf_cli.run.logs import configure_logging
 from tests.cli.toy_batch import outputs_of, run
 
 FOLDER_VERBS = {

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 from skimage.data import astronaut
 
-from facerf_cli import memory
-from facerf_cli.cli.batch import _Work
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.options import Settings
-from facerf_cli.cli.report import Outcome
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import _Work
+from facerf_cli.batch.settings import Settings
 from facerf_cli.files.images import write_display
 from facerf_cli.main import global_options_first, main
+from facerf_cli.run import memory
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:

@@ -7,7 +7,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from facerf_cli.cli.options import Settings, with_groups
+from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.options import with_groups
 from facerf_cli.option import Only, option
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.colour import luminance
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
+from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.models import SHIPPED_NETWORKS
@@ -135,7 +135,7 @@ def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path) -> None
 def test_the_contact_sheet_does_not_grow_with_the_lights(
     frame: str, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.cli.items.olat_stacks._SHEET_PX", 9 * 20**2)
+    monkeypatch.setattr("facerf_cli.work.olat_stacks._SHEET_PX", 9 * 20**2)
     assert predict(given, tmp_path, "--lights", "9", "--frame", frame, "--size", "64") == 0
     sheet = read_image(tmp_path / "astronaut_olat.png").pixels
     assert (

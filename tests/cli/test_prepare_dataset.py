@@ -24,8 +24,8 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
-from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.main import main
+from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.dataset.capture import Truth, write_capture
 
 LIGHTS = 12

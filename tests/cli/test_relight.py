@@ -91,7 +91,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.cli.items.relight_photos._HELD", 1 << 30)  # so that one frame fits
+    monkeypatch.setattr("facerf_cli.work.relight_photos._HELD", 1 << 30)  # so that one frame fits
     line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
     assert relight(given, tmp_path, *line) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
@@ -114,8 +114,8 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
             held.append(weakref.ref(one.texture))
             yield one
 
-    monkeypatch.setattr("facerf_cli.cli.items.relight_photos._HELD", 1 << 30)  # so that one light fits
-    monkeypatch.setattr("facerf_cli.cli.items.relight_photos.relit_by", watched)
+    monkeypatch.setattr("facerf_cli.work.relight_photos._HELD", 1 << 30)  # so that one light fits
+    monkeypatch.setattr("facerf_cli.work.relight_photos.relit_by", watched)
     assert relight(given, tmp_path, *lights, "--composite", composite) == 0
     assert len(held) > 2
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.cli.items.evaluate import run_protocol
-from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
-from facerf_cli.cli.options import Settings, Shard
-from facerf_cli.logs import configure_logging
+from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.main import main
+from facerf_cli.run.logs import configure_logging
+from facerf_cli.work.evaluate import run_protocol
+from facerf_cli.work.evaluation_settings import EvaluateOptions
 from tests.dataset.capture import write_capture
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.toy_protocol import LAYOUT, Toy, evaluate, items

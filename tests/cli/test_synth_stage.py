@@ -13,8 +13,8 @@ from safetensors.numpy import load_file
 
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.files.images import read_image
-from facerf_cli.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.main import main
+from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.exr_layers import exr_layers
 
 LIGHTS = 6

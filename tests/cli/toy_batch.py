@@ -9,13 +9,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from facerf_cli.cli.batch import BatchOptions, run_batch
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.options import Settings, Shard
-from facerf_cli.cli.report import Outcome
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.logs import LOGGER_NAME, configure_logging
+from facerf_cli.run.logs import LOGGER_NAME, configure_logging
 
 
 def outputs_of(item: Item) -> list[Path]:

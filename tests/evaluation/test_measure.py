@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import measure as module
 from facerf_cli.evaluation.measure import METRICS, Case, Comparison, Measures, Row, measure, shown
-from facerf_cli.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
+from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.image.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 
 LANDMARKS = np.random.default_rng(5).uniform(5, 20, (68, 2))
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Measures, measure
 from facerf_cli.evaluation.pairs import collect_pairs, compare_pair
 from facerf_cli.files.images import write_exr
+from facerf_cli.image.colour import srgb_to_linear
 
 NAMES = ("anna/one", "anna/two", "bert/one")
 SHAPE = (6, 9, 3)

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.evaluate import run_protocol
-from facerf_cli.cli.items.evaluation_settings import EvaluateOptions
-from facerf_cli.cli.options import Settings
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.recipe import NOT_IN_RECIPE
+from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.olat import TABLE_1
 from facerf_cli.evaluation.summary import Layout
+from facerf_cli.work.evaluate import run_protocol
+from facerf_cli.work.evaluation_settings import EvaluateOptions
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(

@@ -19,7 +19,7 @@ COLOURS = np.array([[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.3, 0.3, 0.7], [0.5, 0.5
 
 def images_of(folder: Path, size: tuple[int, int] = (36, 50), bits: int = 8) -> list[Path]:
     """Frames of one colour each, as PNG; the colours are display values."""
-    from facerf_cli.colour import PLAIN_VIEW, srgb_to_linear
+    from facerf_cli.image.colour import PLAIN_VIEW, srgb_to_linear
 
     paths = []
     for number, colour in enumerate(COLOURS):

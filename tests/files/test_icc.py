@@ -8,9 +8,9 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms
 
-from facerf_cli import colour
 from facerf_cli.files.icc import linear_profile, space_of_profile
 from facerf_cli.files.images import read_image
+from facerf_cli.image import colour
 from tests import icc_profiles
 
 COLOURS = np.random.default_rng(5).integers(30, 226, (12, 17, 3), np.uint8)

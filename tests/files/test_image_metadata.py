@@ -11,12 +11,12 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from facerf_cli.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import embed_xmp, read_header, xmp_packet
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import is_olat_stack
-from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, Provenance
+from facerf_cli.image.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
+from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 
 IPTC = "{http://iptc.org/std/Iptc4xmpExt/2008-02-29/}DigitalSourceType"
 

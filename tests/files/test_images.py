@@ -7,11 +7,11 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from facerf_cli import colour
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.image_metadata import space_of_file
 from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr
-from facerf_cli.logs import Provenance
+from facerf_cli.image import colour
+from facerf_cli.run.logs import Provenance
 from tests.exr_layers import exr_layers
 
 VALUES = np.random.default_rng(1).random((23, 34, 4)).astype(np.float32)  # [H, W, RGBA], not square

@@ -12,12 +12,12 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from facerf_cli import memory
-from facerf_cli.cli.inputs import PHOTO_SUFFIXES
-from facerf_cli.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_display
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.run import memory
 from tests import icc_profiles
 
 ULTRA_HDR = Path(__file__).with_name("ultra_hdr.jpg")  # examples/astronaut.jpg, with a gain map

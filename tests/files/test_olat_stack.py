@@ -13,7 +13,6 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli import memory
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files import olat_stack
 from facerf_cli.files.images import read_image, write_exr
@@ -26,6 +25,7 @@ from facerf_cli.files.olat_stack import (
     stream_olats,
     write_olat_stack,
 )
+from facerf_cli.run import memory
 
 LIGHTS, HEIGHT, WIDTH = 5, 24, 17  # not square
 DRAW = np.random.default_rng(3)

@@ -8,10 +8,10 @@ import OpenImageIO as oiio
 import pytest
 import tifffile
 
-from facerf_cli import colour
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
-from facerf_cli.logs import COMPOSITE_SOURCE_TYPE, Provenance
+from facerf_cli.image import colour
+from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
 from tests.files.test_image_metadata import IPTC, properties
 

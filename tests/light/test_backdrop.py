@@ -5,10 +5,10 @@ from functools import partial
 import numpy as np
 import torch
 
+from facerf_cli.image.strips import whole
 from facerf_cli.light.backdrop import backdrop
 from facerf_cli.light.sphere import direction_to_uv
 from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays, rays_of_rows
-from facerf_cli.strips import whole
 
 
 def seen(envmap: torch.Tensor, rotate_deg: float = 0.0, blur: float = 0.0) -> np.ndarray:

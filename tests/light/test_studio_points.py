@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.colour import REC709_CHROMATICITIES, luminance, rgb_to_xyz
+from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, rgb_to_xyz
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import PointLights, blackbody_rgb, far_samples, intensity_of

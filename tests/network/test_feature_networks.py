@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.colour import linear_to_srgb
+from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.network.appearance_network import AppearanceNetwork, AppearanceSettings
 from facerf_cli.network.feature_networks import (
     LightNetwork,

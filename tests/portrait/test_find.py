@@ -9,11 +9,11 @@ import skimage.data
 import skimage.transform
 from PIL import Image
 
-from facerf_cli.colour import srgb_to_linear
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.dlib_landmarks import predictor_path
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import averaged, detect_faces, find_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square

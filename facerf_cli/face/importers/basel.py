@@ -27,7 +27,7 @@ from facerf_cli.face.importers.source import SourceModel, require_mesh
 from facerf_cli.files.apart import arrays_apart
 from facerf_cli.files.json_reader import parse_json
 from facerf_cli.files.regular import require_regular
-from facerf_cli.logs import one_line
+from facerf_cli.run.logs import one_line
 
 _READERS = "facerf_cli.face.importers.basel_arrays"  # in a process of their own
 _LICENCE_2009 = "Basel Face Model 2009, (c) University of Basel; non-commercial use, by its licence agreement"

@@ -23,7 +23,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import SourceModel, read_npz, require_mesh
 from facerf_cli.face.morphable import NPZ_ERRORS
 from facerf_cli.files.inert_pickle import array_of, read_inert_pickle, read_inert_stream
-from facerf_cli.logs import one_line
+from facerf_cli.run.logs import one_line
 
 IDENTITIES = 300  # the first shapes; the others are expressions
 _MAX_SHAPES = 500

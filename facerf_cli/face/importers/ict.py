@@ -19,7 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import EXPRESSION_STD, SourceHead, SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS
 from facerf_cli.files.downloads import PublishedFile, cache_folder, fetch
-from facerf_cli.logs import one_line
+from facerf_cli.run.logs import one_line
 
 _IDS = (
     "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 "

@@ -8,7 +8,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import NPZ_ERRORS, check_npz_sizes
-from facerf_cli.logs import one_line
+from facerf_cli.run.logs import one_line
 
 EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means
 _MAX_VERTICES, _MAX_TRIANGLES = 120_000, 240_000

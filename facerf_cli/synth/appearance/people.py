@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.colour import REC709_CHROMATICITIES, rgb_to_xyz
+from facerf_cli.image.colour import REC709_CHROMATICITIES, rgb_to_xyz
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, places_mm, plain_noise
 

@@ -22,6 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.appearance.people import hair_albedo
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
 from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, photograph_head
@@ -33,7 +34,6 @@ from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.random_fields import Uniform
 from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
-from facerf_cli.workers import in_shards
 
 BRIGHTEST = 6.0  # largest stored radiance, over the mean radiance of the face
 _HIGHLIGHTS = 10  # only the brightest lights have highlights

@@ -35,8 +35,8 @@ from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.camera import Camera, crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv, unwrap
+from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.bank.texture_samples import HeadFields, Sample, draw_sample, head_fields
-from facerf_cli.workers import in_shards
 
 # Expression shapes that are never drawn: they do not move skin, or correct another shape.
 _LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")

@@ -24,8 +24,8 @@ from PIL import Image
 from safetensors import safe_open
 from torch import Tensor
 
-from facerf_cli.colour import linear_to_srgb
 from facerf_cli.errors import InputError
+from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE

@@ -22,6 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
+from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.texture_samples import draw_light
@@ -30,7 +31,6 @@ from facerf_cli.synth.random_fields import Uniform
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.synth.subjects import draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
-from facerf_cli.workers import in_shards
 
 BACKGROUND_PX = 320
 _MAP_PX = 768  # width of the maps

@@ -28,6 +28,7 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.square import SIDE_PX, SIDES
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
+from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.bank.texture_samples import draw_light
@@ -41,7 +42,6 @@ from facerf_cli.synth.portraits import (
 )
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
-from facerf_cli.workers import in_shards
 
 _LOOK_PX = 256  # texture side of looks other than the person's own
 _BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=6)

@@ -19,7 +19,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
-from facerf_cli.workers import one_thread
+from facerf_cli.run.workers import one_thread
 
 BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; its other side is 1 - BACK_U
 _CROWN_MM_PER_DEG = 1.4  # arc length over the crown

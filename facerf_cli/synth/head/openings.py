@@ -14,9 +14,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.distance import cdist
 
 from facerf_cli.face.topology import LANDMARK_UV, UV_SIZE_MM, grid_uv
+from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.head.cranium import BACK_U, CROWN_LEVEL, NECK_LEVEL
 from facerf_cli.synth.head.mesh import arc_lengths
-from facerf_cli.workers import one_thread
 
 # Landmarks along the upper and the lower edge of an opening; the right eye mirrors the left one.
 _ARCS = {"eye_left": ([36, 37, 38, 39], [39, 40, 41, 36]), "mouth": ([*range(60, 65)], [64, 65, 66, 67, 60])}

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from facerf_cli.cli.inputs import Item
-from facerf_cli.cli.items.photos import _names
+from facerf_cli.batch.inputs import Item
 from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.work.photos import _names
 
 ITEM = Item(Path("me.jpg"), Path("out/me"), "me")
 

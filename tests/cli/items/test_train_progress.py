@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from facerf_cli.cli.items.train_progress import TrainProgress
-from facerf_cli.cli.options import Settings
+from facerf_cli.batch.settings import Settings
+from facerf_cli.work.train_progress import TrainProgress
 
 
 def row(step: int, seconds: float) -> dict[str, Any]:

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.colour import lab_d65
 from facerf_cli.face.topology import LANDMARK_UV
-from facerf_cli.metrics import ita_deg
+from facerf_cli.image.colour import lab_d65
+from facerf_cli.image.metrics import ita_deg
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import (
     RANDOM_TEXTURES,

@@ -1,0 +1,362 @@
+"""The contract of every verb that walks folders: what is read, skipped, written and reported.
+
+A verb passes functions to `run_batch` (files) or `run_items` (other items): `outputs_of(item)` names the
+files of a finished item, `process(item)` makes them, and `recipes_of` says what else shapes them. `process`
+raises `InputError` for a faulty item (the run continues); any other `FacerfError` concerns the whole run and
+ends it.
+"""
+
+import logging
+import os
+import sys
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.made_from import FolderIndex, Made, read_row
+from facerf_cli.batch.naming import file_pattern
+from facerf_cli.batch.recipe import RecipesOf
+from facerf_cli.batch.report import ItemResult, Outcome, add_row, open_report, report_name, unusable
+from facerf_cli.batch.settings import Overwrite, Settings, Shard, workers_of
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.files.atomic import all_or_none, sweep_leftovers
+from facerf_cli.files.folder_lock import alone_in
+from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, unexpected
+from facerf_cli.run.stopping import end_again
+from facerf_cli.run.workers import process_died, spread
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """The options of the contract, as the user gave them."""
+
+    output: Path
+    overwrite: Overwrite = "changed"
+    dry_run: bool = False
+    jobs: int = 1  # 0, with `--ray`: as many as there are processors
+    in_a_row: int = 1  # neighbouring items that one of the processes takes
+    print_outputs: bool = True  # on stdout; not those that are to be joined
+
+
+def run_batch(
+    verb: str,
+    inputs: Sequence[str],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    recipes_of: RecipesOf,
+    suffixes: frozenset[str] = PHOTO_SUFFIXES,
+    prepare: Callable[[], object] | None = None,
+    name: str | None = None,
+) -> int:
+    """Process the files that `inputs` name: `run_files` over `collect_items`, with the pattern of --name."""
+    items = collect_items(inputs, options.output, suffixes, file_pattern(name), settings.null_separated)
+    return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
+
+
+def run_files(
+    verb: str,
+    items: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    recipes_of: RecipesOf,
+    prepare: Callable[[], object] | None = None,
+    index: FolderIndex | None = None,
+) -> int:
+    """Process items that are files: `run_items`, and a missing file is an error of its item."""
+    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of, index)
+    missing = [item for item in items if options.dry_run and not os.path.exists(item.input_path)]
+    for item in missing:
+        log.error("%s: no such file; check the path", item.input_path)
+    return max(code, int(bool(missing)))
+
+
+def run_items(
+    verb: str,
+    items: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    prepare: Callable[[], object] | None = None,
+    recipes_of: RecipesOf | None = None,
+    index: FolderIndex | None = None,
+) -> int:
+    """Process the items and return the exit code: 0 all done, 1 some failed.
+
+    An item is finished if its outputs exist and, with `recipes_of`, were made from the same input by the
+    same recipe. With `--shard` only this process's share of them, which has a report of its own. `prepare` is
+    called once, before the first item, and not at all where everything is finished: it loads what `process`
+    needs, so that an error in that is reported once; in a dry run, too. An `index` that was read stands for
+    that of `recipes_of`. With several workers `process` runs
+    in other processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be
+    used.
+    """
+    items = settings.shard.share(items)
+    with ExitStack() as stack:
+        is_new = not options.output.exists()
+        if not options.dry_run:
+            try:
+                stack.enter_context(alone_in(options.output, _lock_name(settings.shard)))
+            except OSError as error:
+                raise unusable(options.output, error) from error
+        batch = _Batch(verb, items, process, outputs_of, options, settings)
+        if index is None and recipes_of:
+            index = FolderIndex(options.output, verb, settings.shard, recipes_of)
+        return _run_alone(batch, is_new, prepare, index)
+
+
+@dataclass(frozen=True)
+class _Batch:
+    """This process's share of a run: the arguments of `run_items`."""
+
+    verb: str
+    items: Sequence[Item]
+    process: Callable[[Item], Outcome]
+    outputs_of: Callable[[Item], Sequence[Path]]
+    options: BatchOptions
+    settings: Settings
+
+
+def _run_alone(
+    batch: _Batch, is_new: bool, prepare: Callable[[], object] | None, index: FolderIndex | None
+) -> int:
+    """Run the share while no other process writes to the folder; `is_new`: it did not exist before."""
+    verb, outputs_of, options, settings = batch.verb, batch.outputs_of, batch.options, batch.settings
+    states = {item: _why_again(item, outputs_of(item), options, index) for item in batch.items}
+    reasons = {item: reason for item, (reason, _) in states.items()}
+    todo = [replace(item, stale=states[item][1]) for item in batch.items if reasons[item] is not None]
+    finished = [item for item in batch.items if reasons[item] is None]
+    if todo and prepare:
+        prepare()
+    if options.dry_run:
+        _say_what_is_made_again(reasons)
+        return _list_what_would_be_done(todo, finished, outputs_of)
+    report = open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
+    if index and (todo or index.has_news):
+        index.open()
+    _say_what_is_skipped(reasons, options)
+    if index and index.edited:
+        kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
+        log.warning(kept, len(index.edited))
+    failures = _process(batch, todo, report, index)
+    if failures and len(batch.items) > 1:
+        log.error("%d of %d failed; %s has a row for each", failures, len(batch.items), report)
+    elif failures and is_new:
+        lock = options.output / _lock_name(settings.shard)
+        _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
+    return 1 if failures else 0
+
+
+def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderIndex | None) -> int:
+    """Process the items that are not finished, write their rows, and count failures."""
+    failures = 0
+    memory.collect_as_usual()
+    workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
+    at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+    work = _Work(batch.process, index is not None, batch.settings.job_bytes(at_once))
+    try:
+        with closing(spread(work, todo, workers, _broken)) as results:
+            for result in _with_progress(results, len(todo), batch.verb, batch.settings):
+                if result.stops_the_run is not None:
+                    raise result.stops_the_run
+                if index and result.made:
+                    index.add(result.made, batch.outputs_of(result.item))
+                add_row(report, batch.verb, result)
+                failures += _print_result(result, batch.options)
+    finally:
+        if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
+            for folder in {path.parent for item in todo for path in batch.outputs_of(item)}:
+                sweep_leftovers(folder)
+    return failures
+
+
+def all_finished(
+    items: Sequence[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    index: FolderIndex,
+) -> bool:
+    """True if this process's share of the items is finished, so that nothing needs to be loaded."""
+    share = settings.shard.share(items)
+    return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
+
+
+def _lock_name(shard: Shard) -> str:
+    """The name of a run's lock; each shard has its own, since shards run at the same time."""
+    return ".facerf-lock" if shard.of == 1 else f".facerf-lock-{shard.number}-of-{shard.of}"
+
+
+def sums_up(
+    items: Sequence[Item],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+) -> bool:
+    """True if a verb may now write what depends on all items.
+
+    Without `--shard` always. A shard may when the items of all shards are finished, so the last one does; not
+    with `--overwrite always`, since an earlier run's outputs look the same.
+    """
+    if settings.shard.of == 1:
+        return True
+    always = options.overwrite == "always"
+    left = len(items) if always else sum(not _exist(outputs_of(item)) for item in items)
+    if left:
+        state = "may be unfinished" if always else f"({left}) are unfinished"
+        log.info(
+            "items %s, so there is no summary; a run without --shard and --overwrite always writes it", state
+        )
+    return not left
+
+
+@dataclass(frozen=True)
+class _OfFile:
+    """`process` for items that are files."""
+
+    process: Callable[[Item], Outcome]
+
+    def __call__(self, item: Item) -> Outcome:
+        require_regular(item.input_path)
+        with all_or_none():
+            return self.process(item)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Runs `process` on an item and returns an `ItemResult`, whatever happens."""
+
+    process: Callable[[Item], Outcome]
+    indexed: bool
+    memory_bytes: int
+
+    def __call__(self, item: Item) -> ItemResult:
+        start_s = time.perf_counter()
+        memory.set_limit(self.memory_bytes)
+
+        def result(**ends: Any) -> ItemResult:
+            return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
+
+        try:
+            can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
+            read = read_row(item.input_path) if self.indexed and can_be_read else None
+            outcome = self.process(item)
+            made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
+            return result(outcome=outcome, made=made)
+        except InputError as error:
+            return result(error=str(error), trace=traceback.format_exc())
+        except FacerfError as error:
+            return result(stops_the_run=error)
+        except Exception as error:  # a bug must not cost the other items
+            return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+        finally:
+            memory.give_back()
+            end_again()
+
+
+def _broken(item: Item, error: Exception) -> ItemResult:
+    """The result of an item whose process died."""
+    return ItemResult(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
+
+
+def _why_again(
+    item: Item, outputs: Sequence[Path], options: BatchOptions, index: FolderIndex | None
+) -> tuple[str | None, frozenset[Path]]:
+    """Say why an item must be made, and which of its outputs; see `FolderIndex.why_again`."""
+    if options.overwrite == "always":
+        return "", frozenset(outputs)
+    if options.overwrite == "never" or index is None:
+        return (None, frozenset()) if _exist(outputs) else ("", frozenset(outputs))
+    return index.why_again(item.input_path, outputs)
+
+
+def _exist(outputs: Sequence[Path]) -> bool:
+    return bool(outputs) and all(map(_is_there, outputs))
+
+
+def _is_there(path: Path) -> bool:
+    """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
+    return path.is_dir() or (is_regular(path) and path.stat().st_size > 0)
+
+
+def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
+    """Remove a new folder in which only these records are; what another process wrote there stays."""
+    if not any(path.is_file() and path not in records for path in folder.rglob("*")):
+        for record in records:
+            record.unlink()
+        for empty in sorted([folder, *folder.rglob("*")], reverse=True):
+            empty.rmdir()
+
+
+def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:
+    """Log how many items are finished, and how many are made again for each reason."""
+    if finished := sum(reason is None for reason in reasons.values()):
+        advice = "" if options.overwrite == "never" else " from the same inputs and options"
+        log.info("%d of %d already finished%s", finished, len(reasons), advice)
+    _say_what_is_made_again(reasons)
+
+
+def _say_what_is_made_again(reasons: Mapping[Item, str | None]) -> None:
+    counts = Counter(filter(None, reasons.values()))
+    for reason, count in sorted(counts.items()):
+        log.info("%d made again: %s", count, reason)
+
+
+def _list_what_would_be_done(
+    todo: list[Item], finished: list[Item], outputs_of: Callable[[Item], Sequence[Path]]
+) -> int:
+    for item in todo:
+        for path in outputs_of(item):
+            print_path(f"{item.input_path} -> {path}")
+    log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
+    return 0
+
+
+def _print_result(result: ItemResult, options: BatchOptions) -> int:
+    """Print outputs to stdout, an error to stderr; return 1 for a failure."""
+    if result.error:
+        log.error("%s", result.error)
+        if result.trace:
+            log.debug("%s", "\n" + result.trace)
+        return 1
+    if result.outcome and options.print_outputs:
+        for path in result.outcome.outputs:
+            print_path(path)
+    return 0
+
+
+def print_path(text: object) -> None:
+    """Print a name to standard output, for people escaped, for programs as it is."""
+    print(escaped(str(text)) if sys.stdout.isatty() else text, flush=True)
+
+
+def _with_progress(
+    results: Iterator[ItemResult], total: int, verb: str, settings: Settings
+) -> Iterator[ItemResult]:
+    """Pass the results through, with a progress bar on stderr if that is a terminal."""
+    # imported here, since --help does without it
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
+    redirect = sys.stdout.isatty()
+    with Progress(*columns, console=STDERR, disable=not shown, redirect_stdout=redirect) as progress:
+        task = progress.add_task(verb, total=total)
+        for result in results:
+            yield result
+            progress.advance(task)

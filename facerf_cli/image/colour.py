@@ -1,0 +1,443 @@
+"""Colour spaces: from the encodings of files to scene-linear Rec.709, and from there to sRGB for display.
+
+Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
+the ACES spaces). Constants are those of colour-science, which is imported only for what few files need: other
+transfer functions, and colour temperatures. A name that is not defined here is looked up in an OpenColorIO
+configuration (`ocio`). A view turns scene-linear values into values of a display.
+"""
+
+import difflib
+import importlib
+import math
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+
+from facerf_cli.errors import UsageError
+from facerf_cli.image import display as ocio
+
+# Chromaticities x, y of red, green, blue and white.
+REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+_P3_CHROMATICITIES = (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.3127, 0.3290)
+_REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+_AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+_AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+_ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
+_ROMM_CHROMATICITIES = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 0.3585)
+
+# From XYZ to the cone responses of the Bradford transform (Lam 1985).
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
+# Limits of chromaticities: the tolerance of equal ones, the largest coordinate, and the smallest area or
+# coordinate of primaries that span a space.
+_SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
+
+AUTO_EXPOSURE_PERCENTILE = 99.0
+ExposureRule = Literal["auto", "face"]
+FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
+MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more than one that sees it all
+_BLACK = 1e-9
+AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
+SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
+_WHITENING = 0.3  # of colours that the soft view bends, by how much it does
+
+
+def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Decode sRGB (IEC 61966-2-1), float32 of any shape; negative values are mirrored."""
+    size = np.abs(encoded)
+    linear = np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4)
+    return np.copysign(linear, encoded).astype(np.float32)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode sRGB (IEC 61966-2-1), float32 of any shape, also beyond 1; negative values are mirrored."""
+    size = np.abs(linear)
+    encoded = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055)
+    return np.copysign(encoded, linear).astype(np.float32)
+
+
+@cache
+def colour_science() -> Any:
+    """Import colour-science without its warnings and side effects; it takes most of a second."""
+    with np.printoptions(), warnings.catch_warnings(), _without("OpenImageIO"):
+        warnings.simplefilter("ignore")  # about its optional dependencies
+        return importlib.import_module("colour")
+
+
+@contextmanager
+def _without(name: str) -> Iterator[None]:
+    """Hide a module from imports in the block.
+
+    colour-science would keep types of OpenImageIO alive, which OpenImageIO reports as leaks at exit.
+    """
+    modules: dict[str, Any] = sys.modules
+    hidden = modules.get(name)
+    modules[name] = None  # makes Python raise ImportError for it
+    try:
+        yield
+    finally:
+        del modules[name]
+        if hidden is not None:
+            modules[name] = hidden
+
+
+def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
+    decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
+    return np.copysign(decoded, encoded).astype(np.float32)
+
+
+def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
+    curve = colour_science().RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding
+    return np.copysign(curve(np.abs(encoded)), encoded).astype(np.float32)
+
+
+def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert the transfer function of ROMM RGB (ISO 22028-2), which is ProPhoto RGB."""
+    decoded = colour_science().models.cctf_decoding_ROMMRGB(np.abs(encoded))
+    return np.copysign(decoded, encoded).astype(np.float32)
+
+
+def _cineon_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert Kodak's Cineon curve, of code values 0..1023 as 0..1; black is 0 and diffuse white 1."""
+    return np.asarray(colour_science().models.log_decoding_Cineon(encoded), np.float32)
+
+
+@dataclass(frozen=True)
+class ColourSpace:
+    """A colour space by its primaries and decoding curve; without primaries OpenColorIO converts it."""
+
+    name: str
+    chromaticities: tuple[float, ...] | None
+    decode: Callable[[np.ndarray], np.ndarray] | None = None  # None if linear
+    config: str = ""  # OpenColorIO's, which knows the name
+
+    @property
+    def is_linear(self) -> bool:
+        """True if values are known to be proportional to light."""
+        return self.chromaticities is not None and self.decode is None
+
+
+LINEAR = ColourSpace("linear Rec.709", REC709_CHROMATICITIES)
+SRGB = ColourSpace("sRGB", REC709_CHROMATICITIES, srgb_to_linear)
+DISPLAY_P3 = ColourSpace("Display P3", _P3_CHROMATICITIES, srgb_to_linear)
+ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, _adobe_to_linear)
+ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
+REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
+LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
+LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
+ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
+PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _romm_to_linear)
+CINEON = ColourSpace("Cineon log", REC709_CHROMATICITIES, _cineon_to_linear)
+
+# Compared without case, spaces and punctuation; includes the interchange names that OpenImageIO uses.
+_ALIASES = {
+    LINEAR: "linear linrec709 linearrec709 linrec709scene linsrgb linearrec709srgb",
+    SRGB: "srgb srgbrec709scene srgbtexture srgbtx srgbencodedrec709srgb",
+    DISPLAY_P3: "displayp3 p3 srgbp3d65scene srgbdisplayp3",
+    ADOBE_RGB: "adobergb adobergb1998 g22adobergbscene",
+    ACESCG: "acescg linap1 linap1scene",
+    REC2020: "rec2020 bt2020",
+    LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
+    LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
+    ACES: "aces20651 linap0 linap0scene",
+    PROPHOTO: "prophoto prophotorgb romm rommrgb",
+    CINEON: "cineon cineonlog kodaklog",
+}
+_BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
+
+
+def find_space(name: str, config: str = "") -> ColourSpace | None:
+    """Return the space of this name, defined here or by OpenColorIO; None if it is unknown."""
+    plain = "".join(letter for letter in name.lower() if letter.isalnum())
+    if plain in _BY_ALIAS:
+        return _BY_ALIAS[plain]
+    return ColourSpace(name, None, None, config) if name.casefold() in ocio.names(config) else None
+
+
+def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
+    """Return the linear space of these primaries and white, with its usual name if it has one.
+
+    None if they are impossible: white must lie inside the triangle of the primaries.
+    """
+    xy = np.array(chromaticities, float).reshape(4, 2)
+    if not (np.abs(xy) < _LARGEST_XY).all() or not (np.abs(xy[:, 1]) > _LEAST_XY).all():
+        return None
+    columns = np.vstack([xy.T, np.ones(4)])
+    is_flat = abs(np.linalg.det(columns[:, :3])) < _LEAST_XY
+    if is_flat or not (np.linalg.solve(columns[:, :3], columns[:, 3]) > _LEAST_XY).all():
+        return None
+    for space in _ALIASES:
+        if space.is_linear and np.allclose(np.array(space.chromaticities), xy.ravel(), 0, _SAME_XY):
+            return space
+    return ColourSpace("linear, by its chromaticities", tuple(chromaticities))
+
+
+def named_space(name: str, config: str = "") -> ColourSpace:
+    """Return the space that a user names; an unknown name raises a UsageError that lists similar ones."""
+    space = find_space(name, config)
+    if space is None:
+        ours = [known.name for known in _ALIASES]
+        near = difflib.get_close_matches(name, [*ours, *ocio.names(config).values()], 3, 0.5)
+        hint = f"similar names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
+        raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
+    return space
+
+
+def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values.
+
+    Integers count in steps from 0 to 1; the curve of a space is then looked up.
+    """
+    if pixels.dtype.kind == "u" and space.chromaticities is not None:
+        return _by_matrix(_looked_up(pixels, space), matrix_to_rec709(space.chromaticities))
+    pixels = unit_floats(pixels)
+    if space.chromaticities is None:
+        for name, matrix in _ocio_bridges():
+            found = ocio.converted(pixels, space.name, name, space.config)
+            if found is not None:
+                return _by_matrix(found, matrix)
+        raise _cannot_convert(space)
+    linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
+    return _by_matrix(linear, matrix_to_rec709(space.chromaticities))
+
+
+def _looked_up(integers: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Decode unsigned integers [H, W, 3] by the curves of a space, each computed once for each value."""
+    values = unit_floats(np.arange(np.iinfo(integers.dtype).max + 1, dtype=integers.dtype))
+    grey = np.repeat(values[:, None, None], 3, -1)  # a profile has a curve for each channel
+    table = (grey if space.decode is None else space.decode(grey))[:, 0]
+    linear = np.empty(integers.shape, np.float32)
+    for channel in range(3):
+        linear[..., channel] = table[:, channel][integers[..., channel]]
+    return linear
+
+
+def unit_floats(values: np.ndarray) -> np.ndarray:
+    """Values as float32; unsigned integers count in steps from 0 to 1."""
+    if values.dtype.kind != "u":
+        return values.astype(np.float32, copy=False)
+    return values.astype(np.float32) * (1 / np.float32(np.iinfo(values.dtype).max))  # as OpenImageIO
+
+
+def from_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
+    """Convert scene-linear Rec.709 [H, W, 3] to a linear space, or to one of OpenColorIO, unclipped."""
+    if space.chromaticities is None:
+        for name, matrix in _ocio_bridges():
+            bridge = _by_matrix(pixels, np.linalg.inv(matrix))
+            found = ocio.converted(bridge, name, space.name, space.config)
+            if found is not None:
+                return found
+        raise _cannot_convert(space)
+    if space.decode is not None:
+        raise ValueError(f"{space.name} is not linear")
+    return _by_matrix(pixels, np.linalg.inv(matrix_to_rec709(space.chromaticities)))
+
+
+def _by_matrix(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Multiply colours [H, W, 3] by a matrix [3, 3]."""
+    if np.allclose(matrix, np.eye(3), atol=1e-6):
+        return pixels.astype(np.float32, copy=False)
+    return pixels @ matrix.T.astype(np.float32)
+
+
+def _ocio_bridges() -> Iterator[tuple[str, np.ndarray]]:
+    """Yield names of linear spaces that OpenColorIO may know, each with its matrix to linear Rec.709."""
+    yield from ((name, np.eye(3)) for name in ocio.REC709_NAMES)
+    yield from ((name, matrix_to_rec709(_AP0_CHROMATICITIES)) for name in ocio.ACES_NAMES)
+
+
+def _cannot_convert(space: ColourSpace) -> UsageError:
+    known = "the configuration has neither linear Rec.709 nor ACES2065-1 under a usual name"
+    return UsageError(f"'{space.name}': OpenColorIO cannot convert it; maybe {known}")
+
+
+def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
+    """Apply a curve to [H, W, C] in blocks of rows, which fit the processor's cache: several times faster."""
+    rows = max(1, _BLOCK_VALUES // max(1, pixels[0].size))
+    result = np.empty(pixels.shape, np.float32)
+    for start in range(0, len(pixels), rows):
+        result[start : start + rows] = curve(pixels[start : start + rows])
+    return result
+
+
+def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
+    """Return the matrix [3, 3] from linear RGB of these primaries to XYZ, with Y = 1 for white."""
+    xy = np.array(chromaticities, float).reshape(4, 2)
+    xyz = np.concatenate([xy, 1 - xy.sum(-1, keepdims=True)], -1) / xy[:, 1:]  # [4, 3], each of Y = 1
+    return xyz[:3].T * np.linalg.solve(xyz[:3].T, xyz[3])
+
+
+def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
+    """Return the matrix [3, 3] from linear RGB of these primaries to linear Rec.709 (Bradford adaptation)."""
+    source, target = rgb_to_xyz(chromaticities), rgb_to_xyz(REC709_CHROMATICITIES)
+    return np.linalg.inv(target) @ adaptation(source.sum(1), target.sum(1)) @ source
+
+
+def adaptation(from_white: np.ndarray, to_white: np.ndarray) -> np.ndarray:
+    """Return the matrix [3, 3] of the Bradford adaptation between two whites, XYZ [3]."""
+    gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
+    return np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
+
+
+def luminance(linear: np.ndarray) -> np.ndarray:
+    """Return the luminance Y [...] of linear Rec.709 [..., 3]."""
+    return linear @ rgb_to_xyz(REC709_CHROMATICITIES)[1].astype(linear.dtype)
+
+
+def lab_d65(linear: np.ndarray) -> np.ndarray:
+    """Convert linear Rec.709 [..., 3] to CIE L*a*b* under D65 [..., 3]."""
+    matrix = rgb_to_xyz(REC709_CHROMATICITIES)
+    relative = linear @ matrix.T / matrix.sum(1)
+    root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
+    x, y, z = np.moveaxis(root, -1, 0)
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Return the exposure that maps the 99th percentile of the luminance to 0.8, in EV, to two decimals.
+
+    linear is [H, W, 3]. Only pixels where `mask` [H, W] exceeds one half count. A black image gives 0 EV.
+    """
+    whole = np.ones(linear.shape[:2]) if mask is None else mask
+    high = _brighter_than(linear, whole, AUTO_EXPOSURE_PERCENTILE)
+    return round(float(np.log2(AUTO_EXPOSURE_TARGET_LINEAR / high)), 2) if high > _BLACK else 0.0
+
+
+def anchored_exposure_ev(
+    relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray | None = None
+) -> float:
+    """Return the exposure in EV, to two decimals, that leaves a face as bright in `relit` as in its plate.
+
+    Images [H, W, 3] and masks [H, W], of which what exceeds one half counts. As bright: by the luminance
+    that a tenth of the face exceeds, for a light from the side leaves much of it in shadow. So a dark skin
+    stays as dark beside a light one as it was. No more than lets the brightest hundredth of the person
+    exceed white, or the plate's own, by one EV, as in a light from behind. A black face gives 0 EV.
+    """
+    bright, wanted = (_brighter_than(image, face, FACE_PERCENTILE) for image in (relit, plate))
+    if min(bright, wanted) <= _BLACK:
+        return 0.0
+    whole = face if person is None else person
+    most, own = (_brighter_than(image, whole, AUTO_EXPOSURE_PERCENTILE) for image in (relit, plate))
+    gain = min(wanted / bright, 2 * max(1.0, own) / max(most, _BLACK))
+    return round(float(np.log2(gain)), 2)
+
+
+def chosen_exposure_ev(
+    rule: ExposureRule, relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray
+) -> float:
+    """The exposure in EV by a rule: `auto`, anchored to the plate, or `face`, which shows the person well."""
+    if rule == "face":
+        return auto_exposure_ev(relit, person)
+    return anchored_exposure_ev(relit, plate, face, person)
+
+
+def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
+    """The most exposure in EV, by a rule, under light of a total luminance; see `light_weights.strengths`.
+
+    A face that looks into a light of strength 1 needs 0 EV to be as bright as in its photo. Under `auto`, a
+    light from behind shows a dark face, not what little reaches it hundreds of times as bright.
+    """
+    limited = rule == "auto" and strength > _BLACK
+    return MOST_OVER_FRONT_EV - math.log2(strength) if limited else math.inf
+
+
+def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> float:
+    values = luminance(linear)[mask > 0.5]
+    return float(np.percentile(values, percentile)) if values.size else 0.0
+
+
+@dataclass(frozen=True)
+class View:
+    """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `softened` before it.
+
+    Others are views of a display of an OpenColorIO configuration; '' is its default one.
+    """
+
+    name: str = "none"
+    config: str = ""
+    display: str = ""
+
+    @property
+    def is_srgb(self) -> bool:
+        """True if the encoded values are known to be sRGB."""
+        return (
+            self.name in ("none", "soft") or "srgb" in (self.display or ocio.display(self.config)).casefold()
+        )
+
+
+PLAIN_VIEW, SOFT_VIEW = View("none"), View("soft")
+_ACES_VIEW = View("ACES 2.0 - SDR 100 nits (Rec.709)", "ocio://default")
+_VIEWS = {"none": PLAIN_VIEW, "soft": SOFT_VIEW, "aces": _ACES_VIEW}
+
+
+def named_view(name: str, config: str = "", display: str = "") -> View:
+    """Return the view that a user names; an unknown name raises a UsageError that lists the known ones.
+
+    With a display the view is one of its own; "soft", which is nobody's choice then, is its default one.
+    """
+    if not display and name in _VIEWS:
+        return _VIEWS[name]
+    if display:
+        display = _spelt(display, ocio.displays(config), "display")
+        name = ocio.views(config, display)[0] if name == SOFT_VIEW.name else name
+    known = ocio.views(config, display)
+    return View(_spelt(name, known, "view", () if display else tuple(_VIEWS)), config, display)
+
+
+def _spelt(name: str, known: Sequence[str], what: str, more: Sequence[str] = ()) -> str:
+    """A name as OpenColorIO spells it."""
+    for spelt in known:
+        if spelt.casefold() == name.casefold():
+            return spelt
+    raise UsageError(f"unknown {what} '{name}' (known: {', '.join([*more, *known])})")
+
+
+def shoulder(linear: np.ndarray) -> np.ndarray:
+    """Keep values up to s = 0.8, and let higher ones approach 1: 1 - (1 - s) exp(-(x - s) / (1 - s))."""
+    start = np.float32(SHOULDER_START_LINEAR)
+    above = np.maximum(linear - start, 0) / (1 - start)
+    return np.where(above > 0, 1 - (1 - start) * np.exp(-above), linear)
+
+
+def softened(linear: np.ndarray) -> np.ndarray:
+    """Bend colours [..., 3] whose brightest channel is above the shoulder's start; their hue stays.
+
+    All channels follow the brightest one, and the more it was bent the more white is mixed in, as in Khronos'
+    PBR Neutral tone mapper (2024). Bent one by one, the channels of bright skin and leaves turn yellow.
+    """
+    brightest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
+    found = brightest > SHOULDER_START_LINEAR
+    brightest = brightest[found][:, None]
+    bent = shoulder(brightest)
+    colour = linear[found] * (bent / brightest)
+    result = linear.copy()
+    result[found] = bent + (colour - bent) / (1 + _WHITENING * (brightest - bent))
+    return result
+
+
+def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = None) -> np.ndarray:
+    """Encode exposed linear Rec.709 [H, W, 3] for a display, 0..1.
+
+    `share` [H, W] in 0..1 is how far the soft shoulder applies to a pixel: what was photographed, and so is
+    encoded already, keeps its look without it.
+    """
+    if view.name == "none":
+        return in_blocks(lambda block: linear_to_srgb(np.clip(block, 0, 1)), linear)
+    if view.name == "soft":
+        soft = in_blocks(softened, linear)
+        mixed = soft if share is None else linear + share[..., None] * (soft - linear)
+        return encode_display(mixed, PLAIN_VIEW)
+    for name, matrix in _ocio_bridges():
+        found = ocio.shown(
+            _by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config, view.display
+        )
+        if found is not None:
+            return found.clip(0, 1)
+    raise _cannot_convert(ColourSpace(view.name, None))

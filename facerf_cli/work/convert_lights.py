@@ -1,0 +1,94 @@
+"""One light read from any file that can hold one, and written in other forms."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from facerf_cli import __version__
+from facerf_cli.batch.inputs import Item
+from facerf_cli.cli.convert_light import Axes, ConvertLight, Form
+from facerf_cli.files.images import write_exr
+from facerf_cli.files.light_files import (
+    Harmonics,
+    LightRecord,
+    read_light_file,
+    read_map_file,
+    read_numbers,
+    write_light,
+    write_numbers,
+)
+from facerf_cli.light.forms import (
+    LightForms,
+    from_dpr,
+    from_map_axes,
+    from_sfsnet,
+    to_dpr,
+    to_map_axes,
+    to_sfsnet,
+)
+from facerf_cli.light.sh import CONVENTION
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.photos import directions_of
+
+Attributes = dict[str, str | int | float]
+log = logging.getLogger(LOGGER_NAME)
+
+
+def write_forms(item: Item, work: ConvertLight) -> str:
+    """Read the item's light and write it in every form; a description of the light for the report."""
+    light, attributes = _read(item.input_path, work.from_axes)
+    light = replace(light, signed=work.signed)
+    for form, path in zip(work.forms, work.outputs_of(item), strict=True):
+        _write(path, light, form, attributes, work)
+    return str(light)
+
+
+def _write(path: Path, light: LightForms, form: Form, attributes: Attributes, work: ConvertLight) -> None:
+    if form == "json" or form == "sh":
+        _write_json(path, light, form, attributes, work)
+    elif form == "dpr" or form == "sfsnet":
+        numbers = to_dpr if form == "dpr" else to_sfsnet
+        write_numbers(path, numbers(light.harmonics(2)))
+    else:
+        _write_map(path, light, "facerf" if form == "latlong" else form, attributes, work)
+
+
+def _write_json(
+    path: Path, light: LightForms, form: Form, attributes: Attributes, work: ConvertLight
+) -> None:
+    harmonics = Harmonics(light.harmonics(work.order), CONVENTION)
+    record = LightRecord(torch.zeros(0, 3), torch.zeros(0, 3), "", harmonics, attributes)
+    if form == "json":
+        rig = light.on_rig(None if work.lights is None else directions_of(work.lights))
+        words = f"--lights {work.lights}" if work.lights else f"{len(rig.weights)} lights"
+        record = LightRecord(rig.directions, rig.weights, words, harmonics, attributes)
+    write_light(path, record)
+
+
+def _write_map(path: Path, light: LightForms, axes: Axes, attributes: Attributes, work: ConvertLight) -> None:
+    envmap = light.latlong(None if work.width_px is None else work.width_px // 2)
+    below = float((envmap < 0).any(-1).float().mean())
+    if below:
+        reason = "as in the input" if light.envmap is not None else "since spherical harmonics are cut off"
+        log.warning("%s: %.0f %% of the map is negative, %s", path, 100 * below, reason)
+    write_exr(path, to_map_axes(envmap, axes).numpy(), metadata=attributes | {"facerf:map_axes": axes})
+
+
+def _read(path: Path, from_axes: Axes) -> tuple[LightForms, Attributes]:
+    """The light of any file that can hold one, and metadata of its origin."""
+    said: Attributes = {"Software": f"facerf {__version__}", "facerf:input": path.name}
+    if path.suffix.lower() == ".json":
+        light, known = read_light_file(path)
+        return light, {**known, **said}
+    if path.suffix.lower() == ".txt":
+        return LightForms(coefficients=_read_text(path)), said
+    return LightForms(envmap=from_map_axes(read_map_file(path), from_axes)), said
+
+
+def _read_text(path: Path) -> Tensor:
+    """Coefficients [9, 3] from DPR's 9 or SfSNet's 27 numbers."""
+    numbers = read_numbers(path, (9, 27))
+    return from_dpr(numbers) if len(numbers) == 9 else from_sfsnet(numbers)

@@ -1,0 +1,108 @@
+"""The device, assets, colour configuration and cache that `facerf doctor` shows."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+import platformdirs
+import torch
+
+from facerf_cli.batch.settings import Settings, torch_device
+from facerf_cli.cli.doctor import MISSING
+from facerf_cli.errors import FacerfError
+from facerf_cli.face.detector import DETECTOR_LICENCE
+from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, predictor_path
+from facerf_cli.face.morphable import BUILTIN_PATH
+from facerf_cli.face.recognition import RECOGNITION_LICENCE
+from facerf_cli.models import described_file
+from facerf_cli.network.checkpoint import load_checkpoint
+from facerf_cli.network.files import SHIPPED, serving_files
+
+
+def examine(settings: Settings) -> dict[str, dict[str, Any]]:
+    """The facts of this machine by section."""
+    try:
+        serving = serving_files(settings.checkpoints, user="facerf")
+        networks: dict[str, Any] = {name: described_file(path) for name, path in serving.items()}
+    except FacerfError as error:
+        serving, networks = SHIPPED, {MISSING: {"file": str(error), "sha256": ""}}
+    return {
+        "device": _device(settings),
+        "assets": {
+            "face model": _face_model(BUILTIN_PATH),
+            **_checkpoints(serving),
+            "detector": {"licence": DETECTOR_LICENCE},
+            "dlib": _extra_models(),
+        },
+        "networks": networks,
+        "colour": _colour_configuration(),
+        "cache": {"folder": platformdirs.user_cache_dir("facerf")},
+    }
+
+
+def _device(settings: Settings) -> dict[str, Any]:
+    device = torch_device(settings)
+    built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"this torch is {built}"
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return {
+        "uses": f"{device} ({name})",
+        "threads": torch.get_num_threads(),
+        "memory": f"{memory:.0f} GiB",
+        "seed": settings.seed,
+    }
+
+
+def _face_model(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {"name": MISSING, "file": str(path)}
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return {"name": str(arrays["name"]), "licence": str(arrays["licence"]), "size": _size(path)}
+    except (ValueError, OSError, KeyError) as error:
+        return {"name": f"{MISSING}: damaged, {error}", "file": str(path)}
+
+
+def _checkpoints(serving: Mapping[str, Path]) -> dict[str, dict[str, Any]]:
+    """The checkpoints whose licences are shown; those of people say whose shapes these have."""
+    people = ("name", "licence", "size")
+    return {"checkpoint": _checkpoint(serving["reflectance"])} | {
+        name: {key: value for key, value in _checkpoint(serving[name]).items() if key in people}
+        for name in ("parsing", "portrait")
+    }
+
+
+def _checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        _, metadata = load_checkpoint(path)
+    except FacerfError as error:
+        return {"name": f"{MISSING}: {error}"}
+    provenance = metadata.get("provenance", {})
+    return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
+
+
+def _extra_models() -> dict[str, str]:
+    """The models of the extra `dlib`, which may not be used commercially."""
+    try:
+        return {
+            "licence": PREDICTOR_LICENCE,
+            "size": _size(predictor_path()),
+            "recognition": RECOGNITION_LICENCE,
+        }
+    except FacerfError:
+        return {"name": "not installed (an extra, see above)"}
+
+
+def _colour_configuration() -> dict[str, Any]:
+    configuration = oiio.ColorConfig()
+    trouble = configuration.geterror()
+    if trouble:
+        raise FacerfError(f"$OCIO is {os.environ.get('OCIO', '')!r}: {trouble}")
+    return {"OCIO": configuration.configname(), "spaces": configuration.getNumColorSpaces()}
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 2**20:.1f} MiB"

@@ -1,0 +1,164 @@
+"""Light setups as weights of lights: their maps read, drawn or estimated from a photo."""
+
+import logging
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache, lru_cache
+from itertools import groupby
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.cli.output_options import OutputOptions
+from facerf_cli.errors import InputError
+from facerf_cli.files.light_files import face_model_of_map, read_map_file
+from facerf_cli.image.colour import luminance
+from facerf_cli.light.envmap import ball, rotated_weights
+from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.studio_points import NearLights, far_samples, intensity_of
+from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.synth.sky.skies import draw_sky
+from facerf_cli.work.outputs import Exposure, OutputImage, write_output
+from facerf_cli.work.photo_lights import light_of_photo
+from facerf_cli.work.photos import directions_of, face_model
+
+_DRAWN_WIDTH_PX = 512  # of a procedural map
+_LIGHT_WIDTH_PX = 512  # of the map of a photo's light
+_BALL_PX = 256
+log = logging.getLogger(LOGGER_NAME)
+
+
+def readable(setups: Iterable[LightSetup]) -> tuple[LightSetup, ...]:
+    """The setups whose maps can be read; each map that cannot is logged in one line."""
+    good: list[LightSetup] = []
+    for envmap, group in groupby(setups, lambda setup: setup.envmap):
+        try:
+            if isinstance(envmap, (Path, PhotoLight)):
+                read_map(envmap)
+            good += group
+        except InputError as error:
+            log.error("%s", error)
+    return tuple(good)
+
+
+def read_map(envmap: Path | DrawnMap | PhotoLight) -> Tensor:
+    """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
+    if isinstance(envmap, PhotoLight):
+        return _map_of_photo(envmap)
+    if isinstance(envmap, DrawnMap):
+        return torch.from_numpy(draw_sky(envmap.index, envmap.seed, _DRAWN_WIDTH_PX)[0])
+    return read_map_file(envmap)
+
+
+@cache
+def _map_of_photo(photo: PhotoLight) -> Tensor:
+    """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
+    return rig_to_latlong(light_of_photo(photo.path, photo.options), _LIGHT_WIDTH_PX // 2).half().float()
+
+
+@lru_cache(maxsize=1)
+def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    """Directions [L, 3] and rgb weights [M, L, 3] of M setups, without their near lights.
+
+    Maps are integrated over the rig's lights; single lights follow them as additional lights.
+    """
+    directions, weights = weights_of_far_lights(setups)
+    if not any(setup.envmap for setup in setups):
+        return directions, weights
+    every = directions_of(rig)
+    of_maps = _map_weights(setups, every, sampling)
+    return torch.cat([every, directions]), torch.cat([of_maps, weights], 1)
+
+
+def strengths(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> list[float]:
+    """Luminance of all light of each of M setups, from wherever it comes.
+
+    Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
+    """
+    total, near = weights_over_rig(setups, rig, sampling)[1].sum(1), near_lights_of(setups)
+    if near is not None:
+        total = total + near.weights.sum(1)
+    return [float(value) for value in luminance(total.numpy())]
+
+
+def weights_of_far_lights(setups: Sequence[LightSetup]) -> tuple[Tensor, Tensor]:
+    """Directions [L, 3] and rgb weights [M, L, 3] of the far lights of M setups; at least one, if dark."""
+    directions, weights = [], []
+    for row, towards, rgb in _far_lights(setups):
+        directions.append(towards)
+        weights.append(torch.zeros(len(setups), len(towards), 3))
+        weights[-1][row] = rgb
+    if not directions:
+        return torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(len(setups), 1, 3)
+    return torch.cat(directions), torch.cat(weights, 1)
+
+
+def near_lights_of(setups: Sequence[LightSetup]) -> NearLights | None:
+    """The near lights of M setups, each prepared once for all of them; None without any."""
+    near = [
+        (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
+        for row, setup in enumerate(setups)
+        for light in setup.lights
+        if light.at_m is not None
+    ]
+    if not near:
+        return None
+    lights = tuple(dict.fromkeys(light for _, light, _ in near))
+    weights = torch.zeros(len(setups), len(lights), 3)
+    for row, light, rgb in near:
+        weights[row, lights.index(light)] += rgb
+    return NearLights(lights, weights)
+
+
+def weights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
+    """Weights [M, L, 3] of M setups over a stack's lights [L, 3]; single lights are moved to the nearest."""
+    weights = _map_weights(setups, directions, sampling)
+    for row, towards, rgb in _far_lights(setups):
+        nearest = (towards @ directions.T).argmax(1)
+        weights[row].index_add_(0, nearest, rgb)
+    return weights
+
+
+def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
+    for row, setup in enumerate(setups):
+        for light in setup.lights:
+            if light.at_m is None:
+                towards, shares = far_samples(light)
+                yield row, towards, shares[:, None] * intensity_of(light)
+
+
+def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
+    """[M, L, 3], zero for setups without a map; a map is read once for all its rotations."""
+    weights = torch.zeros(len(setups), len(directions), 3)
+    for envmap, group in groupby(enumerate(setups), lambda row: row[1].envmap):
+        rows = list(group)
+        if envmap is not None:
+            angles = [setup.rotate_deg for _, setup in rows]
+            weights[[row for row, _ in rows]] = rotated_weights(
+                read_map(envmap), directions, angles, sampling
+            )
+    return weights
+
+
+def write_balls(
+    setups: Sequence[LightSetup], paths: Sequence[Path], exposure: float | str, output: OutputOptions
+) -> None:
+    """Write, in every format, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
+    for setup, path in zip(setups, paths, strict=True):
+        assert setup.envmap is not None
+        envmap = read_map(setup.envmap)
+        both = [ball(envmap, _BALL_PX, kind, setup.rotate_deg) for kind in ("mirror", "diffuse")]
+        pixels = torch.cat(both, 1).numpy()
+        chosen: Exposure = exposure if isinstance(exposure, float) else "auto"
+        write_output(path, OutputImage(pixels), chosen, output, _metadata_of(setup.envmap))
+
+
+def _metadata_of(envmap: Path | DrawnMap | PhotoLight) -> dict[str, str | int]:
+    """Metadata of an image that shows a light; an estimated light depends on the face model."""
+    if isinstance(envmap, PhotoLight):
+        return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
+    made = Provenance(envmap.name).attributes()
+    return made if isinstance(envmap, DrawnMap) else {**made, **face_model_of_map(envmap)}

@@ -1,0 +1,220 @@
+"""The OLAT stack of one photo's face, and its contact sheet."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from facerf_cli.batch.inputs import Item
+from facerf_cli.cli.predict_olat import PredictOlat
+from facerf_cli.composite import Target
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import FaceFit, fit_to_arrays
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.face.view import render_face, see_face
+from facerf_cli.files.drawings import contact_sheet, mark_light
+from facerf_cli.files.images import LinearImage, write_display
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.relight_web import write_relight_web
+from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
+from facerf_cli.image.resample import resized, shrunk_photo
+from facerf_cli.image.strips import filled, whole
+from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
+from facerf_cli.raster.camera import crop_camera
+from facerf_cli.run import memory
+from facerf_cli.work.photos import (
+    FittedFace,
+    directions_of,
+    facts_of,
+    fit_faces,
+    load_models_once,
+    provenance,
+    read_photo,
+    rotation_of,
+)
+from facerf_cli.work.view_photos import write_page
+
+_TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
+_FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
+_HALF_AND_SHOWN = 9  # bytes a pixel of an image for web viewers: half floats, then bytes
+_LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
+
+
+def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, Any]]:
+    """Predict and write the stack of each chosen face of a photo; the files, and facts for the report."""
+    directions = directions_of(work.lights)
+    if work.format == "relight":
+        directions = _from_in_front(item, directions)
+    image = read_photo(item, work.photo)
+    faces = fit_faces(item, image, work.photo)
+    outputs: list[Path] = []
+    for face in reversed(faces):
+        stack, sheet, *pages = work.files_of(item, face.tag)
+        tiles: list[np.ndarray] = []
+        if work.frame == "photo":
+            header, olats = _of_person(item, image, face, directions, work, tiles)
+        else:
+            header, olats = _header(item, face, directions, work), _olats(face, directions, work, tiles)
+        if work.format == "exr":
+            write_olat_stack(stack, header, olats)
+        else:
+            _write_relight_web(stack.parent, header, olats)
+        write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
+        for page in pages:
+            write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
+        outputs += [stack, sheet, *pages]
+    return outputs, facts_of(faces, work.photo) | {"lights": len(directions)}
+
+
+def _from_in_front(item: Item, directions: Tensor) -> Tensor:
+    """The lights that web viewers show; InputError if they are too few."""
+    front = directions[directions[:, 2] > _FRONT]
+    if len(front) < _FEWEST_FRONT:
+        raise InputError(
+            f"{item.input_path}: --format relight needs {_FEWEST_FRONT} lights from in front, not "
+            f"{len(front)}; give more --lights"
+        )
+    return front
+
+
+def _write_relight_web(folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
+    """Write the images, exposed alike so that the brightest is well shown."""
+    lights, (height, width) = len(header.directions), header.seen.shape
+    needed = _HALF_AND_SHOWN * lights * height * width
+    memory.require(f"--format relight of {lights} lights", needed, "fewer --lights or a smaller --size")
+    halves, brightest = [], torch.zeros(height, width)
+    for batch in olats:
+        halves.append(batch.half())
+        brightest = torch.maximum(brightest, batch.mean(1).amax(0))
+    ev = auto_exposure_ev(brightest[..., None].expand(-1, -1, 3).numpy(), header.seen)
+    shown = np.empty((lights, height, width, 3), np.uint8)
+    for image, half in zip(shown, (half for batch in halves for half in batch), strict=True):
+        exposed = half.float().permute(1, 2, 0).numpy() * np.float32(2.0**ev)
+        image[:] = np.round(encode_display(exposed, SOFT_VIEW) * 255)
+    del halves
+    write_relight_web(folder, shown, header.directions, {"exposure_ev": ev})
+
+
+def _of_person(
+    item: Item,
+    image: LinearImage,
+    face: FittedFace,
+    directions: Tensor,
+    work: PredictOlat,
+    tiles: list[np.ndarray],
+) -> tuple[StackHeader, Iterator[Tensor]]:
+    """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
+    models = load_models_once(work.photo)
+    photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
+    reflectance = reflectance_of(models, head, "portrait", work.network_alone, memory.limit_bytes(), photo)
+    alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
+    target = Target(alpha=alpha, background="none")
+    composition = composition_of(models, photo, head, reflectance, target)
+    size = composition.size_px
+
+    def olats() -> Iterator[Tensor]:
+        for some in torch.split(directions, _LIGHTS_AT_ONCE):
+            single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
+            relit = relit_by(composition, head, reflectance, some, single)
+            layers = np.stack([whole(composition.light_layer(one), *size) for one in relit])
+            batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
+            scale = _tile_px(len(directions)) / max(batch.shape[-2:])
+            small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
+            tiles.append(small.permute(0, 2, 3, 1).numpy())
+            yield batch
+
+    single = torch.eye(1)[..., None].expand(-1, -1, 3)
+    relit = next(iter(relit_by(composition, head, reflectance, directions[:1], single)))
+    normals = filled(composition.layers(("normal",), relit), *size)["normal"]
+    header = StackHeader(
+        kind="photo",
+        directions=directions.numpy(),
+        rotation=head.fit.rotation.numpy(),
+        source=photo,
+        seen=composition.matte,
+        normals=normals,
+        layout_version=LAYOUT_VERSION,
+        fit=fit_to_arrays(head.fit),
+        metadata=_metadata(item, work),
+    )
+    return header, olats()
+
+
+def _metadata(item: Item, work: PredictOlat) -> dict[str, str | int]:
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    return metadata | ({"facerf:network_alone": 1} if work.network_alone else {})
+
+
+def _olats(
+    face: FittedFace, directions: Tensor, work: PredictOlat, tiles: list[np.ndarray]
+) -> Iterator[Tensor]:
+    """Yield OLATs in batches [l, 3, H, W], textures or images; small images [l, h, w, 3] go to `tiles`."""
+    models = load_models_once(work.photo)
+    large = _uv_and_coverage(face, work)
+    small = _uv_and_coverage(face, work, 2 * _tile_px(len(directions)))
+    olats = predict_olat(
+        models,
+        face.head,
+        directions,
+        rotation_of(work.pose),
+        work.network_alone,
+        memory.limit_bytes(),
+        work.precision == "bf16",
+    )
+    for textures in olats:
+        tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
+        yield render_face(textures, *large) if work.frame == "face" else textures
+
+
+def _uv_and_coverage(
+    face: FittedFace, work: PredictOlat, side_px: int | None = None
+) -> tuple[Tensor, Tensor]:
+    """`see_face` in the asked pose, by the crop's camera, its image `side_px` wide."""
+    vertices = _posed(face, work).vertices_camera(load_models_once(work.photo).face)
+    return see_face(vertices, crop_camera(side_px or face.fit.crop.size_px))
+
+
+def _posed(face: FittedFace, work: PredictOlat) -> FaceFit:
+    rotation = rotation_of(work.pose)
+    return face.fit if rotation is None else replace(face.fit, rotation=rotation)
+
+
+def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat) -> StackHeader:
+    posed, uv_maps = _posed(face, work), face.head.face
+    source, normals, seen = uv_maps.texture, uv_maps.normals, uv_maps.visible
+    if work.frame == "face":
+        uv, seen = _uv_and_coverage(face, work)
+        turn = face.fit.turn_to(posed.rotation)
+        both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
+        source, normals = render_face(both, uv, seen)
+    return StackHeader(
+        kind="image" if work.frame == "face" else "texture",
+        directions=directions.numpy(),
+        rotation=posed.rotation.numpy(),
+        source=source.permute(1, 2, 0).numpy(),
+        seen=seen.numpy(),
+        normals=normals.permute(1, 2, 0).numpy(),
+        layout_version=LAYOUT_VERSION,
+        fit=fit_to_arrays(face.fit),
+        metadata=_metadata(item, work),
+    )
+
+
+def _tile_px(lights: int) -> int:
+    """The longer side of a contact sheet's tiles, such that their sum does not grow with the lights."""
+    return min(_TILE_PX, math.isqrt(_SHEET_PX // lights))
+
+
+def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarray:
+    """Every light's image, with a mark at the light's direction."""
+    images = np.concatenate(tiles)
+    white = float(np.percentile(images, 99.5))
+    for image, direction in zip(images, directions, strict=True):
+        mark_light(image, direction, white)
+    return contact_sheet(images)

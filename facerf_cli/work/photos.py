@@ -1,0 +1,289 @@
+"""Photos of a batch: read, their faces found and fitted, and the models loaded once a process."""
+
+import logging
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.naming import OF_PHOTOS, NamePattern
+from facerf_cli.batch.settings import torch_device
+from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.values import parse_lights, parse_pose
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import check_in_photo
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import Head
+from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks
+from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.files.images import LinearImage, read_image
+from facerf_cli.image.colour import named_space
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.models import Models, load_models
+from facerf_cli.network.files import serving_files
+from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
+from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
+from facerf_cli.portrait_field import SteadyFrame
+from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME, Provenance
+
+
+def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> Path:
+    """The file of an option that goes with a photo.
+
+    A folder mirrors the photos', or holds all files in one place; a pattern has fields, as in
+    `mattes/{dir}/{stem}.png`. Raises InputError for a photo without a file.
+    """
+    if "{" in str(given) and not given.exists():
+        text = given.as_posix()
+        pattern = NamePattern.parse(text.lstrip("/"), option, OF_PHOTOS)
+        found = Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)
+        candidates = [found]
+    elif given.is_dir():
+        names = dict.fromkeys((item.name, item.input_path.stem))
+        candidates = [given / f"{name}{suffix}" for name in names for suffix in suffixes]
+    else:
+        return given
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise InputError(f"{item.input_path}: {option} has no {candidates[0]}; add it there")
+
+
+_PHOTO_BYTES = 12  # of a pixel of the photo that is held
+_KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
+_MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
+LANDMARK_SUFFIXES = (".pts", ".json")
+log = logging.getLogger(LOGGER_NAME)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFace:
+    """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'."""
+
+    tag: str
+    found: FaceBox
+    head: Head
+    steady: SteadyFrame | None = None  # of a frame of a shot
+
+    @property
+    def fit(self) -> FaceFit:
+        """The fitted face model."""
+        return self.head.fit
+
+    def facts(self) -> dict[str, Any]:
+        """The face's entries in the report."""
+        pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found, pose_deg[0])}
+
+
+def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: bool = True) -> None:
+    """Load what every photo needs, and the networks of some names.
+
+    Raises UsageError or InputError for what would fail all photos, and for a checkpoint without use.
+    """
+    if options.colourspace is not None:
+        named_space(options.colourspace, options.ocio_config)
+    face_model(options)
+    settings = options.settings
+    if not settings.checkpoints_by_default:
+        serving_files(settings.checkpoints, uses, "this line")
+    if with_networks:
+        load_models_once(options).networks.load(uses)
+
+
+@cache
+def load_models_once(options: PhotoOptions) -> Models:
+    """The face model and the networks of the checkpoint, on the device, once a process."""
+    return load_models(options.settings.checkpoints, options.face_model, torch_device(options.settings))
+
+
+@cache
+def face_model(options: PhotoOptions) -> MorphableModel:
+    """The face model alone, once a process."""
+    return load_face_model(options.face_model)
+
+
+def read_photo(item: Item, options: PhotoOptions, kept_px: int = _KEPT_PX) -> LinearImage:
+    """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
+    space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
+    image = read_image(item.input_path, space, kept_px=kept_px)
+    if (most := float(image.pixels.max())) > _MOST_RADIANCE:
+        raise InputError(
+            f"{item.input_path}: its brightest value is {most:.3g}, and {_MOST_RADIANCE:.0e} is the most; "
+            "clip it"
+        )
+    return image
+
+
+def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
+    """Fit the faces of a photo that the options choose, from left to right."""
+    found = list(_find(item, image, options))
+    names = _names(item, found)
+    for face, name in zip(found, names, strict=True):
+        _say_confidence(name, face)
+    return [
+        FittedFace(tag, face, _fit_one(name, image, face, options))
+        for face, tag, name in zip(found, _tags(len(found), options), names, strict=True)
+    ]
+
+
+def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
+    """Find the faces that the options choose, from left to right, with the tags of their outputs."""
+    if options.landmarks is not None:
+        faces = [_given(item, image, options.landmarks)]
+    else:
+        parsing = load_models_once(options).networks.parsing
+        faces = find_faces(parsing, image.pixels, str(item.input_path), options.face, options.landmarks_from)
+    for face, name in zip(faces, _names(item, faces), strict=True):
+        _say_confidence(name, face)
+    return list(zip(_tags(len(faces), options), faces, strict=True))
+
+
+def facts_of_found(faces: Sequence[FaceBox], options: PhotoOptions) -> dict[str, Any]:
+    """The report's entries of a photo whose faces were only found."""
+    facts = [confidence_facts(face) for face in faces]
+    return (facts[0] if len(facts) == 1 else {"faces": facts}) | facts_of_networks(options)
+
+
+def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
+    """A face's confidence for the report; nothing where it was given, or found by dlib."""
+    if not isinstance(face, FoundFace | FoundBox):
+        return {}
+    confidence = confidence_in(face, yaw_deg)
+    factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
+    return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
+
+
+def _names(item: Item, faces: Sequence[FaceBox]) -> list[str]:
+    """Name the faces of a photo for messages: the photo, and of several their index and place."""
+    if len(faces) == 1:
+        return [str(item.input_path)]
+    named = []
+    for number, (left, top, right, bottom) in enumerate(face.box_px for face in faces):
+        x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
+        named.append(f"{item.input_path}: face {number} from the left, at x {x_px}, y {y_px} px")
+    return named
+
+
+def _say_confidence(name: str, face: FaceBox) -> None:
+    if isinstance(face, FoundFace | FoundBox):
+        confidence = confidence_in(face)
+        why = "" if confidence.word == "sure" else f" ({confidence.reason})"
+        log.info("%s: %s%s", name, confidence.word, why)
+
+
+def _tags(count: int, options: PhotoOptions) -> list[str]:
+    return [f"_face{index}" for index in range(count)] if options.face == "all" else [""]
+
+
+def fit_facts(fit: FaceFit) -> dict[str, Any]:
+    """A fit's error and quality for the report; a regressed head has no error."""
+    error = {} if math.isnan(fit.error_iod) else {"error_iod": round(fit.error_iod, 5)}
+    return {**error, "quality": fit.quality}
+
+
+def facts_of(faces: list[FittedFace], options: PhotoOptions) -> dict[str, Any]:
+    """The report's entries of a photo: of its one face, or of each in a list."""
+    facts = faces[0].facts() if len(faces) == 1 else {"faces": [face.facts() for face in faces]}
+    return facts | facts_of_networks(options)
+
+
+def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
+    """The report's entry of the networks that were used: file and digest of each."""
+    return {"networks": load_models_once(options).networks.served()}
+
+
+def stamp(item: Item) -> dict[str, str | int]:
+    """Metadata for parts of a photo, which stay photographs."""
+    return Provenance(item.input_path.name, source_type="").attributes()
+
+
+def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
+    """Metadata for the outputs of a photo."""
+    return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
+
+
+def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FaceBox]:
+    """Find the faces that the options choose; with their landmarks where the fit needs them."""
+    if options.landmarks is not None:
+        yield _given(item, image, options.landmarks)
+    else:
+        models = load_models_once(options)
+        geometry, parsing = options.geometry or models.default_geometry, models.networks.parsing
+        yield from find_for(
+            parsing, geometry, image.pixels, str(item.input_path), options.face, options.landmarks_from
+        )
+
+
+def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
+    """The face whose landmarks a file holds, or a folder for this photo."""
+    path = companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")
+    try:
+        return face_at(check_in_photo(read_landmarks(path), *image.pixels.shape[:2]))
+    except InputError as error:
+        named = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise InputError(f"{named}{error}") from None
+
+
+def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
+    try:
+        models = load_models_once(options)
+        head = head_of(models, image.pixels, face, models.sides(options.texture_side))
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+    if head.fit.quality == "poor":
+        log.warning(
+            "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "
+            "`facerf fit-geometry`, or give --landmarks",
+            name,
+            100 * head.fit.error_iod,
+        )
+    yaw_deg = rotation_to_pose(head.fit.rotation)[0]
+    if abs(yaw_deg) > SUPPORTED_YAW_DEG:
+        log.warning(
+            "%s: the head is turned by %.0f degrees, and %.0f are supported; look at it with "
+            "`facerf fit-geometry`",
+            name,
+            abs(yaw_deg),
+            SUPPORTED_YAW_DEG,
+        )
+    return head
+
+
+def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
+    """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
+    path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
+    with memory.beside(_PHOTO_BYTES * math.prod(size_px)):
+        image = read_image(path, "linear")
+    matte = image.pixels.mean(-1) if image.alpha is None else image.alpha
+    if matte.shape != tuple(size_px):
+        height, width = matte.shape
+        raise InputError(
+            f"{path}: the matte has {width} x {height} pixels, the photo {size_px[1]} x {size_px[0]}; "
+            "give one of the photo's size"
+        )
+    return matte.clip(0, 1)
+
+
+def rotation_of(pose: str | None) -> torch.Tensor | None:
+    """The head_to_camera rotation [3, 3] of `--pose`; None keeps the photo's pose."""
+    pose_deg = parse_pose(pose)
+    return None if pose_deg is None else pose_to_rotation(*pose_deg)
+
+
+def directions_of(rig: str) -> torch.Tensor:
+    """Unit directions [L, 3] of `--lights`."""
+    parsed = parse_lights(rig)
+    if isinstance(parsed, int):
+        return rig_directions(parsed)
+    azimuth, elevation = torch.tensor(parsed).T
+    return azel_to_direction(azimuth, elevation)

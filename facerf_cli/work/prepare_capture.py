@@ -1,0 +1,268 @@
+"""Work of `facerf prepare-dataset`: draft a stage.json, or check and prepare the subjects of a capture."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import BatchOptions, run_items, sums_up
+from facerf_cli.batch.settings import Settings
+from facerf_cli.capture.capture import Capture, ChartCorrection
+from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
+from facerf_cli.capture.checks.motion import with_alignment
+from facerf_cli.capture.checks.subject import check_subject
+from facerf_cli.capture.draft import as_text, draft_stage
+from facerf_cli.capture.findings import Selection, frames_left_out, has_new_frames, select_frames
+from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
+from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
+from facerf_cli.dataset.dataset import (
+    DATASET_FILE,
+    LARGEST_CROP_PX,
+    Split,
+    describe_dataset,
+    preparation_key,
+    record_path,
+)
+from facerf_cli.dataset.prepare import index_page, prepare_subject, prepared_subjects, subject_outputs
+from facerf_cli.dataset.settings import DatasetSettings
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.joint_fit import CROP_STEP_PX
+from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.documents import write_document
+from facerf_cli.files.downloads import file_sha256
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.workers import one_thread
+from facerf_cli.work.capture_findings import (
+    CheckOnly,
+    check_all,
+    collect_findings,
+    require_sound,
+    show_findings,
+    write_findings,
+)
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: bool) -> None:
+    """Write a draft of stage.json to `output` or into the folder, and print its path and notes.
+
+    UsageError where the file exists. A dry run prints the notes only.
+    """
+    path = folder / STAGE_FILE if output is None else output
+    if path.is_dir():
+        raise UsageError(f"-o {path}: is a folder; give the draft's name, such as {path / STAGE_FILE}")
+    if path.exists() or path.is_symlink():
+        raise UsageError(
+            f"{path}: is there already, and a draft replaces nothing; move it, or give -o another name"
+        )
+    stage = draft_stage(folder, PHOTO_SUFFIXES, pattern)
+    for note in stage["draft"]:
+        log.info("%s", note)
+    if dry_run:
+        print(f"{folder} -> {path}")
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_text(as_text(stage), encoding="utf-8", errors="backslashreplace")
+    print(path)
+
+
+def prepare_capture(
+    folder: Path,
+    reading: ReadSettings,
+    chart: ChartSettings,
+    checking: CheckSettings,
+    content: DatasetSettings,
+    face_model: str,
+    batch: BatchOptions,
+    settings: Settings,
+) -> int:
+    """Prepare all subjects of the capture in a folder, or only check them; return the exit code."""
+    split, overwrite, output = Split.parse(content.split), batch.overwrite == "always", batch.output
+    if (px := content.crop) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
+        raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
+    source = _with_charts(CaptureSource(folder, reading), chart)
+    capture = source.opened()
+    _check_subjects(capture, output, split)
+    items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
+    if checking.checks == "only" and not batch.dry_run:
+        return check_all(CheckOnly(source.opened), items, output, batch.jobs, checking.strict, settings)
+    model_sha256 = _model_digest(face_model)
+    key = preparation_key(capture, model_sha256, content.crop)
+    _check_earlier(capture, output, key, overwrite)
+    work = Prepare(source, checking, face_model, content.crop, output, key)
+    if overwrite and not batch.dry_run:
+        (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
+    elif not batch.dry_run:
+        _forget_completed(capture, output)
+    code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
+    if not batch.dry_run and sums_up(items, work.outputs_of, batch, settings):
+        _write_dataset(work, capture, split, settings.seed, model_sha256)
+    return code
+
+
+@dataclass(frozen=True)
+class CaptureSource:
+    """A capture's folder and the options to read it with."""
+
+    folder: Path
+    reading: ReadSettings
+    charts: tuple[ChartCorrection, ...] = ()
+
+    def opened(self) -> Capture:
+        """Read the capture's description once per process; UsageError where it is wrong."""
+        return replace(_read_capture(self.folder, self.reading), charts=self.charts)
+
+
+@cache
+def _read_capture(folder: Path, reading: ReadSettings) -> Capture:
+    try:
+        return read_capture(folder, reading)
+    except InputError as error:
+        raise UsageError(str(error)) from None
+
+
+def _with_charts(source: CaptureSource, given: ChartSettings) -> CaptureSource:
+    """Add the colour corrections of --colour-chart, and log each."""
+    image, corners = given.colour_chart, given.chart_corners
+    if not image:
+        if corners:
+            raise UsageError("--chart-corners: no image is given; give --colour-chart too")
+        return source
+    try:
+        charts = tuple(read_charts(source.opened(), image, _parse_corners(corners) if corners else None))
+    except InputError as error:
+        raise UsageError(f"--colour-chart: {error}") from None
+    for chart in charts:
+        log.info("%s", chart.in_words())
+    return replace(source, charts=charts)
+
+
+def _parse_corners(text: str) -> np.ndarray:
+    """Parse four corners [4, 2] in pixels, `x,y x,y x,y x,y`."""
+    try:
+        corners_px = np.array([[float(number) for number in pair.split(",")] for pair in text.split()])
+    except ValueError:
+        corners_px = np.empty(0)
+    if corners_px.shape != (4, 2) or not np.isfinite(corners_px).all():
+        raise UsageError(f"--chart-corners '{text}': give four corners in pixels, as 'x,y x,y x,y x,y'")
+    return corners_px
+
+
+def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
+    """Raise for faults that concern all subjects; log what the options leave out."""
+    if not capture.subjects:
+        raise UsageError(
+            f"{capture.folder}: no subjects found at {capture.pattern}; check the pattern and the images"
+        )
+    if output.resolve() == capture.folder.resolve():
+        raise UsageError(f"-o {output}: is the capture itself; give another folder")
+    if marked := sum(map(len, capture.marked.values())):
+        log.info("%s: %d images that are marked as damaged (.bad) are left out", capture.folder, marked)
+    left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
+    if left:
+        log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
+
+
+def _model_digest(name: str) -> str:
+    _face_model(name)  # reports a wrong file before it is hashed
+    return file_sha256(BUILTIN_PATH if name == BUILTIN else Path(name))
+
+
+@cache
+def _face_model(name: str) -> MorphableModel:
+    """Load the face model once per process."""
+    return load_face_model(name)
+
+
+def _check_earlier(capture: Capture, output: Path, key: str, overwrite: bool) -> None:
+    """Raise where finished subjects were prepared with other options than this run has."""
+    earlier = {} if overwrite else prepared_subjects(capture, output)
+    other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
+    if other:
+        raise UsageError(
+            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model, "
+            "calibration or colour chart; give --overwrite always, or another folder"
+        )
+
+
+def _forget_completed(capture: Capture, output: Path) -> None:
+    """Remove the records of subjects whose missing frames exist by now, so that they are prepared again."""
+    for subject, record in prepared_subjects(capture, output).items():
+        if has_new_frames(capture, subject, record.get("missing", ())):
+            log.info("%s: frames that were missing exist now; it is prepared again", subject)
+            record_path(output, subject).unlink()
+
+
+@dataclass(frozen=True)
+class Prepare:
+    """Prepares one subject; settings only."""
+
+    source: CaptureSource
+    checking: CheckSettings
+    face_model: str
+    crop_px: int | None
+    folder: Path
+    key: str
+
+    def outputs_of(self, item: Item) -> Sequence[Path]:
+        """Files of a subject."""
+        return subject_outputs(self.source.opened(), item.name, self.folder)
+
+    def __call__(self, item: Item) -> Outcome:
+        """Prepare a subject on one thread, so that its bytes do not depend on the number of cores."""
+        model = _face_model(self.face_model)
+        with one_thread():
+            capture, chosen = self._choose(item.name)
+            record = prepare_subject(
+                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.checking.strict
+            )
+        if record["quality"] == "poor":
+            log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
+        worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
+        facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
+        facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
+        facts |= {"lights": len(chosen.lights)}
+        return Outcome(self.outputs_of(item), facts)
+
+    def _choose(self, subject: str) -> tuple[Capture, Selection]:
+        """Check a subject, select its sound frames, and align them on request; InputError for too few."""
+        capture = self.source.opened()
+        findings = check_subject(capture, subject) if self.checking.checks == "on" else []
+        write_findings(self.folder, subject, findings)
+        require_sound(subject, findings, self.checking.strict)
+        chosen = select_frames(capture, subject, findings, self.checking.strict)
+        if capture.align:
+            capture = with_alignment(capture, subject, frames_left_out(findings))
+        return capture, chosen
+
+
+def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, model_sha256: str) -> None:
+    """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
+    found = prepared_subjects(capture, work.folder).items()
+    records = {subject: record for subject, record in found if record.get("prepared") == work.key}
+    findings = collect_findings(work.folder, capture.subjects)
+    show_findings([row for rows in findings.values() for row in rows], work.checking.strict)
+    if not records:
+        return
+    _write_chart_overlays(capture, work.folder)
+    model = _face_model(work.face_model)
+    dataset = describe_dataset(capture, records, split, seed, model, model_sha256)
+    with atomic_path(work.folder / "index.html") as temporary:
+        text = index_page(dataset, records, findings)
+        temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
+    write_document(work.folder / DATASET_FILE, dataset)
+    print(work.folder / DATASET_FILE)
+
+
+def _write_chart_overlays(capture: Capture, output: Path) -> None:
+    """Replace the control images of colour charts."""
+    for older in output.glob("colour_chart*.png"):
+        older.unlink()
+    write_chart_overlays(capture, output)

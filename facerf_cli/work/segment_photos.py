@@ -1,0 +1,107 @@
+"""The person of one photo, cut out of it, as files."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.batch.inputs import Item
+from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.cli.shots import Shot, shot_of
+from facerf_cli.face.landmarks import Face, to_display
+from facerf_cli.files.documents import write_document
+from facerf_cli.files.images import LinearImage, write_display, write_exr
+from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.image.strips import filled
+from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
+from facerf_cli.portrait.find import FoundFace
+from facerf_cli.portrait.matte import PersonColours
+from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.work.outputs import canvas
+from facerf_cli.work.photos import (
+    facts_of_found,
+    facts_of_networks,
+    find_people,
+    load_models_once,
+    read_photo,
+    stamp,
+)
+from facerf_cli.work.shot_frames import segmented_frame
+
+_SHOWN = 0.55  # share of the class's colour in the overlay
+_HELD_PX = 38  # bytes of a pixel: the photo, and
+_KEPT_PX = 26  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the colours, a class
+_OVERLAY_PX = 1600  # largest side of the overlay
+_DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
+# Hues of the classes but the background, in the order of CLASSES; near ones differ.
+_HUES = np.array([0.07, 0.6, 0.5, 0.95, 0.9, 0.78, 0.7, 0.33, 0.14, 0.45, 0.85, 0.62, 0.25])
+
+
+def write_segments(
+    item: Item, options: PhotoOptions, shots: Sequence[Shot] = ()
+) -> tuple[list[str], dict[str, Any]]:
+    """Segment and write each chosen person of a photo; their tags, and facts for the report.
+
+    The person of a frame of a shot is steadied by the frames around it.
+    """
+    if place := shot_of(shots, item):
+        image, face, found = segmented_frame(*place, options)
+        _write(item, "", image, to_display(image.pixels), face, found)
+        return [""], facts_of_networks(options)
+    image = read_photo(item, options, _KEPT_PX)
+    display = to_display(image.pixels)
+    people = find_people(item, image, options)
+    parsing = load_models_once(options).networks.parsing
+    for tag, face in reversed(people):
+        _write(item, tag, image, display, face, segment(parsing, display, face.landmarks_px))
+    return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
+
+
+def _write(
+    item: Item, tag: str, image: LinearImage, display: np.ndarray, face: Face, found: Segmentation
+) -> None:
+    def path(ending: str) -> Path:
+        return item.output(tag + ending)
+
+    metadata, found = stamp(item), found.cut(image.alpha)
+    height, width = found.matte.shape
+    colours, held = PersonColours(image.pixels, found.matte)[:], _HELD_PX * height * width
+    with canvas(path("_segment.exr"), held) as empty:
+        layers = {"person.A": found.matte, **filled(found.layers(), height, width, empty)}
+        write_exr(path("_segment.exr"), colours, found.matte, layers, metadata)
+    write_display(path("_person.png"), colours, "auto", found.matte, metadata)
+    write_display(path("_overlay.jpg"), _overlay(display, found, face), metadata=metadata)
+    write_document(path("_landmarks.json"), _landmarks(face))
+
+
+def _overlay(display: np.ndarray, found: Segmentation, face: Face) -> np.ndarray:
+    """Colours of the classes and landmarks over a small copy of the photo, scene-linear."""
+    step = math.ceil(max(display.shape[:2]) / _OVERLAY_PX)
+    shown = display[::step, ::step] / np.float32(255) * (1 - _SHOWN * found.matte[::step, ::step, None])
+    for name, colour in zip(CLASSES[1:], _colours(), strict=True):
+        shown += _SHOWN * found.layer(name)[::step, ::step, None] * colour
+    half = max(1, round(_DOT * max(shown.shape[:2]) / 2))
+    for x, y in np.round(face.landmarks_px / step).astype(int).clip(0):
+        shown[max(0, y - half) : y + half, max(0, x - half) : x + half] = (0, 1, 0)
+    return np.asarray(srgb_to_linear(shown.clip(0, 1)))
+
+
+def _colours() -> np.ndarray:
+    """One colour [C, 3] of full saturation for each class of the person."""
+    turns = (_HUES[:, None] + np.array([0, 1 / 3, 2 / 3])) * 2 * np.pi
+    return np.asarray(0.5 + 0.5 * np.cos(turns), np.float32)
+
+
+def _landmarks(face: Face) -> dict[str, Any]:
+    """The landmarks as a document that --landmarks reads, with what else the network saw."""
+    document: dict[str, Any] = {"landmarks": face.landmarks_px.round(3).tolist()}
+    if isinstance(face, FoundFace):
+        document["expected_error_px"] = face.seen.error_px[:68].round(3).tolist()
+        more = zip(MORE_LANDMARKS, face.seen.landmarks_px[68:], face.seen.error_px[68:], strict=True)
+        document["more"] = {
+            name: {"at": at.round(3).tolist(), "expected_error_px": round(float(error), 3)}
+            for name, at, error in more
+        }
+    return document

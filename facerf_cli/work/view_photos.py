@@ -1,0 +1,171 @@
+"""The pages of photos, and the list of them."""
+
+import shlex
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from facerf_cli.batch.inputs import Item
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import fit_from_arrays
+from facerf_cli.face.head import Head
+from facerf_cli.face.view import photo_camera, view_face
+from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
+from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
+from facerf_cli.image.resample import fitted, resized, shrunk_photo
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.models import Models
+from facerf_cli.pipeline import composition_of, reflectance_of
+from facerf_cli.portrait_field import PortraitField
+from facerf_cli.synth.sky.skies import KINDS, draw_sky
+from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
+from facerf_cli.viewer.page import (
+    IndexEntry,
+    PageMap,
+    Plate,
+    index_page,
+    packed,
+    page,
+    strip_jpeg,
+    strip_of,
+)
+from facerf_cli.work.photos import FittedFace, face_model, facts_of, fit_faces, load_models_once, read_photo
+
+if TYPE_CHECKING:
+    from facerf_cli.cli.view import MakePage
+
+_MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
+_HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
+_STRIP_PX = 160  # longer side of an image of the strip
+_STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
+
+
+def write_pages(item: Item, work: "MakePage") -> tuple[list[Path], dict[str, Any]]:
+    """Write a page for each chosen face of a photo, or for a stack; their paths, and facts for the report."""
+    if is_olat_stack(item.input_path):
+        (path,) = work.outputs_of(item)
+        return [path], write_page_of_stack(path, item, work)
+    image = read_photo(item, work.photo)
+    faces = fit_faces(item, image, work.photo)
+    models = load_models_once(work.photo)
+    paths = []
+    for face in reversed(faces):  # the first one's page marks the photo as finished
+        path = item.output(face.tag + ".html")
+        write_page(path, item, models, image.pixels, face, work.size_px)
+        paths.append(path)
+    return paths[::-1], facts_of(faces, work.photo)
+
+
+def write_page(
+    path: Path, item: Item, models: Models, photo: np.ndarray, face: FittedFace, size_px: int
+) -> None:
+    """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
+    photo, head = shrunk_photo(photo, face.head, size_px)
+    basis, plate = of_photo(models, photo, head)
+    _write(path, item, face.tag.replace("_", " "), basis, plate, head_place(head.fit.crop, plate.matte))
+
+
+def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plate]:
+    """The basis of a photo's person, and what a page shows around it."""
+    field = reflectance_of(models, head, "portrait", photo=photo)
+    assert isinstance(field, PortraitField)
+    composition = composition_of(models, photo, head, field)
+    basis = basis_of_photo(models, photo, head, field, composition)
+    matte = composition.matte
+    background = photo - matte[..., None] * composition.own[:]
+    return basis, Plate(photo, matte, background)
+
+
+def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, Any]:
+    """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
+    header = read_olat_header(item.input_path)
+    basis = basis_of_stack(
+        header.directions, lambda: stream_olats(item.input_path), header.seen, work.size_px
+    )
+    size = basis.guide.shape[:2]
+    head = (0.5, 0.5, 0.5)
+    if header.kind == "photo":
+        head, face = _face_of_stack(item, header, work)
+        basis = basis.anchored(header.source, face * header.seen, header.seen)
+    plate = Plate(resized(header.source, *size), resized(header.seen, *size))
+    _write(path, item, "", basis, plate, head)
+    return {"lights": len(header.directions)}
+
+
+def _face_of_stack(
+    item: Item, header: StackHeader, work: "MakePage"
+) -> tuple[tuple[float, float, float], np.ndarray]:
+    """Where the head of a photo's stack is, and the face's share [H, W] of it."""
+    try:
+        fit = fit_from_arrays(header.fit)
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
+    vertices = fit.vertices_camera(face_model(work.photo))
+    view = view_face(vertices, photo_camera(fit.crop, *header.seen.shape), fit.crop.side_px)
+    return head_place(fit.crop, header.seen), view.full(view.mask)
+
+
+def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:
+    """The middle of the face as shares of the photo's sides, and the radius of the head in the shorter."""
+    height, width = matte.shape
+    middle = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
+    return middle[0] / width, middle[1] / height, _HEAD_RADIUS * crop.side_px / min(height, width)
+
+
+def _write(
+    path: Path, item: Item, tag: str, basis: Basis, plate: Plate, head: tuple[float, float, float]
+) -> None:
+    document = packed(basis, plate, head, page_maps())
+    text = page(Path(item.name).name + tag, str(item.input_path), document, _strip(basis, plate))
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_index(path: Path, items: Sequence[Item], work: "MakePage") -> None:
+    """Write the list of all pages that exist, and print its path."""
+    entries = []
+    for item in items:
+        for made in sorted(item.output_base.parent.glob(f"{_escaped(item.output_base.name)}*.html")):
+            tag = made.stem.removeprefix(item.output_base.name)
+            if tag == "" if work.photo.face != "all" else tag.startswith("_face"):
+                address = made.relative_to(path.parent).as_posix()
+                strip = strip_of(made.read_text(encoding="utf-8"))
+                entries.append(IndexEntry(item.name + tag.replace("_", " "), address, strip))
+    with atomic_path(path) as temporary:
+        temporary.write_text(index_page(entries), encoding="utf-8")
+    print(path, flush=True)
+
+
+@cache
+def page_maps() -> tuple[PageMap, ...]:
+    """A procedural map of each kind, small, with the command that draws it."""
+    found = []
+    for kind in KINDS:
+        pixels, _ = draw_sky(0, 0, _DRAWN_WIDTH_PX, (kind,))
+        step = _DRAWN_WIDTH_PX // _MAP_WIDTH_PX
+        small = pixels.reshape(_MAP_WIDTH_PX // 2, step, _MAP_WIDTH_PX, step, 3).mean((1, 3))
+        command = f"facerf envmap --kind {shlex.quote(kind)} --count 1 -o maps"
+        found.append(PageMap(kind, small, command, f"maps/00000_{kind}.exr"))
+    return tuple(found)
+
+
+def _strip(basis: Basis, plate: Plate) -> str:
+    """The photo and the person under a few lights, small and side by side."""
+    size = fitted(plate.matte.shape[0], plate.matte.shape[1], _STRIP_PX)
+    images = [resized(plate.before.clip(0, 1), *size)]
+    seen = resized(plate.matte, *basis.ratios.shape[1:3])
+    for light in _STRIP_LIGHTS:
+        image = basis.image(azel_to_direction(*light).numpy())
+        exposed = image * np.float32(2.0 ** auto_exposure_ev(image, seen))
+        images.append(resized(exposed.clip(0, 1), *size))
+    return strip_jpeg([linear_to_srgb(image) for image in images])
+
+
+def _escaped(name: str) -> str:
+    """A name in a pattern of files."""
+    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
