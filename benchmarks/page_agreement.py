@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from _common import ASTRONAUT, ROOT, arguments
 
+from facerf_cli.face.head import shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, most_exposure_ev
-from facerf_cli.image.resample import shrunk_photo
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, golden_spiral, rig_directions
 from facerf_cli.models import load_models

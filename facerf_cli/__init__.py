@@ -7,6 +7,8 @@ Names are loaded from `facerf_cli.api` at their first use, so that the command l
 
 from typing import TYPE_CHECKING, Any
 
+from facerf_cli._version import __version__ as __version__
+
 if TYPE_CHECKING:
     from facerf_cli.api import (
         Light,
@@ -20,7 +22,6 @@ if TYPE_CHECKING:
         write_image,
     )
 
-__version__ = "0.1.0"
 __all__ = [
     "Light",
     "estimate_light",

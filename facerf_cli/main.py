@@ -20,7 +20,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.batch.settings import DeviceName, Settings
 from facerf_cli.cli import evaluate, face_model
 from facerf_cli.cli.check import check

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer.main
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.errors import UsageError
 from facerf_cli.main import app
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.cli.options import settings_of
 from facerf_cli.run.logs import json_line
 

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from pydantic import Field, model_validator
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.stage_json import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.errors import InputError, UsageError

@@ -11,6 +11,7 @@ from facerf_cli.face.crop import GIVE_LANDMARKS
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles
+from facerf_cli.image.resample import fitted, resized
 from facerf_cli.raster.texture import inpaint, normal_map, unwrap
 
 _INSIDE_PHOTO = 0.99  # share of a texel's pixels that lie inside the photo, from which on it is visible
@@ -77,3 +78,12 @@ def unwrap_face(
         raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
     normals = normal_map(vertices, grid_triangles(), side)
     return FaceTexture(inpaint(texture, visible), visible, normals)
+
+
+def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarray, Head]:
+    """A photo [H, W, 3] of `most_px` at most, and its head in the pixels of the smaller one."""
+    height, width = fitted(photo.shape[0], photo.shape[1], most_px)
+    if (height, width) == photo.shape[:2]:
+        return photo, head
+    crop = head.fit.crop.of_scaled(width / photo.shape[1])
+    return resized(photo, height, width), replace(head, fit=replace(head.fit, crop=crop))

@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlsplit
 import platformdirs
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, one_line
 

@@ -1,12 +1,9 @@
-"""Images, photos and their heads at another size."""
-
-from dataclasses import replace
+"""Images at another size."""
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.face.head import Head
 from facerf_cli.image.strips import Band, enlarged
 
 
@@ -33,12 +30,3 @@ def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:
     """The size of a frame whose longer side is `most_px` at most."""
     scale = min(1.0, most_px / max(height, width))
     return max(1, round(height * scale)), max(1, round(width * scale))
-
-
-def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarray, Head]:
-    """A photo [H, W, 3] of `most_px` at most, and its head in the pixels of the smaller one."""
-    height, width = fitted(photo.shape[0], photo.shape[1], most_px)
-    if (height, width) == photo.shape[:2]:
-        return photo, head
-    crop = head.fit.crop.of_scaled(width / photo.shape[1])
-    return resized(photo, height, width), replace(head, fit=replace(head.fit, crop=crop))

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 
 # IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"

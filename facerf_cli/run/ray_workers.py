@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue, one_line
 

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.capture.stage_json import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import GRID

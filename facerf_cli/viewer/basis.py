@@ -14,7 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from facerf_cli.composite import Composition, Relit
-from facerf_cli.face.head import Head
+from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     FACE_PERCENTILE,
@@ -22,7 +22,7 @@ from facerf_cli.image.colour import (
     luminance,
     srgb_to_linear,
 )
-from facerf_cli.image.resample import fitted, resized, shrunk_photo
+from facerf_cli.image.resample import fitted, resized
 from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.models import Models

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.convert_light import Axes, ConvertLight, Form
 from facerf_cli.files.images import write_exr

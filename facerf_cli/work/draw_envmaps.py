@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import sweep_leftovers

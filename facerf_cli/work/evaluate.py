@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import FolderIndex
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of

@@ -12,12 +12,12 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import fit_from_arrays
-from facerf_cli.face.head import Head
+from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.image.resample import fitted, resized, shrunk_photo
+from facerf_cli.image.resample import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, reflectance_of

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from safetensors.numpy import save_file
 
-from facerf_cli import __version__
+from facerf_cli._version import __version__
 from facerf_cli.cli.doctor import EXTRAS, MISSING
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.main import main

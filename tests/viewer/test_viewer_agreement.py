@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from facerf_cli.composite import Composition, Relit
-from facerf_cli.face.head import Head
+from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_display, most_exposure_ev
-from facerf_cli.image.resample import resized, shrunk_photo
+from facerf_cli.image.resample import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.models import load_models
