@@ -39,7 +39,7 @@ class Finding:
 
     @property
     def leaves_out(self) -> bool:
-        """Whether this frame alone is broken, and left out."""
+        """True if this frame alone is broken, and left out."""
         return self.severity == "error" and bool(self.light)
 
     @property

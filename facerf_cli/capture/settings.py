@@ -10,7 +10,7 @@ CAPTURE, CORRECTION = "Capture", "Checks and corrections"  # panels of the help
 
 @dataclass(frozen=True)
 class ReadSettings:
-    """How to read a capture's frames."""
+    """Settings of reading a capture's frames."""
 
     layout: str = option(
         "stage",
@@ -56,7 +56,7 @@ class ChartSettings:
 
 @dataclass(frozen=True)
 class CheckSettings:
-    """Whether to check the frames, and what a finding does."""
+    """Settings of the checks of frames, and of what a finding does."""
 
     checks: Literal["on", "off", "only"] = option(
         "on",

@@ -9,7 +9,7 @@ _DATASET, _PAIRS = "Dataset", "Pairs"  # panels of the help
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """What a dataset holds."""
+    """Settings of the contents of a dataset."""
 
     split: str = option(
         "0.8/0.1/0.1",

@@ -41,7 +41,7 @@ _ALLOWED = frozenset(
 )
 
 
-class _Refused(Exception):
+class _Unreadable(Exception):
     """The pickle contains something that is not read; the text says what."""
 
 
@@ -72,7 +72,7 @@ class _Unpickler(pickle.Unpickler):
         """Return a class of stand-ins for an allowed name."""
         whole = f"{module}.{name}"
         if whole not in _ALLOWED and not whole.startswith("chumpy."):
-            raise _Refused(f"names {whole[:80]}, which is not part of a face model")
+            raise _Unreadable(f"names {whole[:80]}, which is not part of a face model")
         return type("StandIn", (StandIn,), {"name": whole})
 
 
@@ -96,7 +96,7 @@ def read_inert_stream(file: BinaryIO, path: Path) -> Any:
     try:
         _check_work(content)
         return _unwrapped(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
-    except _Refused as refused:
+    except _Unreadable as refused:
         raise InputError(f"{path}: refused: it {refused}; nothing of it was run") from None
     except Exception as error:  # whatever damage makes an unpickler raise
         raise InputError(
@@ -110,9 +110,9 @@ def _check_work(content: bytes) -> None:
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content), 1):
         tuples += opcode.name.startswith(("TUPLE", "FROZENSET"))
         if count > _MAX_OPCODES or tuples > _MAX_TUPLES:
-            raise _Refused(f"has more than {_MAX_OPCODES} instructions, or {_MAX_TUPLES} tuples")
+            raise _Unreadable(f"has more than {_MAX_OPCODES} instructions, or {_MAX_TUPLES} tuples")
         if "PUT" in opcode.name and int(argument or 0) > _MAX_OPCODES:
-            raise _Refused(f"numbers an object {argument}")
+            raise _Unreadable(f"numbers an object {argument}")
 
 
 def _unwrapped(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What a stage camera sees of a person: samples of the surface, facets of the image, and the true layers.
+"""A person as a stage camera sees it: samples of the surface, facets of the image, and the true layers.
 
 Further landmarks than the 68 of `face.topology` have names: centres and outlines of the irises, and ears.
 """

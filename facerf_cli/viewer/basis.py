@@ -41,7 +41,7 @@ _WHITE_PERCENTILE = 99.9  # of a guide and of a ratio: the white of their bytes
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class LightSamples:
     """Pixels of a person by which the exposure is chosen: `face` [L, F, 3] and `person` [L, P, 3].
 
     `plate` is the brightness of both in the photo, at the percentiles of `relight`; None shows them well.
@@ -64,7 +64,7 @@ class Basis:
     scales: np.ndarray
     guide: np.ndarray
     white: float
-    samples: Samples
+    samples: LightSamples
 
     @staticmethod
     def of(
@@ -72,7 +72,7 @@ class Basis:
         images: np.ndarray,
         mean: np.ndarray,
         matte: np.ndarray,
-        samples: Samples | None = None,
+        samples: LightSamples | None = None,
     ) -> "Basis":
         """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W].
 
@@ -95,7 +95,7 @@ class Basis:
         if samples is None:
             person = _some(share > _SURE)
             straight = images.reshape(len(images), -1, 3)[:, person] / share.reshape(-1, 1)[person]
-            samples = Samples(straight, straight)
+            samples = LightSamples(straight, straight)
         return Basis(directions, ratios, scales, encoded, white, samples)
 
     @property
@@ -125,7 +125,7 @@ class Basis:
             float(np.percentile(plate[m], p)) if m.any() else 0.0
             for m, p in zip(masks, percentiles, strict=True)
         ]
-        return replace(self, samples=Samples(found[0], found[1], (bright[0], bright[1])))
+        return replace(self, samples=LightSamples(found[0], found[1], (bright[0], bright[1])))
 
     def _ratio(self, light: int) -> np.ndarray:
         return np.asarray((self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light])
@@ -169,7 +169,7 @@ def basis_of_photo(
     return Basis.of(rig.numpy(), np.stack(images), shown, composition.matte, samples)
 
 
-def _samples(coarse: np.ndarray, field: PortraitField) -> Samples:
+def _samples(coarse: np.ndarray, field: PortraitField) -> LightSamples:
     """The samples of a photo's person, whose images [L, S S, 3] are as coarse as the maps of its field."""
     classes = field.person.classes.numpy()
     face, person = classes[class_index("skin")] > _SURE, 1 - classes[0] > _SURE
@@ -178,7 +178,7 @@ def _samples(coarse: np.ndarray, field: PortraitField) -> Samples:
         float(np.percentile(photo[mask], percentile)) if mask.any() else 0.0
         for mask, percentile in ((face, FACE_PERCENTILE), (person, AUTO_EXPOSURE_PERCENTILE))
     ]
-    return Samples(coarse[:, _some(face)], coarse[:, _some(person)], (plate[0], plate[1]))
+    return LightSamples(coarse[:, _some(face)], coarse[:, _some(person)], (plate[0], plate[1]))
 
 
 def _single(composition: Composition, head: Head, field: PortraitField, lights: Tensor) -> Iterator[Relit]:

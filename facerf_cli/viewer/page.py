@@ -23,7 +23,7 @@ from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.viewer.basis import Basis, Samples
+from facerf_cli.viewer.basis import Basis, LightSamples
 
 _HERE = Path(__file__).parent
 _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
@@ -41,7 +41,7 @@ class PageMap:
 
 @dataclass(frozen=True, eq=False)
 class Plate:
-    """What a page shows besides its basis: all images [H, W, ...].
+    """Images that a page shows besides its basis: all [H, W, ...].
 
     `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown.
     """
@@ -103,7 +103,7 @@ def _triangles(directions: np.ndarray) -> np.ndarray:
         return np.zeros((0, 3), int)
 
 
-def _exposure(samples: Samples) -> dict[str, Any]:
+def _exposure(samples: LightSamples) -> dict[str, Any]:
     """Pixels under each light by which a page chooses its exposure, and what it compares them with."""
     return {
         "face": _roots(samples.face),

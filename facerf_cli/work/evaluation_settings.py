@@ -35,7 +35,7 @@ class SplitOptions:
 
 @dataclass(frozen=True)
 class EvaluateOptions:
-    """What is measured, by which methods, and where it goes; it can be sent to other processes."""
+    """Settings of what is measured, by which methods, and where it goes, for other processes too."""
 
     output: Path = option(
         ...,

@@ -100,7 +100,7 @@ def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, A
 def _face_of_stack(
     item: Item, header: StackHeader, work: "MakePage"
 ) -> tuple[tuple[float, float, float], np.ndarray]:
-    """Where the head of a photo's stack is, and the face's share [H, W] of it."""
+    """The place of the head of a photo's stack, and the face's share [H, W] of it."""
     try:
         fit = fit_from_arrays(header.fit)
     except (ValueError, TypeError, KeyError) as error:
