@@ -226,9 +226,9 @@ def difference(a: Path, b: Path) -> tuple[float, str]:
         old, new = old.astype(np.float64), new.astype(np.float64)
         apart = np.where((old == new) | (np.isnan(old) & np.isnan(new)), 0.0, np.abs(old - new))
         if (largest := float(np.nan_to_num(apart, nan=np.inf, posinf=np.inf).max(initial=0.0))) > 0:
-            share = largest / max(float(np.nanmax(np.abs(old))), 1e-30)
+            scale = max(float(np.nanmax(np.abs(values))) for values in (old, new))
             count = f"{np.count_nonzero(apart)} of {apart.size}"
-            worst = max(worst, (share, f"{name}: by {largest:.3g} of {np.nanmax(np.abs(old)):.3g}, {count}"))
+            worst = max(worst, (largest / scale, f"{name}: by {largest:.3g} of {scale:.3g}, {count}"))
     return worst
 
 
