@@ -123,10 +123,9 @@ class Models:
         """The device of the networks."""
         return self.networks.device
 
-    @property
-    def checkpoint_name(self) -> str:
-        """Name of the Reflectance Network's file."""
-        return self.networks.files["reflectance"].stem
+    def checkpoint_name(self, network: str = "reflectance") -> str:
+        """Name of the file that serves a network."""
+        return self.networks.files[network].stem
 
     def with_networks(self, **networks: nn.Module) -> "Models":
         """Return the same models with other networks in place of some."""

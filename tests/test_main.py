@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import typer
 
 from facerf_cli import __version__, main
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.network.checkpoint import save_networks
 
 ROOT = Path(main.__file__).parents[1]
 ERRORS: dict[str, BaseException] = {
@@ -74,9 +76,13 @@ def test_log_as_json(verb: Verb, capsys: Capture) -> None:
     ["probe", "--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q"],
     ["--seed", "7", "probe", "-q", "--device=cpu", "--checkpoint=a.st"],
 ])  # fmt: skip
-def test_global_options_stand_anywhere(verb: Verb, line: list[str]) -> None:
+def test_global_options_stand_anywhere(
+    verb: Verb, line: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_networks(Path("a.st"), {"reflectance": torch.nn.Linear(1, 1)}, {})
     assert verb(*line) == 0
-    assert seen[-1] == Settings(-1, False, "cpu", Path("a.st"), 7)
+    assert seen[-1] == Settings(-1, False, "cpu", (Path("a.st"),), seed=7)
 
 
 def test_nothing_is_moved_from_behind_two_dashes() -> None:

@@ -26,6 +26,7 @@ from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
+from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
 
@@ -289,8 +290,8 @@ def compare_sitter(
     questions = list(sitter.questions())
     frontal = sitter.image("frontal")
     name = str(database.folder / subject)
-    parsing = methods[0].models.networks.parsing
-    face = find_for(parsing, geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
+    networks = methods[0].models.networks if methods else SHIPPED_NETWORKS
+    face = find_for(networks.parsing, geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
     for source in dict.fromkeys(question.source for question in questions):
         asked = [question for question in questions if question.source == source]
         photo = sitter.image(source)

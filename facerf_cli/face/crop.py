@@ -153,8 +153,8 @@ def check_in_photo(landmarks_px: np.ndarray, height_px: int, width_px: int) -> n
     inside = (middle_px >= 0).all() and (middle_px <= (width_px, height_px)).all()
     if not inside or extent_px > 2 * max(height_px, width_px):
         raise InputError(
-            f"landmarks: around ({middle_px[0]:.0f}, {middle_px[1]:.0f}), {extent_px:.0f} pixels wide, and "
-            f"the photo has {width_px} x {height_px}; give those of this photo, in its pixels"
+            f"landmarks: outside the image: around ({middle_px[0]:.0f}, {middle_px[1]:.0f}) and "
+            f"{extent_px:.0f} pixels wide, in a photo of {width_px} x {height_px}; give its own"
         )
     return landmarks_px
 

@@ -170,8 +170,10 @@ def _space_of_icc(path: Path, profile: bytes, description: str, default: ColourS
 
 def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
     """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: its values are linear."""
+    if not is_floating(spec):
+        return False
     with path.open("rb") as stream:
-        return is_floating(spec) and stream.read(2) == _JPEG_START
+        return stream.read(2) == _JPEG_START
 
 
 def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:

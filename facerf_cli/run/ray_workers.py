@@ -25,7 +25,7 @@ from facerf_cli.run.logs import LOGGER_NAME, log_to_queue, one_line
 T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
-_NO_MODULES = Path(__file__).parent / "assets"
+_NO_MODULES = Path(__file__).parents[1] / "assets"
 _ATTEMPTS = 3  # at an item whose workers are lost
 _PATIENCE_S = 10
 _STORE_BYTES = 256 << 20  # of shared memory; what goes through it is settings

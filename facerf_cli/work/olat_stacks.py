@@ -148,7 +148,7 @@ def _of_person(
 
 
 def _metadata(item: Item, work: PredictOlat) -> dict[str, str | int]:
-    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name())
     return metadata | ({"facerf:network_alone": 1} if work.network_alone else {})
 
 

@@ -230,7 +230,7 @@ def _write(
     estimate, facts = _estimate(item, image, face.head, options, more)
     models = load_models_once(options.photo)
     said = {f"facerf:light_{name}": _as_metadata(value) for name, value in facts.items()}
-    metadata = provenance(item, options.photo, models.checkpoint_name) | said
+    metadata = provenance(item, options.photo, models.checkpoint_name()) | said
     envmap = rig_to_latlong(estimate.light, width_px // 2)
     base = item.output(f"{face.tag}_light")
     write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)

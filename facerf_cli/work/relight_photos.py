@@ -179,7 +179,8 @@ def _together(item: Item, image: LinearImage, faces: Sequence[FittedFace], work:
 
 
 def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
-    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name)
+    network = "diffuse_sh" if work.reflectance == "diffuse-sh" else "reflectance"
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name(network))
     if work.reflectance != "portrait":
         metadata["facerf:reflectance"] = work.reflectance
     if work.network_alone:

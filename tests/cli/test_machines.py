@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,14 @@ def call(monkeypatch: pytest.MonkeyPatch) -> Call:
     return lambda *line: (app(args=["walk", *line], standalone_mode=False), seen.pop())[1]
 
 
+GIVEN = Settings(checkpoints_by_default=True)  # without --checkpoint
+
+
 def test_they_reach_the_settings(call: Call) -> None:
-    assert call() == (1, Settings())
-    assert call("--shard", "3/8", "--jobs", "2") == (2, Settings(shard=Shard(3, 8)))
-    assert call("--ray", "local", "--jobs", "1") == (1, Settings(ray="local"))
-    assert call("--ray", "head:6379") == (0, Settings(ray="head:6379"))
+    assert call() == (1, GIVEN)
+    assert call("--shard", "3/8", "--jobs", "2") == (2, replace(GIVEN, shard=Shard(3, 8)))
+    assert call("--ray", "local", "--jobs", "1") == (1, replace(GIVEN, ray="local"))
+    assert call("--ray", "head:6379") == (0, replace(GIVEN, ray="head:6379"))
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])

@@ -33,7 +33,7 @@ def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
             return [found for found in findings if found.subject == subject]
 
         for module in ("capture_findings", "prepare_capture"):
-            monkeypatch.setattr(f"facerf_cli.cli.items.{module}.check_subject", check_subject)
+            monkeypatch.setattr(f"facerf_cli.work.{module}.check_subject", check_subject)
 
     return planted
 

@@ -17,7 +17,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import Sides
+from facerf_cli.models import SHIPPED_NETWORKS, Networks, Sides
 from facerf_cli.pipeline import relight
 
 LIGHTS = torch.eye(3)
@@ -44,6 +44,7 @@ class FaceModelOnly:
     face: MorphableModel
     geometry: None = None
     default_geometry: Geometry = "landmarks"
+    networks: Networks = SHIPPED_NETWORKS
 
     def sides(self) -> Sides:
         return Sides(256, 512)

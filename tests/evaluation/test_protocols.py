@@ -54,7 +54,7 @@ def person(dataset: Dataset) -> Person:
 
 def person_of(dataset: Dataset, geometry: Geometry | None = None) -> PersonOfAlbedo:
     """Of the joint fit, which is the true one here, unless another geometry is given."""
-    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96))
+    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96), SHIPPED_NETWORKS.parsing)
 
 
 def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
@@ -180,7 +180,7 @@ def found_by_truth(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, blind: str
     joint = person_of(dataset)
     cameras = {camera: joint.lit(camera).face for camera in ("C0", "C1")}
 
-    def find(geometry: Geometry, image: np.ndarray, name: str, landmarks_from: str) -> list[Face]:
+    def find(_: object, geometry: Geometry, image: np.ndarray, name: str, landmarks_from: str) -> list[Face]:
         assert geometry == "landmarks"
         camera = name.rpartition("/")[2]
         if camera not in cameras:  # a source, of C0 if its index is even

@@ -107,7 +107,7 @@ def test_scores_are_the_benchmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     comparisons = list(compare_sitter(databases[0], "yaleB05", []))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
@@ -146,7 +146,7 @@ def small(tmp_path: Path) -> YaleB:
 
 def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(
         pipeline, "person_matte", lambda models, photo, head: np.ones(photo.shape[:2], np.float32)
     )
@@ -197,7 +197,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     models = load_models()
     sitter = Sitter(small, "yaleB07")
     photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
