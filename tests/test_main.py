@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 import typer
 
 from facerf_cli import __version__, main
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import save_networks
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
 
 ROOT = Path(main.__file__).parents[1]
 ERRORS: dict[str, BaseException] = {
@@ -80,7 +81,8 @@ def test_global_options_stand_anywhere(
     verb: Verb, line: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    save_networks(Path("a.st"), {"reflectance": torch.nn.Linear(1, 1)}, {})
+    monkeypatch.setitem(main.USES, "probe", frozenset({"diffuse_sh"}))
+    save_networks(Path("a.st"), {"diffuse_sh": DiffuseNetwork()}, {"layout_version": LAYOUT_VERSION})
     assert verb(*line) == 0
     assert seen[-1] == Settings(-1, False, "cpu", (Path("a.st"),), seed=7)
 

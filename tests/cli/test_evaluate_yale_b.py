@@ -34,7 +34,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
     monkeypatch.setattr(evaluate_images, "methods_of", lambda *_: (Lambert("field", models),))
-    monkeypatch.setattr(yale_b, "find_for", lambda geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
 
 
 @pytest.mark.usefixtures("toys")

@@ -256,7 +256,7 @@ def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path:
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
     assert differences(one, other) == "--lights is another, was 150; --matte changed"
-    assert len(one["checkpoints"]) > 32  # the networks that facerf ships
+    assert len(one["checkpoint"]) > 32  # the networks that facerf ships
 
 
 def test_the_files_of_a_folder_and_of_a_pattern_are_in_the_recipe(tmp_path: Path) -> None:

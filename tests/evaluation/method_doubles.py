@@ -45,6 +45,7 @@ class FaceModelOnly:
     geometry: None = None
     default_geometry: Geometry = "landmarks"
     networks: Networks = SHIPPED_NETWORKS
+    device: str = "cpu"
 
     def sides(self) -> Sides:
         return Sides(256, 512)
