@@ -227,11 +227,11 @@ def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[Fac
 def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
     path = companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")
+    landmarks_px = read_landmarks(path)
     try:
-        return face_at(check_in_photo(read_landmarks(path), *image.pixels.shape[:2]))
+        return face_at(check_in_photo(landmarks_px, *image.pixels.shape[:2]))
     except InputError as error:
-        named = "" if str(error).startswith(str(path)) else f"{path}: "
-        raise InputError(f"{named}{error}") from None
+        raise InputError(f"{path}: {error}") from None
 
 
 def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
