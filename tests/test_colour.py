@@ -40,7 +40,7 @@ def test_usual_images_do_not_import_colour_science() -> None:
     """sRGB and Display P3, with profiles or without, EXRs and studio lights without a temperature."""
     program = (
         "import sys, numpy as np\n"
-        "from facerf_cli import colour\n"
+        "from facerf_cli.image import colour\n"
         "from facerf_cli.files.icc import space_of_profile\n"
         "from facerf_cli.light.studio_points import StudioLight, intensity_of\n"
         "from tests import icc_profiles\n"

@@ -25,13 +25,15 @@ from tests.processes import wait_until
 pytestmark = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
 NAMES = tuple(f"{letter}.png" for letter in "abcdefgh")
+# Workers import tests.cli.toy_batch.
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
 ITEMS = [f"x/{letter}" for letter in "abcdefgh"]
 
 
 @pytest.fixture(scope="module")
 def two_workers() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))  # workers import tests.cli.toy_batch
+        patch.setenv("PYTHONPATH", ENVIRONMENT["PYTHONPATH"])
         ray = connect("local", 2)
     yield
     ray.shutdown()
@@ -168,9 +170,10 @@ def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, two_wor
 @needs_ray
 def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
     (photos / "x" / "a.png").write_bytes(b"wait")
-    root = Path(__file__).parents[1]
     command = [sys.executable, "-m", "tests.cli.toy_batch", str(photos), str(tmp_path / "out")]
-    process = subprocess.Popen(command, cwd=root, start_new_session=True, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, env=ENVIRONMENT, start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
     wait_until((tmp_path / "victim").exists, process)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does
     error = process.communicate()[1].rstrip()
