@@ -25,7 +25,6 @@ from torch import Tensor
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import explain_texture
-from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, load_pairs
 from facerf_cli.evaluation.people import CropView, Person
@@ -33,8 +32,9 @@ from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import mean_interval, si_mse
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import explain, relight
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 METHODS = ("field", "diffuse-sh", "diffuse-sh low-pass", "diffuse-sh unrefined", "specular-sh", "prt")
 STEPS = ("reconstruction", "in the source's true light", "under another map", "and in another pose")

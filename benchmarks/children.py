@@ -26,11 +26,11 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.portraits import bake_portrait, photograph
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera

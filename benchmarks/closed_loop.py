@@ -24,18 +24,18 @@ import torch
 from _common import MAPS, arguments, photos, print_header, print_row
 from torch import Tensor
 
-from facerf_cli.composite import Composition
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.composite import Composition
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.training.pretrained import load_features
 
 TURNS_DEG = (0, 120)  # of each map

@@ -23,9 +23,9 @@ from facerf_cli.face.landmarks import Face
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import regress_head
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 CROP_PX = 256
 EVERY = 4  # of a dataset's people, one is measured

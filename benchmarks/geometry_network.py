@@ -28,10 +28,10 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.synth.bank.face_crops import RenderedFaces
 from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
 

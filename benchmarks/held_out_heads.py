@@ -30,7 +30,7 @@ from torch import Tensor
 
 from facerf_cli.face.topology import region_mask
 from facerf_cli.image.metrics import TONES, ita_deg, mean_interval, tone_drift_deg, tone_of
-from facerf_cli.models import load_models
+from facerf_cli.relighting.models import load_models
 from facerf_cli.synth.appearance import skin
 from facerf_cli.synth.appearance.people import People, draw_people
 from facerf_cli.synth.bank.heads import Bank

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import LightEvidence, estimate_signed_weights, estimate_smooth_weights
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import estimate_light, fit_photo
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 REACHES = 0.1  # as `facerf estimate-light`
 NEIGHBOURS = 6

@@ -36,10 +36,10 @@ from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import faces_of
 from facerf_cli.portrait.segment import segment
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
 from facerf_cli.training.objective import seeded

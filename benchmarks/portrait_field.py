@@ -18,16 +18,16 @@ import torch
 from _common import ASTRONAUT, arguments, best_s, required
 from skimage.metrics import structural_similarity
 
-from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.own_light import own_light
+from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.bank.transport import load_view
 from facerf_cli.synth.portraits import images_under

@@ -17,18 +17,18 @@ import torch
 from _common import ASTRONAUT, ROOT, arguments, best_s
 from torch import Tensor
 
-from facerf_cli.composite import Composition
 from facerf_cli.dataset.weights import multiply
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.field import Field
 from facerf_cli.files.images import read_image
 from facerf_cli.light.envmap import envmap_weights, rotated_weights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import Models, load_models
 from facerf_cli.pipeline import fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import normal_map
+from facerf_cli.relighting.composite import Composition
+from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.sky.skies import draw_sky
 
 _ROUNDS = 3

@@ -27,9 +27,9 @@ from large_photos import enlarged
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.person import SeenPerson, look_at_person
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 
 _ROUNDS = 3
 _AT_ONCE = 16  # lights
@@ -38,7 +38,7 @@ import torch
 from facerf_cli.network import checkpoint
 if {naive}:
     checkpoint._Unfilled.__torch_function__ = lambda self, f, _, args=(), kw=None: f(*args, **(kw or {{}}))
-from facerf_cli.models import SHIPPED_NETWORKS, load_models
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 load_models()
 """
 

@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 HERE = Path(__file__).parent
 PRESETS = ("rembrandt", "loop", "butterfly", "split", "rim", "beauty")

@@ -14,7 +14,6 @@ import torch
 
 from facerf_cli import pipeline
 from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry
@@ -25,12 +24,13 @@ from facerf_cli.image.strips import filled
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models
-from facerf_cli.models import load_models as load
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
+from facerf_cli.relighting.models import load_models as load
 
 Pose = tuple[float, float, float]  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"]

@@ -20,35 +20,35 @@ from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
-from facerf_cli.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import Face, FaceBox, to_display
-from facerf_cli.field import (
+from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
+from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.light.studio_points import NearLights
+from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.inputs import exposure_of, resize
+from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
+from facerf_cli.portrait.occluders import uncovered
+from facerf_cli.portrait.person import look_at_person
+from facerf_cli.portrait.segment import segment
+from facerf_cli.relighting.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
+from facerf_cli.relighting.field import (
     MEMORY_BYTES,
     Field,
     photo_evidence,
     shrunk,
     weighted_sums,
 )
-from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
-from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import NearLights
-from facerf_cli.models import Models, Sides
-from facerf_cli.near_textures import near_texture
-from facerf_cli.network.feature_networks import FeatureNetwork
-from facerf_cli.network.inputs import exposure_of, resize
-from facerf_cli.network.parsing import ParsingNetwork
-from facerf_cli.own_light import own_light, photo_quotient
-from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
-from facerf_cli.portrait.occluders import uncovered
-from facerf_cli.portrait.person import look_at_person
-from facerf_cli.portrait.segment import segment
-from facerf_cli.portrait_field import PortraitField, SteadyFrame, maps_of
-from facerf_cli.whole_person import WholePerson
+from facerf_cli.relighting.models import Models, Sides
+from facerf_cli.relighting.near_textures import near_texture
+from facerf_cli.relighting.own_light import own_light, photo_quotient
+from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
+from facerf_cli.relighting.whole_person import WholePerson
 
 
 def fit_photo(

@@ -10,16 +10,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import (
-    Background,
-    Composition,
-    PersonAround,
-    PhotoDetail,
-    Relit,
-    RelitImage,
-    Surround,
-    Target,
-)
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
@@ -31,6 +21,16 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
+from facerf_cli.relighting.composite import (
+    Background,
+    Composition,
+    PersonAround,
+    PhotoDetail,
+    Relit,
+    RelitImage,
+    Surround,
+    Target,
+)
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)

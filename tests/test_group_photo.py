@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from facerf_cli.group_photo import GroupComposition
 from facerf_cli.image.strips import Band, Layer, filled, whole
+from facerf_cli.relighting.group_photo import GroupComposition
 
 SIZE = (4, 6)
 

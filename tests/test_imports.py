@@ -13,10 +13,7 @@ LEVELS = (
     ("__main__", "manpages", "completions", "main", "cli"),
     ("work", "api"),
     ("evaluation", "training", "viewer", "capture", "dataset", "synth"),
-    (
-        *("pipeline", "portrait", "baselines", "network", "face", "models", "field", "composite", "film"),
-        *("group_photo", "near_textures", "own_light", "portrait_field", "whole_person"),
-    ),
+    ("pipeline", "relighting", "portrait", "baselines", "network", "face"),
     ("batch", "light", "raster", "image", "files", "run", "errors", "option", "_version"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

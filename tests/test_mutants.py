@@ -25,6 +25,6 @@ def test_there_are_enough_of_every_room() -> None:
         "face",
         "light",
         "raster",
-        "composite.py",
+        "relighting",
         "evaluation",
     } <= rooms

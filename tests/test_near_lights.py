@@ -8,17 +8,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, Target
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
 from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import NearLights, far_samples
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.relighting.composite import Composition, Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.portrait_field import PortraitField
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 TARGET = Target(background="none")

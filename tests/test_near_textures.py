@@ -12,8 +12,8 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import PointLights
-from facerf_cli.near_textures import far_lights_of, near_texture
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.relighting.near_textures import far_lights_of, near_texture
 
 SIDE = 64
 

@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.field import Field, shrunk
 from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
-from facerf_cli.own_light import light_of_frames, own_light
 from facerf_cli.pipeline import fit_photo
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.field import Field, shrunk
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.own_light import light_of_frames, own_light
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))

@@ -7,19 +7,19 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.baselines import Kind
-from facerf_cli.composite import Composition, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import region_mask
-from facerf_cli.field import photo_evidence, weighted_sum
 from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import estimate_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.composite import Composition, Target
+from facerf_cli.relighting.field import photo_evidence, weighted_sum
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 

@@ -9,20 +9,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Target
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
 from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.own_light import own_light
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait_field import PortraitField, maps_of
-from facerf_cli.whole_person import WholePerson
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.own_light import own_light
+from facerf_cli.relighting.portrait_field import PortraitField, maps_of
+from facerf_cli.relighting.whole_person import WholePerson
 
 PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 

@@ -15,9 +15,9 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sh import coefficients_to_rig, irradiance, rig_coefficients
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import Models
 from facerf_cli.network.diffuse_sh import COEFFICIENTS, ORDER, DiffuseNetwork, shading
 from facerf_cli.network.inputs import resize
+from facerf_cli.relighting.models import Models
 
 _SEEN = 0.9  # visibility from which on a texel counts in the solution for the light
 _HOLD = 1e-4  # weight of the network's light, as a share of the evidence on a coefficient

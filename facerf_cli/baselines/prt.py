@@ -41,8 +41,8 @@ from facerf_cli.files.downloads import cache_folder
 from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated, sh_basis
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
-from facerf_cli.models import Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.relighting.models import Models
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 
 log = logging.getLogger(LOGGER_NAME)

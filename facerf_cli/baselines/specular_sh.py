@@ -33,8 +33,8 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sh import coefficients_to_rig, cosine_lobe, rig_coefficients, sh_basis
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import Models
 from facerf_cli.raster.texture import bake_attributes, normal_map
+from facerf_cli.relighting.models import Models
 
 DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
 EXPONENT = 12.0  # of the Blinn-Phong lobe, which then has no degrees above GLOSS_ORDER

@@ -32,9 +32,9 @@ from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import in_shards
 

@@ -35,10 +35,10 @@ from facerf_cli.files.pages import filled_page
 from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 
 _TILE_PX = 192

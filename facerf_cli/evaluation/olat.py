@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.people import (
     CropView,
@@ -30,7 +29,8 @@ from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import tone_drift_deg
 from facerf_cli.light.sphere import direction_to_azel
-from facerf_cli.models import Models
+from facerf_cli.relighting.composite import Composition, Relit, Target
+from facerf_cli.relighting.models import Models
 
 LAMBERT = "lambert"
 _NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shape

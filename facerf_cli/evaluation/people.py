@@ -12,7 +12,6 @@ from torch import Tensor
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
-from facerf_cli.composite import Target
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights, render_source, weights_path
 from facerf_cli.errors import InputError, UsageError
@@ -27,7 +26,6 @@ from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.image.metrics import tone_of
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import Models, Sides
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
@@ -43,6 +41,8 @@ from facerf_cli.pipeline import (
 from facerf_cli.portrait.find import LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.appearance.people import skin_albedo
 

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import torch
 
-from facerf_cli.composite import Target
 from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.people import Method, SourceFace, common_mask
 from facerf_cli.evaluation.summary import PublishedFigure, paper_table_2
@@ -19,6 +18,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.relighting.composite import Target
 
 FULL, MEAN = "all components", "mean face"
 _CELEBA = "130 images of CelebA-HQ; other data than ours"

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB
-from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.people import Method
@@ -26,9 +25,10 @@ from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
 ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera

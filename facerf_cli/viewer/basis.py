@@ -13,7 +13,6 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli.composite import Composition, Relit
 from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
@@ -25,10 +24,11 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.resample import fitted, resized
 from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.relighting.composite import Composition, Relit
+from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.portrait_field import PortraitField
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept

@@ -17,9 +17,9 @@ from facerf_cli.face.detector import DETECTOR_LICENCE
 from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, predictor_path
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.face.recognition import RECOGNITION_LICENCE
-from facerf_cli.models import described_file
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files
+from facerf_cli.relighting.models import described_file
 
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:

@@ -30,9 +30,9 @@ from facerf_cli.evaluation.reconstruction import (
 from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.transfer import TABLE_2_TRANSFER, couples_of, transfer
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.models import load_models
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.pipeline import Estimator
+from facerf_cli.relighting.models import load_models
 from facerf_cli.work.evaluate import run_protocol
 from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
 from facerf_cli.work.photo_lights import feature_network

@@ -13,7 +13,6 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.predict_olat import PredictOlat
-from facerf_cli.composite import Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit, fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
@@ -28,6 +27,7 @@ from facerf_cli.image.resample import resized
 from facerf_cli.image.strips import filled, whole
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.relighting.composite import Target
 from facerf_cli.run import memory
 from facerf_cli.work.photos import (
     FittedFace,

@@ -25,13 +25,13 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.models import Models, load_models
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
 from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
-from facerf_cli.portrait_field import SteadyFrame
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
+from facerf_cli.relighting.models import Models, load_models
+from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 

@@ -14,19 +14,19 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight_work import Relight
 from facerf_cli.cli.shots import shot_of
-from facerf_cli.composite import Composition, Relit, Target
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
-from facerf_cli.field import weighted_sum
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
-from facerf_cli.group_photo import GroupComposition
 from facerf_cli.image.colour import ExposureRule, most_exposure_ev
 from facerf_cli.image.strips import Band, Layer, filled
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
+from facerf_cli.relighting.composite import Composition, Relit, Target
+from facerf_cli.relighting.field import weighted_sum
+from facerf_cli.relighting.group_photo import GroupComposition
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.backdrops import Backdrops

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facerf_cli.composite import Relit
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.image.resample import resized_rows
 from facerf_cli.image.strips import Band, Layer
+from facerf_cli.relighting.composite import Relit
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 

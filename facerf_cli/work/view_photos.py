@@ -19,9 +19,9 @@ from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_he
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.resample import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.models import Models
 from facerf_cli.pipeline import composition_of, reflectance_of
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import (

@@ -8,7 +8,7 @@ import torch
 
 import facerf_cli as facerf
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, srgb_to_linear
-from facerf_cli.models import Models
+from facerf_cli.relighting.models import Models
 
 
 @cache

@@ -8,9 +8,9 @@ from facerf_cli.baselines.diffuse_sh import (
 )
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.diffuse_sh import shading
 from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 
 def ball(side: int = 9) -> torch.Tensor:

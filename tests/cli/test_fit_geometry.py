@@ -13,9 +13,9 @@ from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import render_texture
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"

@@ -13,10 +13,10 @@ from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS, Sides, load_models
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 

@@ -15,10 +15,10 @@ from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.viewer.page import strip_of
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.files.test_relight_web import Decoder

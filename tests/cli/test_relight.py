@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from facerf_cli.composite import Relit
-from facerf_cli.field import Field
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.pipeline import relit_by
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.composite import Relit
+from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.sky.skies import kind_of
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.exr_layers import exr_layers

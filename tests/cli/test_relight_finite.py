@@ -9,8 +9,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import all_or_none
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 

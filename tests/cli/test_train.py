@@ -11,12 +11,12 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.feature_networks import VggFeatures
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
 from facerf_cli.work import train_run
 from tests.dataset.dataset_fixture import write_small_dataset

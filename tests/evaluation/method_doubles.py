@@ -10,15 +10,15 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
-from facerf_cli.composite import Target
 from facerf_cli.evaluation.people import Method, Person, Portrait
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import SHIPPED_NETWORKS, Networks, Sides
 from facerf_cli.pipeline import relight
+from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
 LIGHTS = torch.eye(3)
 BRIGHTEST = torch.tensor([0.0, 0.0, 1.0])

@@ -11,7 +11,7 @@ from facerf_cli.evaluation.measure import Measures, measure
 from facerf_cli.evaluation.pairs import collect_pairs, compare_pair
 from facerf_cli.files.images import write_exr
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 NAMES = ("anna/one", "anna/two", "bert/one")
 SHAPE = (6, 9, 3)

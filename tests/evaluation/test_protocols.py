@@ -36,8 +36,8 @@ from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.image.metrics import si_mse, si_mse_channels
-from facerf_cli.models import SHIPPED_NETWORKS, Sides
 from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
 

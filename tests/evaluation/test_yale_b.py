@@ -34,8 +34,8 @@ from facerf_cli.evaluation.yale_b import (
 from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import load_models
 from facerf_cli.pipeline import fit_photo, head_of, relight
+from facerf_cli.relighting.models import load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly

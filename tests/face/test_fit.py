@@ -32,10 +32,10 @@ from facerf_cli.face.gauss_newton import (
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, grid_triangles
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import rasterize
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 CAMERA = crop_camera(256)
 CROP = Crop(10.0, 20.0, 512.0, 256)

@@ -12,9 +12,9 @@ from facerf_cli.face import dlib_landmarks, recognition
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.files.images import read_image
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from facerf_cli.film import follow
 
 from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.film import follow
-from facerf_cli.film.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
-from facerf_cli.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 BLANK = np.zeros((100, 160, 3), np.uint8)
 

@@ -7,10 +7,10 @@ import torch
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.models import load_models
 from facerf_cli.network import parsing
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
+from facerf_cli.relighting.models import load_models
 
 SMALL = ParsingSettings((8, 8, 12, 16), (0, 1, 1, 1), 64, 5, 70)
 

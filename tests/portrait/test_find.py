@@ -14,9 +14,9 @@ from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.dlib_landmarks import predictor_path
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import averaged, detect_faces, find_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import seen_of
 
 PHOTO = skimage.data.astronaut()[:400, 40:400]  # not square

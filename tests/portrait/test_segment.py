@@ -7,11 +7,11 @@ import pytest
 import torch
 
 from facerf_cli.image.strips import filled
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import Seen, Square
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
 
 HEIGHT, WIDTH = 240, 320

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from facerf_cli.composite import Composition, Relit
 from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.image.resample import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
-from facerf_cli.models import load_models
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
-from facerf_cli.portrait_field import PortraitField
+from facerf_cli.relighting.composite import Composition, Relit
+from facerf_cli.relighting.models import load_models
+from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.view_photos import head_place, of_photo, page_maps
 from tests.viewer.browser import chromium, drawn

@@ -21,8 +21,8 @@ from facerf_cli.face.joint_fit import PosedCamera, fit_views
 from facerf_cli.face.landmarks import choose_face, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import detect_faces
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 _TURN_DEG = 20.0  # sound rigs give 1 to 11, on Extended Yale B and synthetic faces
 _SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # least turn of a swapped camera; largest distance from the other's pose

@@ -23,11 +23,11 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.models import SHIPPED_NETWORKS
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.square import SIDE_PX, SIDES
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
 from facerf_cli.synth.bank.portraits import background_of

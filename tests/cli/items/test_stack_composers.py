@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.composite import Relit
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.image.strips import filled, whole
+from facerf_cli.relighting.composite import Relit
 from facerf_cli.work.stack_composers import PersonStack
 
 SIDE = 4

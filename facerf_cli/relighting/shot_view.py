@@ -21,15 +21,15 @@ from facerf_cli.face.fit import FaceFit, fit_batch, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.film.follow import MAPS_REACH, Sighting, path_of, steadied
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.models import Models, Sides
 from facerf_cli.network.portrait import PortraitMaps
-from facerf_cli.own_light import light_of_frames
 from facerf_cli.portrait.occluders import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image
-from facerf_cli.portrait_field import SteadyFrame, maps_of
+from facerf_cli.relighting.follow import MAPS_REACH, Sighting, path_of, steadied
+from facerf_cli.relighting.models import Models, Sides
+from facerf_cli.relighting.own_light import light_of_frames
+from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
 
 _KEYS = 12  # frames whose identities are averaged
 _AT_ONCE = 32  # frames that are fitted together

@@ -4,9 +4,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from facerf_cli.composite import Composition, Relit
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Band, Layer, by_rows
+from facerf_cli.relighting.composite import Composition, Relit
 
 Group = Sequence[Relit]  # of each person, in the order of the compositions
 _PERSON_MATTE = "person.A"

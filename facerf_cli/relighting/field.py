@@ -11,10 +11,10 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.quotient import Quotient
-from facerf_cli.models import Models
 from facerf_cli.network.inputs import is_grey, without_cast
 from facerf_cli.network.precision import mixed_precision
 from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.relighting.models import Models
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower

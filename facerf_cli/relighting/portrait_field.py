@@ -18,12 +18,10 @@ from torch import Tensor
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
-from facerf_cli.field import Field
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import is_grey
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
-from facerf_cli.own_light import OwnLight
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson
@@ -31,6 +29,8 @@ from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
+from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.own_light import OwnLight
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16

@@ -17,9 +17,9 @@ from facerf_cli.image.strips import Band, Layer
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import PersonColours, local_lines
 from facerf_cli.portrait.occluders import uncovered_rows
-from facerf_cli.portrait_field import PortraitField
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
+from facerf_cli.relighting.portrait_field import PortraitField
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias

@@ -15,11 +15,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.field import SEEN_WELL, Field, shrunk, weighted_sum
 from facerf_cli.light.estimate import estimate_lamps, lamp_error
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.models import Models
+from facerf_cli.relighting.field import SEEN_WELL, Field, shrunk, weighted_sum
+from facerf_cli.relighting.models import Models
 
 _AROUND = 32  # lights of the rig from around
 _RINGS_DEG = (14.0, 6.0)  # of the search for the lamp, each around the best place so far
