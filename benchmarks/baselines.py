@@ -33,7 +33,7 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import mean_interval, si_mse
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import explain, relight
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 METHODS = ("field", "diffuse-sh", "diffuse-sh low-pass", "diffuse-sh unrefined", "specular-sh", "prt")

@@ -34,7 +34,7 @@ from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composite import Composition
+from facerf_cli.relighting.composition import Composition
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.training.pretrained import load_features
 

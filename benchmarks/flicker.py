@@ -42,10 +42,9 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.relighting.follow import Follower
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
-from facerf_cli.relighting.shot_view import ShotView
+from facerf_cli.relighting.sequence import Follower, ShotView
 from tools.talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 
 PATCH = 1 / 64  # of the side

@@ -24,7 +24,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField

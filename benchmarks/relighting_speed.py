@@ -26,7 +26,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import normal_map
-from facerf_cli.relighting.composite import Composition
+from facerf_cli.relighting.composition import Composition
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.sky.skies import draw_sky

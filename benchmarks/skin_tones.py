@@ -21,7 +21,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
 from facerf_cli.synth.bank.texture_samples import draw_light

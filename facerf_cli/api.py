@@ -28,7 +28,7 @@ from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.models import load_models as load
 

@@ -36,16 +36,16 @@ from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_fa
 from facerf_cli.portrait.occluders import uncovered
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
-from facerf_cli.relighting.composite import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
+from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
 from facerf_cli.relighting.field import (
     MEMORY_BYTES,
     Field,
+    near_texture,
     photo_evidence,
     shrunk,
     weighted_sums,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.near_textures import near_texture
 from facerf_cli.relighting.own_light import own_light, photo_quotient
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
 from facerf_cli.relighting.whole_person import WholePerson

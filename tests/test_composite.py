@@ -21,7 +21,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
-from facerf_cli.relighting.composite import (
+from facerf_cli.relighting.composition import (
     Background,
     Composition,
     PersonAround,

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.image.strips import Band, Layer, filled, whole
-from facerf_cli.relighting.group_photo import GroupComposition
+from facerf_cli.relighting.composition import GroupComposition
 
 SIZE = (4, 6)
 

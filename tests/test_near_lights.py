@@ -16,7 +16,7 @@ from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import NearLights, far_samples
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composite import Composition, Target
+from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
 

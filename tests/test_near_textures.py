@@ -13,7 +13,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.raster.texture import bake_attributes, normal_map
-from facerf_cli.relighting.near_textures import far_lights_of, near_texture
+from facerf_cli.relighting.field import far_lights_of, near_texture
 
 SIDE = 64
 

@@ -17,7 +17,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.relighting.composite import Composition, Target
+from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.field import photo_evidence, weighted_sum
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 

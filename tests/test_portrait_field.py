@@ -18,7 +18,7 @@ from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField, maps_of

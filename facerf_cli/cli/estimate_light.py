@@ -67,7 +67,7 @@ class EstimateLight:
 
     def prepare(self, dry_run: bool) -> None:
         """Load the models, before the first photo; in a dry run check the options only."""
-        from facerf_cli.work.photo_lights import prepare_light
+        from facerf_cli.work.light_of_photo import prepare_light
 
         prepare_light(self.options, with_networks=not dry_run)
         follow_all(self.shots, self.options.photo, dry_run)
@@ -78,7 +78,7 @@ class EstimateLight:
 
     def __call__(self, item: Item) -> Outcome:
         """Estimate the light of every chosen face, or that of a shot."""
-        from facerf_cli.work.photo_lights import write_lights, write_shot_light
+        from facerf_cli.work.light_of_photo import write_lights, write_shot_light
 
         for shot in self.shots:
             if item.output_base == shot.base:

@@ -55,7 +55,7 @@ class FitGeometry:
 
     def __call__(self, item: Item) -> Outcome:
         """Fit every chosen face."""
-        from facerf_cli.work.fit_photos import write_fits
+        from facerf_cli.work.segment_and_fit import write_fits
 
         tags, facts = write_fits(item, self.photo)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

@@ -69,7 +69,7 @@ class PredictOlat:
 
     def __call__(self, item: Item) -> Outcome:
         """Predict every chosen face."""
-        from facerf_cli.work.olat_stacks import write_stacks
+        from facerf_cli.work.stacks import write_stacks
 
         return Outcome(*write_stacks(item, self))
 

@@ -388,7 +388,7 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
         or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
     ]
     if missing:
-        from facerf_cli.work.light_weights import readable, write_balls
+        from facerf_cli.work.lights import readable, write_balls
 
         drawn = readable(missing)
         paths = [path_of(setup) for setup in drawn]

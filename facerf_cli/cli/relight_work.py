@@ -115,7 +115,7 @@ class Relight:
 
         A dry run loads no networks, and so estimates no light of a photo.
         """
-        from facerf_cli.work.light_weights import readable
+        from facerf_cli.work.lights import readable
         from facerf_cli.work.outputs import check_output
 
         check_output(self.output)
@@ -130,7 +130,7 @@ class Relight:
 
     def __call__(self, item: Item) -> Outcome:
         """Relight a photo, a frame or a stack."""
-        from facerf_cli.work.relight_photos import relight_item
+        from facerf_cli.work.relight import relight_item
 
         written, facts = relight_item(item, self.for_stale(item))
         outputs = [path.with_suffix(suffix) for path in written for suffix in self.output.suffixes]

@@ -52,7 +52,7 @@ class Segment:
 
     def __call__(self, item: Item) -> Outcome:
         """Segment the person of every chosen face."""
-        from facerf_cli.work.segment_photos import write_segments
+        from facerf_cli.work.segment_and_fit import write_segments
 
         tags, facts = write_segments(item, self.photo, self.shots)
         return Outcome([item.output(tag + ending) for tag in tags for ending in _OUTPUTS], facts)

@@ -148,7 +148,7 @@ def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
 def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
     """Follow the face through each shot; what was followed before is kept."""
     if shots and not dry_run:
-        from facerf_cli.work.shot_frames import follow_shot
+        from facerf_cli.work.sequence import follow_shot
 
         for shot in shots:
             follow_shot(shot, photo, photo.settings)

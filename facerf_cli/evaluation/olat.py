@@ -29,7 +29,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import tone_drift_deg
 from facerf_cli.light.sphere import direction_to_azel
-from facerf_cli.relighting.composite import Composition, Relit, Target
+from facerf_cli.relighting.composition import Composition, Relit, Target
 from facerf_cli.relighting.models import Models
 
 LAMBERT = "lambert"

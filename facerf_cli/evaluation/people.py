@@ -41,7 +41,7 @@ from facerf_cli.pipeline import (
 from facerf_cli.portrait.find import LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.appearance.people import skin_albedo

@@ -18,7 +18,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 
 FULL, MEAN = "all components", "mean face"
 _CELEBA = "130 images of CelebA-HQ; other data than ours"

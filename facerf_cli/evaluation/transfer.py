@@ -15,7 +15,7 @@ from facerf_cli.dataset.pairs import Pair
 from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.people import Method, SourceFace, angle_of, common_mask, turn_class
 from facerf_cli.evaluation.summary import paper_table_2
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 
 _TEST_SET = "86 light-stage images in natural light; other data than ours"
 TABLE_2_TRANSFER = (

@@ -27,7 +27,7 @@ from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import LandmarksFrom
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these

@@ -26,7 +26,7 @@ from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import composition_of, relit_by
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.composite import Composition, Relit
+from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField
 

@@ -35,7 +35,7 @@ from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import load_models
 from facerf_cli.work.evaluate import run_protocol
 from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
-from facerf_cli.work.photo_lights import feature_network
+from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
 
 T = TypeVar("T")

@@ -11,7 +11,7 @@ from facerf_cli.cli.lights import collect_setups
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
 from facerf_cli.light.studio import StudioLight
-from facerf_cli.work.light_weights import near_lights_of, strengths, weights_over_rig
+from facerf_cli.work.lights import near_lights_of, strengths, weights_over_rig
 
 
 def single(text: str) -> StudioLight:

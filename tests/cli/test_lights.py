@@ -18,7 +18,7 @@ from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
-from facerf_cli.work.light_weights import readable, weights_over_rig, weights_over_stack, write_balls
+from facerf_cli.work.lights import readable, weights_over_rig, weights_over_stack, write_balls
 
 HEIGHT_PX = 16
 

@@ -14,7 +14,7 @@ from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write
 from facerf_cli.main import main
 from facerf_cli.pipeline import relit_by
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composite import Relit
+from facerf_cli.relighting.composition import Relit
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.sky.skies import kind_of
@@ -91,7 +91,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.work.relight_photos._HELD", 1 << 30)  # so that one frame fits
+    monkeypatch.setattr("facerf_cli.work.relight._HELD", 1 << 30)  # so that one frame fits
     line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
     assert relight(given, tmp_path, *line) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
@@ -114,8 +114,8 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
             held.append(weakref.ref(one.texture))
             yield one
 
-    monkeypatch.setattr("facerf_cli.work.relight_photos._HELD", 1 << 30)  # so that one light fits
-    monkeypatch.setattr("facerf_cli.work.relight_photos.relit_by", watched)
+    monkeypatch.setattr("facerf_cli.work.relight._HELD", 1 << 30)  # so that one light fits
+    monkeypatch.setattr("facerf_cli.work.relight.relit_by", watched)
     assert relight(given, tmp_path, *lights, "--composite", composite) == 0
     assert len(held) > 2
 

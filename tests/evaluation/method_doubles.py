@@ -17,7 +17,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import relight
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
 LIGHTS = torch.eye(3)

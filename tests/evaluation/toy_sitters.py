@@ -15,7 +15,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import relight
 from facerf_cli.raster.camera import Camera, project
-from facerf_cli.relighting.composite import Target
+from facerf_cli.relighting.composition import Target
 
 
 @dataclass(frozen=True, eq=False)

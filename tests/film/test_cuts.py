@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skimage.data import astronaut, coffee
 
-from facerf_cli.relighting.follow import CutFinder, takes, thumbnail
+from facerf_cli.relighting.sequence import CutFinder, takes, thumbnail
 
 ONE, OTHER = astronaut()[:300, :400], coffee()[:300, :400]
 

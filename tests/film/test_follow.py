@@ -6,8 +6,8 @@ from facerf_cli.film import follow
 
 from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.relighting.follow import LONGEST_GAP, Follower, Sighting, gaps, path_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.sequence import LONGEST_GAP, Follower, Sighting, gaps, path_of
 
 BLANK = np.zeros((100, 160, 3), np.uint8)
 

@@ -5,7 +5,7 @@ import torch
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project, rotation_to_pose
-from facerf_cli.relighting.shot_view import fit_frames, identity_of, spread_over
+from facerf_cli.relighting.sequence import fit_frames, identity_of, spread_over
 
 SIZE = (180, 240)
 YAWS = (-12.0, -4.0, 3.0, 11.0)

@@ -11,9 +11,8 @@ import torch
 from facerf_cli.film import shot_view
 
 from facerf_cli.errors import InputError
-from facerf_cli.relighting.follow import LONGEST_GAP, Sighting
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
-from facerf_cli.relighting.shot_view import KEY_FRAMES, ShotView
+from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, ShotView, Sighting
 from tests.film.test_follow import face_of
 
 FRAMES = 60

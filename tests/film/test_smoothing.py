@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.relighting.follow import REACH, smoothed, steadied
+from facerf_cli.relighting.sequence import REACH, smoothed, steadied
 
 
 def test_a_parabola_is_kept_and_noise_is_not() -> None:

@@ -14,7 +14,7 @@ from facerf_cli.image.resample import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
-from facerf_cli.relighting.composite import Composition, Relit
+from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.viewer.page import packed, page

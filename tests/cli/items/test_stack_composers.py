@@ -9,8 +9,8 @@ import torch
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.image.strips import filled, whole
-from facerf_cli.relighting.composite import Relit
-from facerf_cli.work.stack_composers import PersonStack
+from facerf_cli.relighting.composition import Relit
+from facerf_cli.work.stacks import PersonStack
 
 SIDE = 4
 

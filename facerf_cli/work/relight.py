@@ -1,16 +1,19 @@
-"""One photo, or one OLAT stack, under every light setup: relit, exposed and written."""
+"""One photo, or one OLAT stack, under every light setup: relit, exposed, before a background, and written."""
 
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.cli.backgrounds import BackgroundChoice
 from facerf_cli.cli.lights import LightSetup
 from facerf_cli.cli.relight_work import Relight
 from facerf_cli.cli.shots import shot_of
@@ -23,15 +26,16 @@ from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.image.colour import ExposureRule, most_exposure_ev
 from facerf_cli.image.strips import Band, Layer, filled
+from facerf_cli.light.backdrop import backdrop
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
-from facerf_cli.relighting.composite import Composition, Relit, Target
+from facerf_cli.raster.camera import Camera, rays_of_rows
+from facerf_cli.relighting.composition import Composition, GroupComposition, Relit, Target
 from facerf_cli.relighting.field import weighted_sum
-from facerf_cli.relighting.group_photo import GroupComposition
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
-from facerf_cli.work.backdrops import Backdrops
-from facerf_cli.work.light_weights import (
+from facerf_cli.work.lights import (
     near_lights_of,
+    read_map,
     strengths,
     weights_of_far_lights,
     weights_over_rig,
@@ -51,8 +55,9 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.shot_frames import seen_frame, view_of
-from facerf_cli.work.stack_composers import PersonStack, RenderedStack
+from facerf_cli.work.relight import Backdrops
+from facerf_cli.work.sequence import seen_frame, view_of
+from facerf_cli.work.stacks import PersonStack, RenderedStack
 
 _IMAGE_PX = 12  # bytes of a pixel of an image
 _HELD = 4  # relit textures are held this many times while lights are added to them
@@ -443,3 +448,61 @@ def _exposures_ev(
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next
     return found
+
+
+_HELD_BYTES = 24  # of a pixel of the photo: it, its matte and the view of its face
+_COVER_BYTES = 12  # of a pixel of the frame, which an image covers
+
+
+class Backdrops:
+    """Draws the chosen background for a photo's camera; what setups share is drawn once."""
+
+    def __init__(self, choice: BackgroundChoice, blur: float, camera: Camera) -> None:
+        self._choice, self._blur, self._camera = choice, blur, camera
+        self._fixed = _fixed(choice, camera)
+
+    def behind(self, setup: LightSetup, ev: float) -> Band | None:
+        """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
+
+        A file and a colour look as they are at an exposure of `ev`. A map is as bright as its light; single
+        lights have a black surrounding.
+        """
+        fixed, gain = self._fixed, np.float32(2.0**-ev)
+        if self._choice.kind != "envmap":
+            return None if fixed is None else lambda rows: fixed[rows] * gain
+        if setup.envmap is None:
+            width_px = self._camera.width_px
+            return lambda rows: np.zeros((rows.stop - rows.start, width_px, 3), np.float32)
+        with memory.beside(_photo_bytes(self._camera)):
+            envmap = read_map(setup.envmap)
+        size = self._camera.height_px, self._camera.width_px
+        return backdrop(envmap, size, partial(rays_of_rows, self._camera), setup.rotate_deg, self._blur)
+
+
+def _photo_bytes(camera: Camera) -> int:
+    """Memory of the photo that is held while a background is read."""
+    return _HELD_BYTES * camera.height_px * camera.width_px
+
+
+def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
+    height, width = camera.height_px, camera.width_px
+    if choice.colour is not None:
+        return np.broadcast_to(np.array(choice.colour, np.float32), (height, width, 3))
+    if choice.path is None:
+        return None
+    with memory.beside(_photo_bytes(camera) + _COVER_BYTES * height * width):
+        return _covering(read_image(choice.path, None).pixels, height, width)
+
+
+def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The middle of an image, scaled to cover a frame."""
+    scale = max(height / image.shape[0], width / image.shape[1])
+    rows, columns = (
+        min(side, round(wanted / scale)) for side, wanted in zip(image.shape, (height, width), strict=False)
+    )
+    top, left = (image.shape[0] - rows) // 2, (image.shape[1] - columns) // 2
+    part = torch.from_numpy(image[top : top + rows, left : left + columns]).permute(2, 0, 1)[None]
+    shrinks = scale < 1
+    sized = F.interpolate(part, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)
+    covered: np.ndarray = sized[0].permute(1, 2, 0).numpy()
+    return covered

@@ -19,9 +19,8 @@ from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709
 from facerf_cli.portrait.segment import Segmentation
-from facerf_cli.relighting.follow import LONGEST_GAP, CutFinder, Follower, Sighting, gaps, takes
 from facerf_cli.relighting.models import described_file
-from facerf_cli.relighting.shot_view import ShotView
+from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, ShotView, Sighting, gaps, takes
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photos import LANDMARK_SUFFIXES, FittedFace, companion, load_models_once, read_photo
 

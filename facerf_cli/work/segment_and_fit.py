@@ -1,7 +1,7 @@
-"""The person of one photo, cut out of it, as files."""
+"""What is read in one photo, as files: its person cut out (`segment`), its fitted face (`fit-geometry`)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,25 +10,36 @@ import numpy as np
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot, shot_of
+from facerf_cli.face.drawings import draw_fit
+from facerf_cli.face.fit import save_fit
 from facerf_cli.face.landmarks import Face, to_display
+from facerf_cli.face.topology import grid_triangles, grid_uv
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import LinearImage, write_display, write_exr
+from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import filled
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import FoundFace
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.work.outputs import canvas
 from facerf_cli.work.photos import (
+    FittedFace,
+    face_model,
+    facts_of,
     facts_of_found,
     facts_of_networks,
     find_people,
+    fit_faces,
     load_models_once,
+    provenance,
     read_photo,
     stamp,
 )
-from facerf_cli.work.shot_frames import segmented_frame
+from facerf_cli.work.sequence import segmented_frame
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
 _HELD_PX = 38  # bytes of a pixel: the photo, and
@@ -48,18 +59,18 @@ def write_segments(
     """
     if place := shot_of(shots, item):
         image, face, found = segmented_frame(*place, options)
-        _write(item, "", image, to_display(image.pixels), face, found)
+        _write_segment(item, "", image, to_display(image.pixels), face, found)
         return [""], facts_of_networks(options)
     image = read_photo(item, options, _KEPT_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     parsing = load_models_once(options).networks.parsing
     for tag, face in reversed(people):
-        _write(item, tag, image, display, face, segment(parsing, display, face.landmarks_px))
+        _write_segment(item, tag, image, display, face, segment(parsing, display, face.landmarks_px))
     return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
 
 
-def _write(
+def _write_segment(
     item: Item, tag: str, image: LinearImage, display: np.ndarray, face: Face, found: Segmentation
 ) -> None:
     def path(ending: str) -> Path:
@@ -105,3 +116,49 @@ def _landmarks(face: Face) -> dict[str, Any]:
             for name, at, error in more
         }
     return document
+
+
+def write_fits(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, Any]]:
+    """Fit and write each chosen face of a photo; their tags, and facts for the report."""
+    image = read_photo(item, options)
+    faces = fit_faces(item, image, options)
+    for face in reversed(faces):
+        _write_fit(item, image, face, options)
+    return [face.tag for face in faces], facts_of(faces, options)
+
+
+def _write_fit(item: Item, image: LinearImage, face: FittedFace, options: PhotoOptions) -> None:
+    def path(ending: str) -> Path:
+        return item.output(face.tag + ending)
+
+    metadata, uv = provenance(item, options), face.head.face
+    texture, normals = (tensor.permute(1, 2, 0).numpy() for tensor in (uv.texture, uv.normals))
+    write_exr(path("_texture.exr"), texture, layers={"visible": uv.visible.numpy()}, metadata=metadata)
+    write_display(path("_texture.png"), texture, "auto", metadata=metadata)
+    write_exr(path("_normals.exr"), normals, metadata=metadata)
+    write_display(path("_normals.png"), srgb_to_linear(0.5 + 0.5 * normals), metadata=metadata)
+    _write_mesh(path, _mesh(face, to_display(texture), options, metadata))
+    overlay = draw_fit(image.pixels, face.fit, face_model(options))
+    write_display(path("_overlay.jpg"), overlay, metadata=metadata)
+    with atomic_path(path("_fit.npz")) as temporary:
+        save_fit(temporary, face.fit, metadata)
+
+
+def _write_mesh(path: Callable[[str], Path], mesh: TexturedMesh) -> None:
+    write_glb(path("_mesh.glb"), mesh)
+    write_obj(path("_mesh.obj"), mesh, path("_texture.png").name)
+
+
+def _mesh(
+    face: FittedFace, texture_srgb: np.ndarray, options: PhotoOptions, metadata: dict[str, Any]
+) -> TexturedMesh:
+    """The fitted mesh in the head's own frame; the fit holds its pose."""
+    vertices = face_model(options).vertices(face.fit.alpha[None], face.fit.beta[None])[0]
+    return TexturedMesh(
+        vertices_m=vertices.numpy(),
+        normals=vertex_normals(vertices, grid_triangles()).numpy(),
+        triangles=grid_triangles().numpy(),
+        uv=grid_uv().numpy(),
+        texture_srgb=texture_srgb,
+        metadata=metadata,
+    )

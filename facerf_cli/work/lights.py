@@ -20,8 +20,8 @@ from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.studio_points import NearLights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
+from facerf_cli.work.light_of_photo import light_of_photo
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
-from facerf_cli.work.photo_lights import light_of_photo
 from facerf_cli.work.photos import directions_of, face_model
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map

@@ -45,7 +45,7 @@ from facerf_cli.work.photos import (
     read_matte,
     read_photo,
 )
-from facerf_cli.work.shot_frames import seen_frame, takes_with_face, view_of
+from facerf_cli.work.sequence import seen_frame, takes_with_face, view_of
 
 TILE_PX = 256
 _LABEL_PX = 20

@@ -1,14 +1,16 @@
-"""The frames of a shot as they are relit: each steadied by those around it.
+"""Cuts of a film, one face followed through the frames of a shot, and smoothing over time.
 
-What a frame needs of its neighbours is computed once, as frames are asked for in order, and kept no longer
-than it is needed; so memory does not grow with the length of the shot. The identity is the mean of the
-identities of key frames, each fitted as a photo is; with it held, each frame's pose and expression are fitted
-to its smoothed landmarks.
+A curve is smoothed by a local quadratic (Savitzky and Golay, *Smoothing and differentiation of data by
+simplified least squares procedures*, 1964), with weights, so that frames that are missing or unsure count for
+nothing or little. It has no delay, and keeps a movement that is a parabola over the window. Maps are smoothed
+by a bilateral filter along time (Tomasi and Manduchi, *Bilateral filtering for gray and color images*, 1998):
+a pixel takes part in the mean as far as the image there looks as it does in the frame itself.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,17 +21,214 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.landmarks import Face, choose_face, to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitMaps
+from facerf_cli.portrait.find import FoundFace, LandmarksFrom, detect_faces, face_near
 from facerf_cli.portrait.occluders import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image
-from facerf_cli.relighting.follow import MAPS_REACH, Sighting, path_of, steadied
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.own_light import light_of_frames
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
+
+_ROWS, _COLUMNS = 12, 16  # of a thumbnail
+_LEAST = 0.05  # change at a cut, display values in 0..1
+_TIMES = 3.0  # of the largest change around it
+_REACH = 3  # frames on each side
+
+
+class CutFinder:
+    """Cuts of a film of `count` frames; `show` gives a frame, sRGB uint8 [H, W, 3], by number."""
+
+    def __init__(self, count: int, show: Callable[[int], np.ndarray]) -> None:
+        self._count = count
+        self._small = lru_cache(2)(lambda frame: thumbnail(show(frame)))
+        self._change = lru_cache(4 * _REACH)(self._changed)
+
+    def is_cut(self, frame: int) -> bool:
+        """Tell if a new shot begins with a frame."""
+        if frame == 0:
+            return False
+        around = range(max(1, frame - _REACH), min(self._count, frame + _REACH + 1))
+        changes = {one: self._change(one) for one in around}
+        return stands_out(changes.pop(frame), list(changes.values()))
+
+    def _changed(self, frame: int) -> float:
+        before, now = self._small(frame - 1), self._small(frame)
+        return float(np.abs(now - before).mean())
+
+
+def stands_out(change: float, around: Sequence[float]) -> bool:
+    """Tell if a change is that of a cut, among the changes of the frames around it."""
+    return change > max(_LEAST, _TIMES * max(around, default=0.0))
+
+
+def thumbnail(image_srgb: np.ndarray) -> np.ndarray:
+    """Means [_ROWS, _COLUMNS, 3] in 0..1 of parts of an image, uint8 [H, W, 3]."""
+    pixels = torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255
+    return F.adaptive_avg_pool2d(pixels, (_ROWS, _COLUMNS))[0].permute(1, 2, 0).numpy()
+
+
+def takes(count: int, cuts: Sequence[int]) -> list[range]:
+    """The frames of each take of a film of `count` frames, in order; cuts are first frames of takes."""
+    edges = [0, *cuts, count]
+    return [range(first, end) for first, end in pairwise(edges)]
+
+
+REACH = 5  # frames on each side of a curve's window
+_FULL = 4  # frames with weight from which on a window has a quadratic; with fewer it is a line or a mean
+MAPS_REACH = 2  # frames on each side of a map's window
+_ALIKE = 0.03  # difference of images, in 0..1, at which a neighbour's weight falls to 0.6
+_BLUR_PX = 3  # side of the square over which images are compared, against their noise
+_TINY = 1e-9
+
+
+def smoothed(values: np.ndarray, weights: np.ndarray, reach: int = REACH) -> np.ndarray:
+    """Smooth curves [N, ...] with weights [N] >= 0 by local quadratics; NaN where a window has no weight.
+
+    The window has `reach` frames on each side, under a tricube (Cleveland, *Robust locally weighted
+    regression and smoothing scatterplots*, 1979).
+    """
+    flat = values.reshape(len(values), -1).astype(np.float64)
+    result = np.full_like(flat, np.nan)
+    for frame in range(len(flat)):
+        first, last = max(0, frame - reach), min(len(flat), frame + reach + 1)
+        at = np.arange(first, last) - frame
+        weight = weights[first:last] * (1 - (np.abs(at) / (reach + 1)) ** 3) ** 3
+        used = weight > 0
+        if used.any():
+            result[frame] = _local(at[used], flat[first:last][used], weight[used])
+    return result.reshape(values.shape)
+
+
+def _local(at: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The value [C] at 0 of the polynomial that fits values [M, C] at times [M] best."""
+    order = 2 if len(at) >= _FULL else min(1, len(at) - 1)
+    columns = np.vander(at, order + 1, increasing=True) * np.sqrt(weight)[:, None]
+    return np.asarray(np.linalg.lstsq(columns, values * np.sqrt(weight)[:, None], rcond=None)[0][0])
+
+
+def steadied(maps: Sequence[Tensor], images: Sequence[Tensor], middle: int) -> Tensor:
+    """Mean over time of maps [C, h, w] of neighbouring frames, for the frame `middle` of them.
+
+    images [3, h, w] in 0..1, display-encoded, say where the frames look alike.
+    """
+    own = _blurred(images[middle])
+    total, weight = torch.zeros_like(maps[middle]), torch.zeros_like(own[:1])
+    for index, (one, image) in enumerate(zip(maps, images, strict=True)):
+        apart = (_blurred(image) - own).square().mean(0, keepdim=True)
+        near = 1 - abs(index - middle) / (MAPS_REACH + 1)
+        share = near * torch.exp(-apart / (2 * _ALIKE**2))
+        total, weight = total + share * one, weight + share
+    return total / weight.clamp_min(_TINY)
+
+
+def _blurred(image: Tensor) -> Tensor:
+    return F.avg_pool2d(image[None], _BLUR_PX, stride=1, padding=_BLUR_PX // 2, count_include_pad=False)[0]
+
+
+LONGEST_GAP = 12  # frames without the face that are bridged: half a second at 24 frames a second
+_FURTHEST = 1.5  # extents of its landmarks that a face may move while it is lost
+_SIZES = (0.6, 1.7)  # range of the change of its size meanwhile
+_BRIDGE_WEIGHT = 0.05  # of a frame in a gap
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """A face in one frame: landmarks [68, 2] in pixels, and its median expected error, in their extent."""
+
+    landmarks_px: np.ndarray
+    error: float
+
+
+class Follower:
+    """Finds the same face in frame after frame; `last` are its landmarks [68, 2] where it was seen last."""
+
+    def __init__(
+        self,
+        parsing: ParsingNetwork,
+        which: str,
+        landmarks_from: LandmarksFrom = "facerf",
+        last: np.ndarray | None = None,
+    ) -> None:
+        self._parsing = parsing
+        self._which, self._from, self._last = which, landmarks_from, last
+
+    def see(self, image_srgb: np.ndarray) -> Sighting | None:
+        """Find the face in the next frame, sRGB uint8 [H, W, 3]; None where it is not seen.
+
+        Near the place of the frame before, else in the whole frame: the one nearest to that place, of about
+        its size. The first face is the one that `which` chooses: largest, or an index from the left.
+        """
+        face: Face | None = None
+        if self._last is not None and self._from == "facerf":
+            face = face_near(self._parsing, image_srgb, self._last)
+            if face is not None and not _may_be(face, self._last):
+                face = None
+        if face is None:
+            face = self._searched(image_srgb)
+        if face is None:
+            return None
+        self._last = face.landmarks_px
+        error = face.seen.relative_error if isinstance(face, FoundFace) else 0.0
+        return Sighting(face.landmarks_px, error)
+
+    def _searched(self, image_srgb: np.ndarray) -> Face | None:
+        last = self._last
+        everyone = last is not None or self._which != "largest"
+        faces = detect_faces(self._parsing, image_srgb, self._from, everyone)
+        if last is None:
+            few = self._which.isdecimal() and int(self._which) >= len(faces)
+            return None if few or not faces else choose_face(faces, self._which, "frame")[0]
+        near = [face for face in faces if _may_be(face, last)]
+        return min(near, key=lambda face: _apart_px(face.landmarks_px, last)) if near else None
+
+
+def _may_be(face: Face, last: np.ndarray) -> bool:
+    """Tell if a face can be the one that was at landmarks [68, 2]."""
+    before, now = _extent_px(last), _extent_px(face.landmarks_px)
+    low, high = _SIZES
+    return low < now / before < high and _apart_px(face.landmarks_px, last) < _FURTHEST * before
+
+
+def _apart_px(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.linalg.norm(one.mean(0) - other.mean(0)))
+
+
+def _extent_px(landmarks_px: np.ndarray) -> float:
+    return max(float(np.ptp(landmarks_px, axis=0).max()), 1.0)
+
+
+def path_of(sightings: Sequence[Sighting | None]) -> np.ndarray:
+    """Smoothed landmarks [N, 68, 2] of a shot; NaN where the face is lost, but for gaps that are bridged."""
+    path = np.full((len(sightings), 68, 2), np.nan)
+    weights = np.zeros(len(sightings))
+    for frame, seen in enumerate(sightings):
+        if seen is not None:
+            path[frame], weights[frame] = seen.landmarks_px, 1.0
+    for first, last in gaps(sightings):
+        if first > 0 and last + 1 < len(sightings) and last - first < LONGEST_GAP:
+            share = (np.arange(first, last + 1) - first + 1)[:, None, None] / (last - first + 2)
+            path[first : last + 1] = path[first - 1] + share * (path[last + 1] - path[first - 1])
+            weights[first : last + 1] = _BRIDGE_WEIGHT
+    kept = weights > 0
+    found = smoothed(np.where(kept[:, None, None], path, 0), weights)
+    return np.where(kept[:, None, None], found, np.nan)
+
+
+def gaps(sightings: Sequence[Sighting | None]) -> Iterator[tuple[int, int]]:
+    """First and last frames of each run of frames without the face."""
+    first = None
+    for frame, seen in enumerate([*sightings, Sighting(np.zeros((68, 2)), 0.0)]):
+        if seen is None and first is None:
+            first = frame
+        elif seen is not None and first is not None:
+            yield first, frame - 1
+            first = None
+
 
 _KEYS = 12  # frames whose identities are averaged
 _AT_ONCE = 32  # frames that are fitted together
