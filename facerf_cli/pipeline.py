@@ -33,7 +33,7 @@ from facerf_cli.network.feature_networks import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
-from facerf_cli.portrait.occluders import uncovered
+from facerf_cli.portrait.parse import uncovered
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target

@@ -29,7 +29,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.portrait.square import SIDE_PX
+from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.bank.portrait_samples import LitPerson, PortraitSample, sample_of, source_light

@@ -3,7 +3,7 @@
     OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l sum_j g_j lobe_j(n, t, l)
 
 A is the photo without its light, gain times photo plus bias, so that detail survives. The gain starts from
-the proxy's shading under the light that explains the photo best (`portrait/own_shading.py`). b_k are
+the proxy's shading under the light that explains the photo best (`portrait/proxy.py`). b_k are
 spherical harmonics of the light's direction; P and U hold light with and without the shadows of the proxy
 V_l; the lobes are highlights about normals n, and about strands t of hair. V'_l corrects those shadows:
 logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pass; a light then costs a few

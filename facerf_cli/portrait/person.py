@@ -16,19 +16,20 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.own_shading import own_shading
 from facerf_cli.portrait.proxy import (
     Proxy,
     ProxyMaps,
     Shadows,
+    own_shading,
     proxy_maps,
     proxy_of,
     square_camera,
 )
 from facerf_cli.portrait.segment import Segmentation, segment
-from facerf_cli.portrait.square import SIDE_PX, portrait_square
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
+SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network sees
+SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
 VISIBILITY_PX = SIDE_PX // 2  # side at which shadow rays are cast
 
 
@@ -76,6 +77,14 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
     z, covered = maps.positions_m[2], maps.covered
     depth = (z - (z * covered).sum() / covered.sum()) / 0.1
     return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
+
+
+def portrait_square(landmarks_px: np.ndarray, size_px: int = SIDE_PX) -> Crop:
+    """The square of a photo around landmarks [68, 2] in its pixels."""
+    low, high = landmarks_px.min(0), landmarks_px.max(0)
+    side_px = SIDES * float((high - low).max())
+    x_px, y_px = (low + high) / 2
+    return Crop(float(x_px) - side_px / 2, float(y_px) - side_px / 2, side_px, size_px)
 
 
 def look_at_person(

@@ -6,21 +6,21 @@ sizes around the head.
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, label
+from scipy.spatial import cKDTree
+from skimage.color import rgb2lab
 from torch import Tensor
 
 from facerf_cli.image.strips import Band, enlarged
 from facerf_cli.network.parsing import ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.ears import with_ears
+from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.matte import refine_matte, shrunk
-from facerf_cli.portrait.outline import with_outline
 from facerf_cli.portrait.parse import Seen, Square, look
-from facerf_cli.portrait.regions import depth_px, joined_to
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
@@ -42,6 +42,23 @@ _SMALL_PX = 384  # longest side at which classes are joined
 # face, and how far beside it, the person's chest has no holes; how far around them clothes are whole.
 _CHEST_BELOW, _WITHIN, _BRIDGE, _OF_HEAD, _OF_BODY = 1.5, 0.4, 0.06, 1.2, 0.2
 _CHEST_FROM, _CHEST_BESIDE, _RIM = 1.0, 1.0, 0.08
+# Of ears, which the network's own landmarks place.
+_EAR_LIFT = 1.25  # logarithm of the largest factor of the odds
+_EAR_WIDTH = 0.045  # standard deviation of the distance from the line, in extents of the landmarks
+_EAR_REACH = 3.0  # in these, beyond which nothing changes
+_EAR_OTHERS = [class_index(name) for name in ("background", "skin", "hair", "neck")]
+_EAR_LINES = [
+    [68 + MORE_LANDMARKS.index(f"{side} ear {part}") for part in ("top", "back", "lobe")]
+    for side in ("left", "right")
+]
+# Of the outline: shares of the person from which on, well inside it, a pixel is sure, and up to which it is
+# background.
+_SURE_PERSON, _SURE_BACKGROUND = 0.9, 0.1
+_WELL_INSIDE = 0.1  # how far inside the person, in extents of the landmarks
+_NEAREST, _APART = 4, 4  # sure pixels that a pixel is compared with, of every fourth one
+_COLOURS_PER_EXTENT = 0.1  # difference of colour, in Lab / 100, that counts as one of places by an extent
+_COLOUR_SPREAD = 0.06  # of the colours of one thing, in Lab / 100
+_MOST_LOGIT, _LEAST_SIDE = 3.0, 0.02  # of the colours, and least share of either side in the network's
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,3 +280,83 @@ def _only_background() -> Tensor:
     shares = torch.zeros(len(CLASSES), 1, 1)
     shares[0] = 1
     return shares
+
+
+def with_ears(classes: Tensor, seen: Seen, places_px: np.ndarray) -> Tensor:
+    """Classes [C, h, w] with likelier ears at pixels that lie at places [h, w, 2] in the photo.
+
+    Ears are small, and get the benefit of the doubt near the line through the landmarks of top, back and
+    lobe. Odds are multiplied, so that what the network is sure of (hair over the ears, a hat) stays. Shares
+    move between ears and background, skin, hair and neck; others stay.
+    """
+    lifted, ears = classes.clone(), class_index("ears")
+    other = classes[_EAR_OTHERS].sum(0)
+    both = classes[ears] + other
+    likelier = classes[ears] * torch.from_numpy(np.exp(_EAR_LIFT * _nearness(seen, places_px))).float()
+    lifted[ears] = both * likelier / (likelier + other).clamp_min(1e-9)
+    lifted[_EAR_OTHERS] *= (both - lifted[ears]) / other.clamp_min(1e-9)
+    return lifted
+
+
+def _nearness(seen: Seen, places_px: np.ndarray) -> np.ndarray:
+    """Nearness [h, w] in 0..1 of places [h, w, 2] to the lines of both ears."""
+    near = np.zeros(places_px.shape[:2])
+    width_px = _EAR_WIDTH * max(seen.extent_px, 1.0)
+    for line in (seen.landmarks_px[ear] for ear in _EAR_LINES):
+        low, high = line.min(0) - _EAR_REACH * width_px, line.max(0) + _EAR_REACH * width_px
+        around = ((places_px > low) & (places_px < high)).all(-1)
+        apart = np.min([_distance(places_px[around], *pair) for pair in pairwise(line)], 0)
+        near[around] = np.maximum(near[around], np.exp(-0.5 * (apart / width_px) ** 2))
+    return near
+
+
+def _distance(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance [N] of places [N, 2] from the segment between two points [2]."""
+    along = end - start
+    share = (((places - start) @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
+    return np.asarray(np.linalg.norm(places - start - share[..., None] * along, axis=-1))
+
+
+def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
+    """Classes [C, h, w] whose matte follows the colours of an sRGB image [3, h, w] in 0..1 near the outline.
+
+    A tree's trunk next to a cheek may look like a part of the person to the network; its colours are like
+    those of the background around. `extent_px` is the extent of the landmarks in the image's pixels. The
+    network's logit of the person is added to
+    that of the colours, whose distances to sure colours of both sides are taken as normally distributed.
+    Colours add no islands.
+    """
+    person = 1 - classes[0].numpy()
+    sure, background = depth_px(person > _SURE_PERSON) > _WELL_INSIDE * extent_px, person < _SURE_BACKGROUND
+    unsure = ~(sure | background)
+    y, x = np.mgrid[: person.shape[0], : person.shape[1]]
+    compared = (x + y) % _APART == 0
+    if not unsure.any() or min(np.sum(sure & compared), np.sum(background & compared)) < _NEAREST:
+        return classes
+    places = np.stack([x, y], -1) * (_COLOURS_PER_EXTENT / extent_px)
+    seen = np.concatenate([rgb2lab(image.permute(1, 2, 0).numpy()) / 100, places], -1)
+
+    def squared_distance(known: np.ndarray) -> np.ndarray:
+        nearest = cKDTree(seen[known & compared]).query(seen[unsure], range(1, _NEAREST + 1), workers=-1)[0]
+        return np.square(nearest).mean(1)
+
+    colours = (squared_distance(background) - squared_distance(sure)) / (2 * _COLOUR_SPREAD**2)
+    share = torch.from_numpy(person)
+    logit = share.clamp(_LEAST_SIDE, 1 - _LEAST_SIDE).logit()
+    logit[unsure] += torch.from_numpy(colours.clip(-_MOST_LOGIT, _MOST_LOGIT)).float()
+    changed = torch.where(torch.from_numpy(unsure), logit.sigmoid(), share)
+    found = changed.numpy() > 0.5
+    islands = torch.from_numpy(found & ~joined_to(found, sure))
+    changed = torch.where(islands, torch.minimum(changed, share), changed)
+    return torch.cat([1 - changed[None], classes[1:] * (changed / share.clamp_min(1e-6))])
+
+
+def depth_px(region: np.ndarray) -> np.ndarray:
+    """Distance [h, w] of pixels of a region [h, w] from its border; beyond the image the region goes on."""
+    return np.asarray(distance_transform_edt(np.pad(region, 1, "edge"))[1:-1, 1:-1])
+
+
+def joined_to(region: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Pixels [h, w] of those parts of a region [h, w] that hold a seed [h, w]."""
+    parts, _ = label(region)
+    return region & np.isin(parts, parts[seeds])

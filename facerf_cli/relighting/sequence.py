@@ -27,7 +27,7 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitMaps
 from facerf_cli.portrait.find import FoundFace, LandmarksFrom, detect_faces, face_near
-from facerf_cli.portrait.occluders import uncovered_in
+from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image
 from facerf_cli.relighting.models import Models, Sides

@@ -16,7 +16,7 @@ from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Band, Layer
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import PersonColours, local_lines
-from facerf_cli.portrait.occluders import uncovered_rows
+from facerf_cli.portrait.parse import uncovered_rows
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.relighting.portrait_field import PortraitField

@@ -27,8 +27,7 @@ from facerf_cli.image.colour import named_space
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_in
-from facerf_cli.portrait.find import FoundBox, FoundFace, find_faces
+from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, FoundBox, FoundFace, confidence_in, find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame

@@ -10,7 +10,7 @@ from torch import Tensor
 from facerf_cli.dataset.portraits import DatasetPortraits, open_dataset_portraits
 from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.square import SIDE_PX
+from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
 

@@ -9,8 +9,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.portrait.confidence import Confidence, confidence_in
-from facerf_cli.portrait.find import FoundFace, detect_faces
+from facerf_cli.portrait.find import Confidence, FoundFace, confidence_in, detect_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
-from facerf_cli.portrait.ears import with_ears
 from facerf_cli.portrait.parse import LANDMARKS, Seen, Square
+from facerf_cli.portrait.segment import with_ears
 from tests.portrait.seen import seen_of
 
 EARS, HAIR, SKIN, GLASSES = (class_index(name) for name in ("ears", "hair", "skin", "glasses"))

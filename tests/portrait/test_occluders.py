@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.portrait.occluders import uncovered
-from facerf_cli.portrait.parse import Square
+from facerf_cli.portrait.parse import Square, uncovered
 from tests.portrait.seen import places, seen_of
 
 

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.outline import with_outline
+from facerf_cli.portrait.segment import with_outline
 
 _SIDE, _BORDER, _EXTENT_PX = 64, 40, 50.0
 _UNSURE = slice(_BORDER - 6, _BORDER + 6)  # columns of which the network is unsure

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.own_shading import own_shading
+from facerf_cli.portrait.proxy import own_shading
 
 SIDE = 64
 RIG = rig_directions(48)

@@ -18,7 +18,7 @@ from facerf_cli.network.portrait import (
     mirrored_x,
     reached_by,
 )
-from facerf_cli.portrait.own_shading import own_shading
+from facerf_cli.portrait.proxy import own_shading
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights

@@ -24,8 +24,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait.person import SeenPerson, look_at_person, surface_of
-from facerf_cli.portrait.square import SIDE_PX, SIDES
+from facerf_cli.portrait.person import SIDE_PX, SIDES, SeenPerson, look_at_person, surface_of
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.workers import in_shards

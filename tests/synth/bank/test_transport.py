@@ -12,7 +12,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.square import SIDE_PX
+from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.synth.bank import transport
 from facerf_cli.synth.bank.portrait_samples import PortraitSample, StoredTransport
 from facerf_cli.synth.bank.transport import (
