@@ -30,13 +30,13 @@ from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
-from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.composition import Composition
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
-from facerf_cli.training.pretrained import load_features
+from facerf_cli.training.losses import load_features
 
 TURNS_DEG = (0, 120)  # of each map
 SINGLE_LIGHTS, FILL = 6, 0.15  # FILL is the light in front, of a key light of about 1

@@ -21,9 +21,8 @@ from torch import Tensor
 
 from facerf_cli.dataset.crops import open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import read_dataset
-from facerf_cli.network.feature_networks import FeatureNetwork, feature_distance, layer_powers
-from facerf_cli.training.losses import PaperWeights, photometric_loss
-from facerf_cli.training.pretrained import load_features
+from facerf_cli.network.features import FeatureNetwork, feature_distance, layer_powers
+from facerf_cli.training.losses import PaperWeights, load_features, photometric_loss
 
 SIDE, TRAINED, MEASURED = 128, 24, 8
 COVERED = 0.01  # mean radiance above which a pixel is compared

@@ -33,7 +33,7 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.synth.bank.face_crops import RenderedFaces
-from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
+from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 
 CROP_PX = 256
 DETECTOR_NOISE = 0.014  # of the inter-ocular distance, added to true landmarks

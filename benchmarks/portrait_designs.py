@@ -25,7 +25,7 @@ from facerf_cli.network.portrait import PortraitInputs, PortraitNetwork
 from facerf_cli.synth.bank.portrait_samples import StoredTransport
 from facerf_cli.synth.bank.portraits import load_backgrounds
 from facerf_cli.training.loop import Row, train
-from facerf_cli.training.portrait_objective import PortraitObjective
+from facerf_cli.training.portrait import PortraitObjective
 from facerf_cli.training.settings import AdamW, preset_of
 
 ORDER, AROUND_ORDER = 4, 3

@@ -22,16 +22,15 @@ from _common import arguments, first_heads, print_header, print_row, required
 
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.network.feature_networks import LightNetwork, VggFeatures
+from facerf_cli.network.features import LightNetwork, VggFeatures
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
-from facerf_cli.training.joint_objective import JointObjective
-from facerf_cli.training.loop import train
-from facerf_cli.training.objective import Objective, Validation, seeded
+from facerf_cli.training.joint import JointObjective
+from facerf_cli.training.loop import Objective, Validation, seeded, train
+from facerf_cli.training.run_folder import build_optimizer
 from facerf_cli.training.settings import PRESETS, TrainSettings
-from facerf_cli.training.state import build_optimizer
-from facerf_cli.training.texture_objective import TextureObjective
+from facerf_cli.training.texture import TextureObjective
 
 _TINY_WIDTHS = (8, 12, 16)  # as in `facerf train --preset tiny`
 TINY_NETWORK = DefaultReflectanceSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, template_channels=2)

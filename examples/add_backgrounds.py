@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.synth.bank.portraits import views_of
-from facerf_cli.work.train_people import drawn_backgrounds
+from facerf_cli.work.train import drawn_backgrounds
 
 VIEWS = 16  # of each map
 SEED = 15

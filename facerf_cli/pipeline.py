@@ -29,7 +29,7 @@ from facerf_cli.face.landmarks import Face, FaceBox, to_display
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import NearLights
-from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces

@@ -10,7 +10,7 @@ from torch import Tensor
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
+from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 
 SIDE, RIG = 16, 8
 NETWORK = DefaultReflectanceSettings(

@@ -80,7 +80,7 @@ def prepare_dataset(
     less than half of the lights, or fewer than 10, fails. findings.jsonl has the findings of the checks.
     """
     from facerf_cli.batch.run import BatchOptions
-    from facerf_cli.work.prepare_capture import describe_capture, prepare_capture
+    from facerf_cli.work.prepare import describe_capture, prepare_capture
 
     if describe:
         others = [name for name in context.params if name not in _DESCRIBES]

@@ -39,7 +39,7 @@ def relight_dataset(
     """
     from facerf_cli.batch.run import BatchOptions
     from facerf_cli.dataset.pairs import RELIT
-    from facerf_cli.work.relight_pairs import relight_subjects
+    from facerf_cli.work.prepare import relight_subjects
 
     batch = BatchOptions(dataset / RELIT, overwrite, dry_run, jobs)
     raise typer.Exit(relight_subjects(dataset, pairs, batch, settings_of(context)))

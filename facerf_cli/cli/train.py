@@ -300,7 +300,7 @@ def train(
         validate_every=validate_every or training.validate_every,
         bf16=training.bf16 and form != "paper" if bf16 is None else bf16,  # its gradients overflow
     )
-    from facerf_cli.work.train_run import run_training
+    from facerf_cli.work.train import run_training
 
     run_training(
         TrainOptions(

@@ -15,8 +15,8 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.image.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
-from facerf_cli.network.feature_networks import SMALLEST_PX, Lpips
-from facerf_cli.training.pretrained import load_vgg, read_tensors
+from facerf_cli.network.checkpoint import load_vgg, read_tensors
+from facerf_cli.network.features import SMALLEST_PX, Lpips
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ in UV space with the fitted normals, and its albedo is a texture, where theirs i
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -16,9 +16,17 @@ from torch import Tensor, nn
 
 from facerf_cli.light.sh import irradiance, sh_basis
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.inputs import MEAN_RADIANCE, exposure_of, head_rotation, resize
+from facerf_cli.network.inputs import (
+    MEAN_RADIANCE,
+    Count,
+    SavedNetwork,
+    Side,
+    Widths,
+    exposure_of,
+    head_rotation,
+    resize,
+)
 from facerf_cli.network.reflectance_default import Down
-from facerf_cli.network.settings import Count, Side, Widths, settings_from
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2
@@ -50,16 +58,16 @@ class DiffuseEstimate(NamedTuple):
     exposure: Tensor  # [B, 1, 1, 1] what the texture was divided by, see `exposure_of`
 
 
-class DiffuseNetwork(nn.Module):
+class DiffuseNetwork(SavedNetwork):
     """Estimate albedo and light from T_s, N_s and the visibility of the texels."""
 
+    kind_of_settings = DiffuseSettings
     mean_normals: Tensor
     directions: Tensor
     coefficients_of: Tensor
 
     def __init__(self, settings: DiffuseSettings = DiffuseSettings()) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings)
         enc, dec = settings.encoder_widths, settings.decoder_widths
         self.down = nn.ModuleList(
             Down(a, b, first=i == 0) for i, (a, b) in enumerate(zip((7, *enc), enc, strict=False))
@@ -81,15 +89,6 @@ class DiffuseNetwork(nn.Module):
         self.register_buffer("directions", directions, persistent=False)
         inverse = torch.linalg.pinv(sh_basis(directions.double(), ORDER)).float()
         self.register_buffer("coefficients_of", inverse, persistent=False)
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "default", **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(settings_from(DiffuseSettings, metadata))
 
     def set_mean_face(self, normals: Tensor) -> None:
         """Store the normals [3, T, T] of the mean face, head frame, from which a head's pose is estimated."""

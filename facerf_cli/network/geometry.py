@@ -8,16 +8,16 @@ the network as two columns that are then orthonormalised (Zhou et al., *On the c
 representations in neural networks*, 2019).
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from facerf_cli.network.settings import settings_from
+from facerf_cli.network.inputs import SavedNetwork
 
 GeometryForm = Literal["default", "paper"]
 _SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of the crop that each form reads
@@ -46,14 +46,14 @@ class GeometryEstimate(NamedTuple):
     beta: Tensor  # [B, Ke] its expression coefficients
 
 
-class GeometryNetwork(nn.Module):
+class GeometryNetwork(SavedNetwork):
     """Estimate heads from crops [B, 3, S, S], scene-linear at any exposure and side."""
 
+    kind_of_settings = GeometryNetworkSettings  # which have the form
     mean_translation_m: Tensor
 
     def __init__(self, settings: GeometryNetworkSettings = GeometryNetworkSettings()) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings)
         self.side = _SIDES[settings.form]
         self.trunk, width = _alexnet() if settings.form == "paper" else _small()
         self.regress = nn.Linear(width, 9 + settings.identity + settings.expression)
@@ -86,15 +86,6 @@ class GeometryNetwork(nn.Module):
         depth_m = -mean[2] * torch.exp(_DEPTH * raw[:, 2])
         across = depth_m[:, None] * (_SHIFT * raw[:, :2] - mean[:2] / mean[2])
         return torch.cat([across, -depth_m[:, None]], 1)
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return asdict(self.settings)
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(settings_from(GeometryNetworkSettings, metadata))
 
 
 def _rotation(columns: Tensor) -> Tensor:

@@ -1,13 +1,24 @@
-"""Steps between a texture and the layers of a network: exposure, colour cast, roots, resizing, head pose."""
+"""What networks share: settings in checkpoints, precision, and the steps between a texture and their layers.
 
+These are exposure, colour cast, roots, resizing and head pose.
+"""
+
+import json
+import logging
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from typing import Annotated, Any, ClassVar, Self
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from pydantic import Field, TypeAdapter
+from torch import Tensor, nn
 
+from facerf_cli.run.logs import LOGGER_NAME
+
+log = logging.getLogger(LOGGER_NAME)
 MEAN_RADIANCE = 0.25  # of the visible face once its exposure is divided out
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 
@@ -129,3 +140,58 @@ def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
     signs = torch.ones(len(moment), 3, dtype=moment.dtype)
     signs[:, 2] = torch.det(u @ vt)
     return (u @ torch.diag_embed(signs) @ vt).to(normals)
+
+
+Count = Annotated[int, Field(ge=1, le=4096)]
+Side = Annotated[int, Field(ge=8, le=4096)]  # pixels or texels
+Grid = Annotated[int, Field(ge=1, le=64)]
+VggWidth = Annotated[float, Field(gt=0, le=4)]  # a share of the channels of VGG-16
+Landmarks = Annotated[int, Field(ge=68, le=256)]
+Classes = Annotated[int, Field(ge=2, le=256)]
+Widths = Annotated[tuple[Count, ...], Field(min_length=1, max_length=12)]
+WidthsOfFour = Annotated[  # for group normalisation
+    tuple[Annotated[int, Field(ge=4, le=512, multiple_of=4)], ...], Field(min_length=3, max_length=6)
+]
+Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=8)], ...], Field(min_length=3, max_length=6)]
+
+
+class SavedNetwork(nn.Module):
+    """A network that a checkpoint describes by its form and its settings."""
+
+    form: ClassVar[str] = "default"
+    kind_of_settings: ClassVar[type[Any]]  # a dataclass
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__()
+        self.settings = settings
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+        return {"form": self.form, **asdict(self.settings)}
+
+    @classmethod
+    def from_metadata(cls, metadata: Mapping[str, Any]) -> Self:
+        """Make an untrained network; raises TypeError or ValueError if the settings make none."""
+        kind = cls.kind_of_settings
+        known = {field.name for field in fields(kind)}
+        given = {name: value for name, value in metadata.items() if name != "form" or name in known}
+        if unknown := sorted(given.keys() - known):
+            raise TypeError(f"a network of this form has no {', '.join(unknown)}")
+        return cls(TypeAdapter(kind).validate_json(json.dumps(given), strict=True))  # JSON's lists are tuples
+
+
+def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
+    """Context in which a network computes in bfloat16, if that is `wanted`.
+
+    A processor without instructions for bfloat16 emulates them and is a hundred times slower: there the
+    network stays in float32, and a line says so once.
+    """
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device.type))
+
+
+@cache
+def _has_bf16(device_type: str) -> bool:
+    has: bool = device_type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    if not has:
+        log.info("this processor has no instructions for bfloat16; networks stay in float32")
+    return has

@@ -6,14 +6,14 @@ training on synthetic portraits alone follows Wood et al., *Fake it till you mak
 """
 
 import itertools
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.settings import Blocks, Classes, Landmarks, Side, WidthsOfFour, settings_from
+from facerf_cli.network.inputs import Blocks, Classes, Landmarks, SavedNetwork, Side, WidthsOfFour
 
 _ALPHA_STEPS = 2  # pixels of the classes along each side of a pixel of the features
 
@@ -43,71 +43,6 @@ class Parsing(NamedTuple):
         return self.logits.float().softmax(1)
 
 
-class ParsingNetwork(nn.Module):
-    """Parse crops [B, 3, S, S] as a screen shows them (sRGB), of any brightness and contrast."""
-
-    def __init__(self, settings: ParsingSettings = ParsingSettings()) -> None:
-        super().__init__()
-        self.settings = settings
-        self.side = settings.side
-        widths = settings.widths
-        self.stem = Halving(3, widths[0], settings.blocks[0])
-        self.encode = nn.ModuleList(
-            Halving(a, b, count) for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
-        )
-        pairs = list(itertools.pairwise(widths))
-        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
-        self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
-        self.classify = nn.Conv2d(widths[0], settings.classes * _ALPHA_STEPS**2, 1)
-        self.heat = nn.Conv2d(widths[1], settings.landmarks, 1)
-        self.judge = nn.Sequential(
-            nn.Linear(widths[-1], widths[-1]), nn.SiLU(), nn.Linear(widths[-1], settings.landmarks + 1)
-        )
-
-    def forward(self, crops: Tensor) -> Parsing:
-        """Parse crops; they may have any side that is a multiple of 32."""
-        x = self.stem(_normalised(crops))
-        skips = []
-        for halving in self.encode:
-            skips.append(x)
-            x = halving(x)
-        judged = self.judge(x.mean((2, 3))).float()
-        features = []
-        for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
-            x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
-            features.append(x)
-        logits = F.pixel_shuffle(self.classify(x), _ALPHA_STEPS)
-        landmarks = _means(self.heat(features[-2]).float())
-        return Parsing(logits, landmarks, judged[:, 1:], judged[:, 0])
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "default", **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        settings = settings_from(ParsingSettings, metadata)
-        if len(settings.widths) != len(settings.blocks) or settings.side % 2 ** len(settings.widths):
-            raise ValueError(f"no Parsing Network has the settings {metadata}")
-        return cls(settings)
-
-
-def _normalised(crops: Tensor) -> Tensor:
-    """Crops of zero mean and unit deviation each."""
-    centred = crops - crops.mean((1, 2, 3), keepdim=True)
-    return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
-
-
-def _means(heat: Tensor) -> Tensor:
-    """Mean places [B, N, 2], right and down in sides, of heatmaps with logits [B, N, H, W]."""
-    height, width = heat.shape[-2:]
-    share = heat.flatten(2).softmax(-1).view_as(heat)
-    x = (torch.arange(width, device=heat.device) + 0.5) / width
-    y = (torch.arange(height, device=heat.device) + 0.5) / height
-    return torch.stack([share.sum(2) @ x, share.sum(3) @ y], -1)
-
-
 class Residual(nn.Module):
     """Two convolutions whose result is added to their input."""
 
@@ -135,3 +70,72 @@ class Halving(nn.Module):
         """Halve and refine features [B, C, H, W]."""
         result: Tensor = self.blocks(F.silu(self.enter(x)))
         return result
+
+
+class UNet(SavedNetwork):
+    """Halvings of an image, and the way back to half its side with skips."""
+
+    def __init__(self, settings: Any, channels: int) -> None:
+        """Make an untrained network for images of some channels; `settings` has widths, blocks and a side."""
+        super().__init__(settings)
+        widths, blocks, self.side = settings.widths, settings.blocks, settings.side
+        if len(widths) != len(blocks) or self.side % 2 ** len(widths):
+            raise ValueError(f"no such network has the settings {settings}")
+        self.stem = Halving(channels, widths[0], blocks[0])
+        self.encode = nn.ModuleList(
+            Halving(a, b, count) for a, b, count in zip(widths, widths[1:], blocks[1:], strict=False)
+        )
+        pairs = list(itertools.pairwise(widths))
+        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
+        self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
+
+    def features(self, images: Tensor) -> list[Tensor]:
+        """Features [B, C, H, W] of images [B, C, S, S], from the coarsest to those of side S / 2."""
+        x = self.stem(images)
+        skips = []
+        for halving in self.encode:
+            skips.append(x)
+            x = halving(x)
+        found = [x]
+        for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
+            x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
+            found.append(x)
+        return found
+
+
+class ParsingNetwork(UNet):
+    """Parse crops [B, 3, S, S] as a screen shows them (sRGB), of any brightness and contrast."""
+
+    kind_of_settings = ParsingSettings
+
+    def __init__(self, settings: ParsingSettings = ParsingSettings()) -> None:
+        super().__init__(settings, 3)
+        widths = settings.widths
+        self.classify = nn.Conv2d(widths[0], settings.classes * _ALPHA_STEPS**2, 1)
+        self.heat = nn.Conv2d(widths[1], settings.landmarks, 1)
+        self.judge = nn.Sequential(
+            nn.Linear(widths[-1], widths[-1]), nn.SiLU(), nn.Linear(widths[-1], settings.landmarks + 1)
+        )
+
+    def forward(self, crops: Tensor) -> Parsing:
+        """Parse crops; they may have any side that is a multiple of 32."""
+        coarsest, *_, at_quarter, at_half = self.features(_normalised(crops))
+        judged = self.judge(coarsest.mean((2, 3))).float()
+        logits = F.pixel_shuffle(self.classify(at_half), _ALPHA_STEPS)
+        landmarks = _means(self.heat(at_quarter).float())
+        return Parsing(logits, landmarks, judged[:, 1:], judged[:, 0])
+
+
+def _normalised(crops: Tensor) -> Tensor:
+    """Crops of zero mean and unit deviation each."""
+    centred = crops - crops.mean((1, 2, 3), keepdim=True)
+    return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
+
+
+def _means(heat: Tensor) -> Tensor:
+    """Mean places [B, N, 2], right and down in sides, of heatmaps with logits [B, N, H, W]."""
+    height, width = heat.shape[-2:]
+    share = heat.flatten(2).softmax(-1).view_as(heat)
+    x = (torch.arange(width, device=heat.device) + 0.5) / width
+    y = (torch.arange(height, device=heat.device) + 0.5) / height
+    return torch.stack([share.sum(2) @ x, share.sum(3) @ y], -1)

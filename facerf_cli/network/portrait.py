@@ -10,18 +10,16 @@ logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pa
 products a pixel. The sum over lights is linear in their intensities.
 """
 
-import itertools
-from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple, Self
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.light.sh import mirror_signs, sh_basis
-from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.network.parsing import Halving, Residual
-from facerf_cli.network.settings import Blocks, Classes, Side, WidthsOfFour, settings_from
+from facerf_cli.network.inputs import MEAN_RADIANCE, Blocks, Classes, Side, WidthsOfFour
+from facerf_cli.network.parsing import Residual, UNet
 
 SKIN = 1  # index of the class whose mean exposes the image
 _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
@@ -195,41 +193,21 @@ def _halved(directions: Tensor) -> Tensor:
     return F.normalize(blocks.mean((3, 5)), dim=-1)
 
 
-class PortraitNetwork(nn.Module):
+class PortraitNetwork(UNet):
     """Predict the maps of people from `PortraitInputs`, by a small U-Net."""
 
+    kind_of_settings = PortraitSettings
+
     def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
-        super().__init__()
-        self.settings = settings
-        self.side = settings.side
+        super().__init__(settings, 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1)
         widths = settings.widths
-        channels = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
-        self.stem = Halving(channels, widths[0], settings.blocks[0])
-        self.encode = nn.ModuleList(
-            Halving(a, b, count) for a, b, count in zip(widths, widths[1:], settings.blocks[1:], strict=False)
-        )
-        pairs = list(itertools.pairwise(widths))
-        self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
-        self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
         self.last = Residual(widths[0])
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
         nn.init.normal_(self.predict.weight, std=0.01)
 
-    def features(self, inputs: PortraitInputs) -> Tensor:
-        """Features [B, widths[0], S / 2, S / 2] of which the maps are made; sides are multiples of 32."""
-        x = self.stem(inputs.stacked())
-        skips = []
-        for halving in self.encode:
-            skips.append(x)
-            x = halving(x)
-        for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
-            x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
-        last: Tensor = self.last(x)
-        return last
-
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
-        predicted = self.predict(self.features(inputs))
+        predicted = self.predict(self.last(self.features(inputs.stacked())[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
         parts = [
@@ -237,18 +215,6 @@ class PortraitNetwork(nn.Module):
             *torch.split(coarse.float(), list(_COARSE.values()), 1),
         ]
         return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs)
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "default", **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        settings = settings_from(PortraitSettings, metadata)
-        if len(settings.widths) != len(settings.blocks) or settings.side % 2 ** len(settings.widths):
-            raise ValueError(f"no Portrait Network has the settings {metadata}")
-        return cls(settings)
 
 
 def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:

@@ -7,15 +7,22 @@ the paper's network in three ways that learn faster: the light also enters the d
 applied at the side of the texture.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import exposure_of, from_root, head_rotation, resize
-from facerf_cli.network.settings import Count, Side, Widths, settings_from
+from facerf_cli.network.inputs import (
+    Count,
+    SavedNetwork,
+    Side,
+    Widths,
+    exposure_of,
+    from_root,
+    head_rotation,
+    resize,
+)
 
 _MAP_SIDE = 64  # of the stored normals and shadows of the mean face
 _DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
@@ -52,16 +59,16 @@ class DefaultEncoded:
     exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
 
 
-class DefaultReflectanceNetwork(nn.Module):
+class DefaultReflectanceNetwork(SavedNetwork):
     """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
 
+    kind_of_settings = DefaultReflectanceSettings
     mean_normals: Tensor
     mean_visibility: Tensor
     rig: Tensor
 
     def __init__(self, settings: DefaultReflectanceSettings = DefaultReflectanceSettings()) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings)
         enc, dec, rig_lights = settings.encoder_widths, settings.decoder_widths, settings.rig_lights
         self.template = nn.Parameter(torch.empty(settings.template_channels, 32, 32))
         nn.init.normal_(self.template, std=0.1)
@@ -88,15 +95,6 @@ class DefaultReflectanceNetwork(nn.Module):
             "mean_visibility", torch.zeros(rig_lights, _MAP_SIDE, _MAP_SIDE, dtype=torch.uint8)
         )
         self.register_buffer("rig", torch.zeros(rig_lights, 3))
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "default", **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(settings_from(DefaultReflectanceSettings, metadata))
 
     @property
     def rig_lights(self) -> int:

@@ -13,15 +13,14 @@ channels as the bottleneck has; the source is divided by its exposure and the ou
 network reads and predicts square roots, which separate shadows as display encodings do.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, Self
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import exposure_of, resize, to_root
-from facerf_cli.network.settings import Count, Side, Widths, settings_from
+from facerf_cli.network.inputs import Count, SavedNetwork, Side, Widths, exposure_of, resize, to_root
 
 _SLOPE = 0.2  # of the leaky rectifiers
 _GROUPS = 4  # of the group normalisations
@@ -55,19 +54,18 @@ class PaperEncoded:
     texture_side: int
 
 
-class PaperReflectanceNetwork(nn.Module):
+class PaperReflectanceNetwork(SavedNetwork):
     """Predict OLAT textures, scene-linear and non-negative, from T_s, N_s, N_t and light directions."""
 
+    form = "paper"
+    kind_of_settings = PaperReflectanceSettings
     rig_lights = 0  # it needs no mean face,
     has_mean_face = False  # so it never stores one
 
     def __init__(self, settings: PaperReflectanceSettings = PaperReflectanceSettings()) -> None:
-        super().__init__()
+        super().__init__(settings)
         widths, features = settings.widths, settings.features
-        if not widths:
-            raise ValueError("no widths")
         _halved_sides(settings.side, len(widths))  # raises for a side that it cannot halve
-        self.settings = settings
         maps = 3 if settings.normals else 0
         before = (3 + maps, *widths[:-1])
         self.down = nn.ModuleList(
@@ -92,15 +90,6 @@ class PaperReflectanceNetwork(nn.Module):
         last: Any = self.light_convolutions[-1]
         nn.init.normal_(last.weight, std=1e-2)
         nn.init.constant_(last.bias, float(torch.tensor(_FIRST_ROOT, device="cpu").expm1().log()))
-
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "paper", **asdict(self.settings)}
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(settings_from(PaperReflectanceSettings, metadata))
 
     def set_mean_face(self, normals: Tensor, visibility: Tensor, directions: Tensor) -> None:
         """Do nothing: this form needs no mean face."""

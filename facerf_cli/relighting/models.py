@@ -16,7 +16,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.downloads import file_sha256
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.files import SHIPPED, read_metadata, serving_files
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.inputs import SourceColours

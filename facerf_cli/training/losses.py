@@ -6,16 +6,21 @@ its weights:
   channels, so that a weight means the same at every size of crop and model;
 - landmarks are in units of half the crop's side, as for image coordinates from -1 to 1;
 - radiance is scene-linear, exposed as in `dataset/crops.py`; feature networks see it as sRGB
-  (`network/feature_networks.py`);
+  (`network/features.py`);
 - textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
-from facerf_cli.network.feature_networks import FeatureNetwork, feature_distance
+from facerf_cli.errors import InputError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.features import FeatureNetwork, feature_distance
 from facerf_cli.network.inputs import from_root, to_root
 
 _SLOPE_WEIGHT = 0.6  # of differences between neighbouring texels
@@ -137,3 +142,24 @@ def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) 
 def light_loss(features: Features, texture: MaskedPair) -> Tensor:
     """L_L [B]: distance of S_f features, which depend on the light's direction, of the texture."""
     return texture.distance(features)
+
+
+def load_features(
+    path: Path, name: Literal["light_features", "appearance_features"], side: int | None = None
+) -> Any:
+    """Load S_f ('light_features') or V_f ('appearance_features'), frozen, from a checkpoint of its stage.
+
+    Raises InputError where it was not trained on images of `side`: features of another scale mislead a loss.
+    """
+    network: Any = load_networks(path, LAYOUT_VERSION)[0].get(name)
+    stage = name.replace("_", "-")
+    if network is None:
+        raise InputError(f"{path}: has no network {name}; give one of `facerf train --stage {stage}`")
+    trained = network.settings.side
+    if side is not None and trained != side:
+        raise InputError(
+            f"{path}: its network {name} was trained on images of {trained} px, here they have {side}; train "
+            f"it with --stage {stage} --texture-size {side}, or give --texture-size {trained} here"
+        )
+    network.eval().requires_grad_(False)
+    return network

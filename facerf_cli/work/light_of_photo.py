@@ -28,12 +28,12 @@ from facerf_cli.light.envmap import ball
 from facerf_cli.light.rig_latlong import rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
-from facerf_cli.network.feature_networks import FeatureNetwork
+from facerf_cli.network.checkpoint import load_vgg
+from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.training.pretrained import load_vgg
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,

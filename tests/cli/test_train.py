@@ -12,13 +12,13 @@ from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
-from facerf_cli.network.feature_networks import VggFeatures
+from facerf_cli.network.features import VggFeatures
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
-from facerf_cli.work import train_run
+from facerf_cli.work import train as train_work
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 
@@ -341,6 +341,6 @@ def test_the_papers_form_trains_in_full_precision_by_default(
     line: tuple[str, ...], expected: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[TrainOptions] = []
-    monkeypatch.setattr(train_run, "run_training", seen.append)
+    monkeypatch.setattr(train_work, "run_training", seen.append)
     assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "builtin", *line]) == 0
     assert seen[0].training.bf16 is expected

@@ -29,7 +29,7 @@ from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.training.loop import train
 from facerf_cli.training.settings import PRESETS
-from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
+from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 
 SIDE, LIGHTS = 32, 20

@@ -10,7 +10,7 @@ import torch
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import measure as perceptual
 from facerf_cli.evaluation.measure import perceptual_metric
-from facerf_cli.network.feature_networks import Lpips
+from facerf_cli.network.features import Lpips
 
 
 @pytest.fixture(autouse=True)

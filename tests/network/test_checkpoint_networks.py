@@ -7,7 +7,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import load_networks, save_checkpoint
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.network.feature_networks import LightNetwork
+from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceSettings

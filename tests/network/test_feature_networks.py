@@ -3,8 +3,9 @@ import pytest
 import torch
 
 from facerf_cli.image.colour import linear_to_srgb
-from facerf_cli.network.appearance_network import AppearanceNetwork, AppearanceSettings
-from facerf_cli.network.feature_networks import (
+from facerf_cli.network.features import (
+    AppearanceNetwork,
+    AppearanceSettings,
     LightNetwork,
     LightSettings,
     VggFeatures,

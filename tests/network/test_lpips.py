@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from facerf_cli.image.colour import linear_to_srgb
-from facerf_cli.network.feature_networks import LPIPS_LAYERS, Lpips, VggFeatures
+from facerf_cli.network.features import LPIPS_LAYERS, Lpips, VggFeatures
 from tests.oracles.lpips import lpips as slow_lpips
 
 CHANNELS = (64, 128, 256, 512, 512)

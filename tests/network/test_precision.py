@@ -5,15 +5,15 @@ import logging
 import pytest
 import torch
 
-from facerf_cli.network import precision
-from facerf_cli.network.precision import mixed_precision
+from facerf_cli.network import inputs
+from facerf_cli.network.inputs import mixed_precision
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(autouse=True)
 def _fresh() -> None:
-    precision._has_bf16.cache_clear()
+    inputs._has_bf16.cache_clear()
 
 
 @pytest.mark.parametrize(("wanted", "has"), [(True, True), (True, False), (False, True)])

@@ -4,14 +4,14 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.diffuse_sh import DiffuseEstimate, DiffuseNetwork, DiffuseSettings
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.diffuse_sh_objective import (
+from facerf_cli.training.diffuse_sh import (
     DiffuseObjective,
     SumSettings,
     draw_sums,
     predicted_images,
     sum_lights,
 )
-from facerf_cli.training.objective import seeded
+from facerf_cli.training.loop import seeded
 
 NETWORK = DiffuseSettings(32, (8, 12, 16), (8, 12, 16), 4, 4, 16)
 SETTINGS = SumSettings(lights=4, sums=2, held_out_heads=2, held_out_draws=2)

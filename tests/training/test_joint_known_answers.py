@@ -20,8 +20,13 @@ from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import SourceColours, colour_cast
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.texture import normal_map
-from facerf_cli.training.joint_objective import JointObjective, JointSettings
-from facerf_cli.training.posed_heads import PosedHeads, render_textures, unwrap_images
+from facerf_cli.training.joint import (
+    JointObjective,
+    JointSettings,
+    PosedHeads,
+    render_textures,
+    unwrap_images,
+)
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
 MODEL = load_face_model()

@@ -10,14 +10,19 @@ from facerf_cli.dataset.crops import CropPairs, PhotoCrops
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.network.feature_networks import LightNetwork, LightSettings, VggFeatures
+from facerf_cli.network.features import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
-from facerf_cli.training.joint_objective import JointObjective, JointSettings
+from facerf_cli.training.joint import (
+    JointObjective,
+    JointSettings,
+    pose_heads,
+    render_textures,
+    unwrap_images,
+)
+from facerf_cli.training.loop import seeded
 from facerf_cli.training.losses import PaperWeights
-from facerf_cli.training.objective import seeded
-from facerf_cli.training.posed_heads import pose_heads, render_textures, unwrap_images
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
 SETTINGS = JointSettings(crop_px=CROP_PX, texture_side=SIDE, validation_pairs=2)

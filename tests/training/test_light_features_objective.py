@@ -3,13 +3,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
-from facerf_cli.training.objective import seeded
+from facerf_cli.training.light_features import LightFeaturesObjective, LightFeaturesSettings
+from facerf_cli.training.loop import seeded
 from tests.toy_faces import ToyFaces
 
 SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_views=3)

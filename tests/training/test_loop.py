@@ -14,8 +14,7 @@ import torch.multiprocessing as mp
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_networks
-from facerf_cli.training.loop import Start, drawn_batches, train
-from facerf_cli.training.processes import joined_processes
+from facerf_cli.training.loop import Start, drawn_batches, joined_processes, train
 from facerf_cli.training.settings import PRESETS, Adadelta, TrainSettings
 from tests.toy_faces import toy_objective
 
@@ -110,7 +109,7 @@ def test_a_killed_run_goes_on_to_the_last_digit(
 import os, signal, sys, torch
 sys.modules["tensorboard"] = None
 from facerf_cli.training import loop as training
-from facerf_cli.training import state
+from facerf_cli.training import run_folder
 from tests.training.test_loop import TINY, toy_objective
 from pathlib import Path
 calls = 0

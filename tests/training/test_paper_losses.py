@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.network.feature_networks import VggFeatures, feature_distance, layer_powers
+from facerf_cli.network.features import VggFeatures, feature_distance, layer_powers
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,

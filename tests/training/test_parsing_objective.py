@@ -10,7 +10,7 @@ from facerf_cli.network.parsing import Parsing, ParsingNetwork, ParsingSettings
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.parsing_objective import ParsingObjective, ParsingObjectiveSettings
+from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
 
 SIDE = 8
 SETTINGS = ParsingObjectiveSettings(held_out_people=1, held_out_draws=1)

@@ -13,7 +13,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
-from facerf_cli.training.portrait_objective import PortraitObjective, PortraitObjectiveSettings
+from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 
 SIDE, RIG = 16, rig_directions(12)
 SETTINGS = PortraitObjectiveSettings(held_out_people=1, held_out_draws=1, targets=2)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from facerf_cli.batch.settings import Settings
-from facerf_cli.work.train_progress import TrainProgress
+from facerf_cli.work.train import TrainProgress
 
 
 def row(step: int, seconds: float) -> dict[str, Any]:

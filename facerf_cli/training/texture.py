@@ -12,12 +12,12 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
-from facerf_cli.network.feature_networks import LightNetwork, feature_distance
+from facerf_cli.network.features import LightNetwork, feature_distance
 from facerf_cli.network.inputs import SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.loop import Objective, Validation, concatenate, metrics_by_pose, seeded
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 
 _VALIDATION_SEED = 12345
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192

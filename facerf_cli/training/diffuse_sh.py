@@ -19,8 +19,8 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.loop import Objective, Validation, concatenate, metrics_by_pose, seeded
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Objective, Validation, concatenate, metrics_by_pose, seeded
 
 _VALIDATION_SEED = 12345
 _SHEET_FACES = 5

@@ -18,7 +18,7 @@ from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20212
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4

@@ -1,15 +1,18 @@
 """One run of `facerf train`: the objective of its stage, with networks and data, and the training loop."""
 
+import logging
 import os
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from torch import Tensor, nn
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
-from facerf_cli.batch.settings import torch_device
+from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.cli.train import TrainOptions
 from facerf_cli.dataset.crops import Photos, mean_translation_m, open_photos
 from facerf_cli.dataset.dataset import Dataset, read_dataset
@@ -20,37 +23,172 @@ from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.appearance_network import AppearanceNetwork, AppearanceSettings
-from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.checkpoint import load_networks, load_vgg
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
-from facerf_cli.network.feature_networks import LightNetwork, LightSettings
+from facerf_cli.network.features import AppearanceNetwork, AppearanceSettings, LightNetwork, LightSettings
 from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
+from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
 from facerf_cli.network.reflectance import make_reflectance_network
+from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces
 from facerf_cli.synth.bank.head_images import add_head_images
 from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
-from facerf_cli.synth.bank.portrait_samples import PortraitSource
+from facerf_cli.synth.bank.parsing import StoredPortraits
+from facerf_cli.synth.bank.portrait_samples import PortraitSource, StoredTransport
+from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, load_backgrounds
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.appearance_objective import AppearanceObjective
-from facerf_cli.training.diffuse_sh_objective import DiffuseObjective, SumSettings
-from facerf_cli.training.geometry_objective import GeometryObjective, GeometryObjectiveSettings
-from facerf_cli.training.joint_objective import JointObjective, JointSettings
-from facerf_cli.training.light_features_objective import LightFeaturesObjective, LightFeaturesSettings
-from facerf_cli.training.loop import Start, train
-from facerf_cli.training.objective import Objective
-from facerf_cli.training.pretrained import load_features, load_vgg
-from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
+from facerf_cli.synth.bank.transport import TransportBankSettings, add_proxies, add_transport
+from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
+from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
+from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
+from facerf_cli.training.joint import JointObjective, JointSettings
+from facerf_cli.training.light_features import (
+    AppearanceObjective,
+    LightFeaturesObjective,
+    LightFeaturesSettings,
+)
+from facerf_cli.training.loop import (
+    Objective,
+    Start,
+    first_process_first,
+    joined_processes,
+    process_rank,
+    train,
+)
+from facerf_cli.training.losses import load_features
+from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
+from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Preset, Stage
-from facerf_cli.training.texture_objective import TextureObjective, TextureObjectiveSettings
-from facerf_cli.work.train_people import (
-    WholePeople,
-    drawn_backgrounds,
-    parsing_objective,
-    portrait_objective,
-    stored_transport,
-)
-from facerf_cli.work.train_progress import TrainProgress
+from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
+
+_MAPS, _HEAPS = 60, 240  # backgrounds: surroundings, each seen from several sides, and heaps of shapes
+_TINY_WIDTHS, _TINY_BLOCKS = (8, 8, 12, 16), (0, 1, 1, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class WholePeople:
+    """Synthetic people by number, the face models they take turns in, and what else the banks need."""
+
+    indices: range
+    held_out: int
+    models: list[str]
+    backgrounds_path: Path
+    seed: int
+    jobs: int
+    tiny: bool
+
+    @cached_property
+    def backgrounds(self) -> Tensor:
+        """Backgrounds of their photos."""
+        return drawn_backgrounds(self.backgrounds_path, self.seed, self.tiny)
+
+    def provenance(self) -> dict[str, Any]:
+        """Origin and licence of the people."""
+        drawn = [load_face_model(model) for model in self.models]
+        shapes = [f"the heads' shapes: {model.licence}" for model in drawn]
+        return {
+            "heads": f"synthetic people drawn from {' and '.join(model.credit for model in drawn)}",
+            "licence": "; ".join(["MIT", *shapes, MAKEHUMAN_LICENCE]),
+        }
+
+
+def drawn_backgrounds(path: Path, seed: int, tiny: bool) -> Tensor:
+    """Backgrounds of photos, drawn where their file is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    maps, heaps = (1, 4) if tiny else (_MAPS, _HEAPS)
+    return load_backgrounds(path, maps, heaps, seed)
+
+
+def parsing_objective(people: WholePeople, folder: Path, network: Any) -> ParsingObjective:
+    """The stage parsing; photos that are missing in `folder` are taken first."""
+    provenance = people.provenance()
+    settings = PortraitBankSettings(views=1, photos=1, side_px=96) if people.tiny else PortraitBankSettings()
+    add_portraits(folder, people.models, people.indices, people.jobs, people.seed, settings)
+    stored = StoredPortraits(folder, people.backgrounds, provenance)
+    own = ParsingSettings(_TINY_WIDTHS, _TINY_BLOCKS, side=64) if people.tiny else ParsingSettings()
+    objective = ParsingObjectiveSettings(held_out_people=people.held_out)
+    return ParsingObjective(stored, network or ParsingNetwork(own), objective)
+
+
+def stored_transport(people: WholePeople, folder: Path) -> StoredTransport:
+    """Synthetic people of the stage portrait; those that are missing in `folder` are baked and seen first."""
+    settings = TransportBankSettings(views=1, looks=1, lights=12) if people.tiny else TransportBankSettings()
+    add_transport(folder, people.models, people.indices, people.jobs, people.seed, settings)
+    add_proxies(folder, people.backgrounds, people.jobs, people.seed)
+    return StoredTransport(folder, people.backgrounds, people.provenance())
+
+
+def portrait_objective(source: PortraitSource, held_out: int, tiny: bool, network: Any) -> PortraitObjective:
+    """The stage portrait on people of a source, of whom at most `held_out` are held out."""
+    own = PortraitSettings(_TINY_WIDTHS, _TINY_BLOCKS) if tiny else PortraitSettings()
+    settings = PortraitObjectiveSettings(held_out_people=held_out, targets=2 if tiny else 4)
+    return PortraitObjective(source, network or PortraitNetwork(own), settings)
+
+
+_SMOOTH = 0.95  # of the moving average of the losses
+log = logging.getLogger(LOGGER_NAME)
+
+
+class TrainProgress:
+    """Step, losses, last validation, share of time spent waiting for batches, and the time left."""
+
+    def __init__(self, steps: int | None, max_seconds: float | None, settings: Settings, shown: bool) -> None:
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[left]}"),
+        )
+        self.on = shown and STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+        self.steps, self.max_seconds = steps, max_seconds
+        self.bar = Progress(*columns, console=STDERR, disable=not self.on)
+        self.task = self.bar.add_task("training", total=1.0, left="")
+        self.smooth: dict[str, float] = {}
+        self.validation = ""
+        self.begun: tuple[int, float] | None = None
+
+    def __enter__(self) -> "TrainProgress":
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.bar.stop()
+
+    def row(self, row: dict[str, Any]) -> None:
+        """Show one row of the log."""
+        losses = {"loss": row["loss"], **(row["terms"] if len(row["terms"]) > 1 else {})}
+        for name, value in losses.items():
+            self.smooth[name] = _SMOOTH * self.smooth.get(name, value) + (1 - _SMOOTH) * value
+        words = "  ".join(f"{name} {value:.4g}" for name, value in self.smooth.items())
+        if "validation" in row:
+            self.validation = "  ".join(f"{name} {value:.4g}" for name, value in row["validation"].items())
+            if not self.on:
+                log.info("step %d  %s  |  %s", row["step"], words, self.validation)
+        text = f"step {row['step']}  {words}  waiting {100 * row['waiting']:.0f} %"
+        text += f"  |  {self.validation}" if self.validation else ""
+        left_s = self._left_s(row)
+        done = 0.0 if left_s is None else row["seconds"] / max(row["seconds"] + left_s, 1e-9)
+        left = "" if left_s is None else f"{_clock(left_s)} left"
+        self.bar.update(self.task, completed=done, description=text, left=left)
+
+    def _left_s(self, row: dict[str, Any]) -> float | None:
+        """Seconds left by this process's pace or by --max-time, whichever ends first; None while unknown."""
+        self.begun = self.begun or (row["step"], row["seconds"])
+        steps = row["step"] - self.begun[0]
+        left = []
+        if self.max_seconds:
+            left.append(self.max_seconds - row["seconds"])
+        if self.steps and steps:
+            left.append((self.steps - row["step"]) * (row["seconds"] - self.begun[1]) / steps)
+        return max(0.0, min(left)) if left else None
+
+
+def _clock(seconds: float) -> str:
+    minutes = int(seconds) // 60
+    return f"{minutes // 60}:{minutes % 60:02d}:{int(seconds) % 60:02d}"
+
 
 _WORKERS_ON_GPU = 4
 _TINY_WIDTHS = (8, 12, 16)

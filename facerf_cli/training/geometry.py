@@ -19,7 +19,7 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.objective import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20211
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192

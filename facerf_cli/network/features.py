@@ -3,7 +3,7 @@
 V_f (paper, 'Loss Functions') is the trunk of VGG-16 (Simonyan and Zisserman, *Very deep convolutional
 networks for large-scale image recognition*, 2015, configuration D) with ImageNet's weights; it is never
 trained here. S_f is the same trunk, narrower if the settings say so, under a head that regresses the
-direction of the light on a texture; it is trained (`training/light_features_objective.py`), then frozen like
+direction of the light on a texture; it is trained (`training/light_features.py`), then frozen like
 V_f. LPIPS version 0.1 is the form 'lin' on VGG (Zhang et al., *The Unreasonable Effectiveness of Deep
 Features as a Perceptual Metric*, CVPR 2018).
 
@@ -14,15 +14,14 @@ is the same normalisation.
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol, Self
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import resize
-from facerf_cli.network.settings import Count, Grid, Side, VggWidth, settings_from
+from facerf_cli.network.inputs import Count, Grid, SavedNetwork, Side, VggWidth, resize
 
 # Index of each convolution in torchvision's `features`, and its channels.
 CONVOLUTIONS = (
@@ -162,13 +161,14 @@ class LightSettings:
     side: Side = 128
 
 
-class TrainedFeatures(nn.Module):
+class TrainedFeatures(SavedNetwork):
     """The trunk of VGG-16 under a head of `outputs` numbers; the features of the trunk compare images."""
+
+    form = "vgg"
 
     def __init__(self, settings: Any, outputs: int) -> None:
         """Make an untrained network; `settings` has the fields of `LightSettings`."""
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings)
         self.trunk = VggFeatures(settings.width)
         self.pool = nn.AdaptiveAvgPool2d(settings.grid)
         self.head = nn.Sequential(
@@ -186,10 +186,6 @@ class TrainedFeatures(nn.Module):
         """Features of the trunk at its own side; see `VggFeatures.layers`."""
         return self.trunk.layers(resize(linear, self.settings.side))
 
-    def as_metadata(self) -> dict[str, Any]:
-        """Form and settings, for a checkpoint."""
-        return {"form": "vgg", **asdict(self.settings)}
-
 
 class LightNetwork(TrainedFeatures):
     """S_f: regress the direction of the one light on a texture, in the head frame.
@@ -197,17 +193,14 @@ class LightNetwork(TrainedFeatures):
     The head frame, since a texture does not show the head's pose.
     """
 
+    kind_of_settings = LightSettings
+
     def __init__(self, settings: LightSettings = LightSettings()) -> None:
         super().__init__(settings, 3)
 
     def forward(self, textures: Tensor) -> Tensor:
         """Unit directions [B, 3] toward the light of linear textures [B, 3, T, T], zero where hidden."""
         return F.normalize(self.regressed(textures), dim=-1)
-
-    @classmethod
-    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
-        """Make an untrained network; raises KeyError, TypeError or ValueError if the settings make none."""
-        return cls(settings_from(LightSettings, metadata))
 
 
 class Lpips(nn.Module):
@@ -254,3 +247,28 @@ class Lpips(nn.Module):
 def _unit(features: Tensor) -> Tensor:
     """Normalise features [B, C, H, W] to length 1 at each pixel; zero features stay 0."""
     return features / (features.square().sum(1, keepdim=True).sqrt() + _EPSILON)
+
+
+@dataclass(frozen=True)
+class AppearanceSettings:
+    """Number of people, side of the images, and sizes; `width` 1 is the trunk of VGG-16."""
+
+    people: Count
+    side: Side = 128
+    width: VggWidth = 0.25
+    grid: Grid = 8  # side to which conv3_3 is pooled before the head
+    hidden: Count = 256
+
+
+class AppearanceNetwork(TrainedFeatures):
+    """Tell who is shown in an image, and where its light comes from."""
+
+    kind_of_settings = AppearanceSettings
+
+    def __init__(self, settings: AppearanceSettings) -> None:
+        super().__init__(settings, settings.people + 3)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Scores of the people [B, P] and unit directions toward the light [B, 3], camera space."""
+        found = self.regressed(images)
+        return found[:, :-3], F.normalize(found[:, -3:], dim=-1)
