@@ -27,7 +27,7 @@ from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.find import faces_of
+from facerf_cli.portrait.find import detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
@@ -165,7 +165,7 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
     photo = photograph(baked, subject.appearance, weights)
     image = photo.image / photo.image.mean((1, 2)).mean() * 0.18 + 0.25 * (1 - photo.alpha)
     display = to_display(image.permute(1, 2, 0).contiguous().numpy())
-    faces = faces_of(SHIPPED_NETWORKS.parsing, display)
+    faces = detect_faces(SHIPPED_NETWORKS.parsing, display)
     shown = [display, display]
     scores = {"found": float(bool(faces))}
     if faces:

@@ -32,12 +32,11 @@ from skimage.transform import resize
 
 from facerf_cli.capture.yale_b import read_yale_b
 from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS
-from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.images import read_image
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.find import faces_of
+from facerf_cli.portrait.find import Face, detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
@@ -92,6 +91,12 @@ def distances(differences: np.ndarray) -> tuple[float, float]:
     return float(lengths.mean()), float(lengths[..., len(CONTOUR) :].mean())
 
 
+def found_by_both(image: np.ndarray) -> tuple[list[Face], list[Face]]:
+    """Faces in an sRGB uint8 image [H, W, 3] by facerf and by dlib."""
+    parsing = SHIPPED_NETWORKS.parsing
+    return detect_faces(parsing, image), detect_faces(parsing, image, "dlib")
+
+
 def measure_yale_b(folder: Path, every: int) -> None:
     """Print distances and counts on Extended Yale B."""
     database = read_yale_b(folder)
@@ -99,12 +104,12 @@ def measure_yale_b(folder: Path, every: int) -> None:
     counts: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for subject in database.subjects:
         frontal = min(database.flashes(subject), key=lambda flash: flash.angle_deg)
-        reference = detect_landmarks(_displayed(database.image(subject, frontal)))[0].landmarks_px
+        reference = found_by_both(_displayed(database.image(subject, frontal)))[1][0].landmarks_px
         for index, flash in enumerate(database.flashes(subject)):
             if index % every and flash != frontal:
                 continue
             image = _displayed(database.image(subject, flash))
-            own, other = faces_of(SHIPPED_NETWORKS.parsing, image), detect_landmarks(image)
+            own, other = found_by_both(image)
             angle = flash.angle_deg
             bin_ = next(f"{a}-{b} deg" for a, b in pairwise(ANGLES_DEG) if angle < b)
             counts[bin_] += np.array([1, bool(own), bool(other)])
@@ -138,7 +143,7 @@ def measure_photos(folder: Path) -> None:
     """Print distances on the photos of a folder."""
     for path in sorted(folder.iterdir()):
         image = to_display(read_image(path).pixels)
-        own, other = faces_of(SHIPPED_NETWORKS.parsing, image), detect_landmarks(image)
+        own, other = found_by_both(image)
         print(f"{path.name}: facerf {len(own)} faces, dlib {len(other)}", end="")
         for face in own:
             near = min(
@@ -175,7 +180,7 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
         for path in sorted(folder.glob(f"{subject}_P00*{drawn['reference']}*")):
             grey = np.asarray(Image.open(path).convert("L"), np.float32) / 255
             image = _displayed(grey)
-            faces = faces_of(SHIPPED_NETWORKS.parsing, image)
+            faces = detect_faces(SHIPPED_NETWORKS.parsing, image)
             if not faces:
                 print(f"{path.name}: no face found")
                 continue
@@ -265,11 +270,11 @@ def measure_speed() -> None:
     """Print seconds of one core at 1024 x 1024."""
     photo = (255 * resize(skimage.data.astronaut(), (1024, 1024))).astype(np.uint8)
     steps = {
-        "facerf, boxes and landmarks": lambda: faces_of(SHIPPED_NETWORKS.parsing, photo),
+        "facerf, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.parsing, photo),
         "facerf, classes and matte": lambda: segment(
-            SHIPPED_NETWORKS.parsing, photo, faces_of(SHIPPED_NETWORKS.parsing, photo)[0].landmarks_px
+            SHIPPED_NETWORKS.parsing, photo, detect_faces(SHIPPED_NETWORKS.parsing, photo)[0].landmarks_px
         ),
-        "dlib, boxes and landmarks": lambda: detect_landmarks(photo),
+        "dlib, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.parsing, photo, "dlib"),
     }
     for name, step in steps.items():
         step()

@@ -25,14 +25,14 @@ from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.fit_start import FitStart
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import Face, FaceBox, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import NearLights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.parsing import ParsingNetwork
-from facerf_cli.portrait.find import FoundBox, FoundFace, LandmarksFrom, find_faces
+from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
@@ -106,9 +106,9 @@ def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | Non
         head = fit_photo(models, photo, face.landmarks_px, sides)
     else:
         head = regress_photo(models, photo, face.box_px, sides)
-    if not isinstance(face, FoundFace | FoundBox):
+    if face.view is None:
         return head
-    return head.without(models.face, uncovered(face.seen, head.fit.crop))
+    return head.without(models.face, uncovered(face.view, head.fit.crop))
 
 
 @torch.no_grad()

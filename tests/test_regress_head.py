@@ -11,12 +11,11 @@ from torch import nn
 
 from facerf_cli.face.crop import from_box, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
-from facerf_cli.face.landmarks import Face
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.files.images import read_image
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.pipeline import find_for, fit_photo, regress_head, regress_photo
-from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides, load_models
 

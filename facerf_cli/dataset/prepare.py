@@ -23,7 +23,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.drawings import draw_fit
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
 from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
-from facerf_cli.face.landmarks import choose_face, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
@@ -35,7 +35,7 @@ from facerf_cli.files.pages import filled_page
 from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.portrait.find import detect_faces
+from facerf_cli.portrait.find import choose_face, detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.recognition import descriptor_distance, face_descriptor
+from facerf_cli.face.dlib_landmarks import face_descriptor
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.image.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.network.checkpoint import load_vgg, read_tensors
@@ -191,7 +191,7 @@ def measure(comparison: Comparison, measures: Measures) -> list[Row]:
         if measures.with_lpips:
             values["lpips"] = perceptual_metric(measures.lpips, measures.vgg_weights)(ours, true)
         if descriptor is not None and landmarks_px is not None:
-            values["face_distance"] = descriptor_distance(face_descriptor(ours, landmarks_px), descriptor)
+            values["face_distance"] = float(np.linalg.norm(face_descriptor(ours, landmarks_px) - descriptor))
         values |= comparison.extra.get(method, {})
         rows.append(Row(case.name, case.person, method, case.facts, values))
     return rows

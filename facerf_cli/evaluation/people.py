@@ -19,7 +19,6 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
 from facerf_cli.files.images import LinearImage, read_image
@@ -38,7 +37,7 @@ from facerf_cli.pipeline import (
     relight,
     relit_by,
 )
-from facerf_cli.portrait.find import LandmarksFrom
+from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.composition import Target

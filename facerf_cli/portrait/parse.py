@@ -66,7 +66,7 @@ class Square:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SquareView:
     """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
 
     The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
@@ -117,7 +117,7 @@ def _smooth(grey: Tensor, reach: int) -> Tensor:
 @torch.inference_mode()
 def look(
     network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False
-) -> list[Seen]:
+) -> list[SquareView]:
     """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
     device = next(network.parameters()).device
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
@@ -131,7 +131,7 @@ def look(
         places = (places + flipped) / 2
         log_error = (log_error + other.log_error.double()[:, MIRROR]) / 2
     return [
-        Seen(
+        SquareView(
             square,
             logits[index].float(),
             square.to_photo(places[index].numpy()),
@@ -143,7 +143,7 @@ def look(
     ]
 
 
-def uncovered(seen: Seen, crop: Crop) -> np.ndarray:
+def uncovered(seen: SquareView, crop: Crop) -> np.ndarray:
     """Share [S, S] of each pixel of a crop that shows the face itself, without hair, glasses or a hand.
 
     Outside of what the network saw it is 1.

@@ -20,7 +20,7 @@ from facerf_cli.image.strips import Band, enlarged
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.matte import refine_matte, shrunk
-from facerf_cli.portrait.parse import Seen, Square, look
+from facerf_cli.portrait.parse import Square, SquareView, look
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
@@ -188,7 +188,7 @@ class _Laid:
         return image[..., self.rows, self.columns]
 
 
-def _over_photo(seen: Seen, size: tuple[int, int], shape: tuple[int, ...]) -> _Laid:
+def _over_photo(seen: SquareView, size: tuple[int, int], shape: tuple[int, ...]) -> _Laid:
     """The classes of an upright square, over a small image of the whole photo."""
     places = _shares(seen.square, size, shape)
     rows, columns = (slice(int((at <= 0).sum()), int((at < 1).sum())) for at in places)
@@ -282,7 +282,7 @@ def _only_background() -> Tensor:
     return shares
 
 
-def with_ears(classes: Tensor, seen: Seen, places_px: np.ndarray) -> Tensor:
+def with_ears(classes: Tensor, seen: SquareView, places_px: np.ndarray) -> Tensor:
     """Classes [C, h, w] with likelier ears at pixels that lie at places [h, w, 2] in the photo.
 
     Ears are small, and get the benefit of the doubt near the line through the landmarks of top, back and
@@ -298,7 +298,7 @@ def with_ears(classes: Tensor, seen: Seen, places_px: np.ndarray) -> Tensor:
     return lifted
 
 
-def _nearness(seen: Seen, places_px: np.ndarray) -> np.ndarray:
+def _nearness(seen: SquareView, places_px: np.ndarray) -> np.ndarray:
     """Nearness [h, w] in 0..1 of places [h, w, 2] to the lines of both ears."""
     near = np.zeros(places_px.shape[:2])
     width_px = _EAR_WIDTH * max(seen.extent_px, 1.0)

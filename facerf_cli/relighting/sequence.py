@@ -21,12 +21,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import Face, choose_face, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitMaps
-from facerf_cli.portrait.find import FoundFace, LandmarksFrom, detect_faces, face_near
+from facerf_cli.portrait.find import Face, LandmarksFrom, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
 from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image
@@ -173,7 +173,7 @@ class Follower:
         if face is None:
             return None
         self._last = face.landmarks_px
-        error = face.seen.relative_error if isinstance(face, FoundFace) else 0.0
+        error = face.view.relative_error if face.view else 0.0
         return Sighting(face.landmarks_px, error)
 
     def _searched(self, image_srgb: np.ndarray) -> Face | None:

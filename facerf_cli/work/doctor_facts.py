@@ -13,10 +13,13 @@ import torch
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.cli.doctor import MISSING
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.detector import DETECTOR_LICENCE
-from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, predictor_path
+from facerf_cli.face.dlib_landmarks import (
+    DETECTOR_LICENCE,
+    PREDICTOR_LICENCE,
+    RECOGNITION_LICENCE,
+    predictor_path,
+)
 from facerf_cli.face.morphable import BUILTIN_PATH
-from facerf_cli.face.recognition import RECOGNITION_LICENCE
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.relighting.models import described_file

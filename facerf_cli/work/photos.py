@@ -20,14 +20,14 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import Face, FaceBox, face_at, read_landmarks
+from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, FoundBox, FoundFace, confidence_in, find_faces
+from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidence_in, face_at, find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
@@ -155,9 +155,9 @@ def facts_of_found(faces: Sequence[FaceBox], options: PhotoOptions) -> dict[str,
 
 def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
     """A face's confidence for the report; nothing where it was given, or found by dlib."""
-    if not isinstance(face, FoundFace | FoundBox):
+    if face.view is None:
         return {}
-    confidence = confidence_in(face, yaw_deg)
+    confidence = confidence_in(face.view, yaw_deg)
     factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
     return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
@@ -174,8 +174,8 @@ def _names(item: Item, faces: Sequence[FaceBox]) -> list[str]:
 
 
 def _say_confidence(name: str, face: FaceBox) -> None:
-    if isinstance(face, FoundFace | FoundBox):
-        confidence = confidence_in(face)
+    if face.view is not None:
+        confidence = confidence_in(face.view)
         why = "" if confidence.word == "sure" else f" ({confidence.reason})"
         log.info("%s: %s%s", name, confidence.word, why)
 

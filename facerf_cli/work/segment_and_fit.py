@@ -12,7 +12,7 @@ from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot, shot_of
 from facerf_cli.face.drawings import draw_fit
 from facerf_cli.face.fit import save_fit
-from facerf_cli.face.landmarks import Face, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
@@ -21,7 +21,7 @@ from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import filled
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
-from facerf_cli.portrait.find import FoundFace
+from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.texture import vertex_normals
@@ -108,9 +108,9 @@ def _colours() -> np.ndarray:
 def _landmarks(face: Face) -> dict[str, Any]:
     """The landmarks as a document that --landmarks reads, with what else the network saw."""
     document: dict[str, Any] = {"landmarks": face.landmarks_px.round(3).tolist()}
-    if isinstance(face, FoundFace):
-        document["expected_error_px"] = face.seen.error_px[:68].round(3).tolist()
-        more = zip(MORE_LANDMARKS, face.seen.landmarks_px[68:], face.seen.error_px[68:], strict=True)
+    if face.view is not None:
+        document["expected_error_px"] = face.view.error_px[:68].round(3).tolist()
+        more = zip(MORE_LANDMARKS, face.view.landmarks_px[68:], face.view.error_px[68:], strict=True)
         document["more"] = {
             name: {"at": at.round(3).tolist(), "expected_error_px": round(float(error), 3)}
             for name, at, error in more

@@ -14,10 +14,11 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import Face, face_at, read_landmarks, to_display
+from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709
+from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, ShotView, Sighting, gaps, takes

@@ -22,10 +22,10 @@ from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation import people
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from facerf_cli.network.features import LightNetwork
+from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting.models import Models
 from facerf_cli.work import evaluate_faces
 from facerf_cli.work.evaluate_faces import FaceSettings, faces_of, load_methods

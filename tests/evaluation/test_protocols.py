@@ -33,9 +33,9 @@ from facerf_cli.evaluation.reconstruction import FULL, MEAN, brightest, compare_
 from facerf_cli.evaluation.transfer import couples_of, transfer
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
-from facerf_cli.face.landmarks import Face, face_at
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.image.metrics import si_mse, si_mse_channels
+from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
 from tests.dataset.dataset_fixture import write_small_dataset

@@ -31,10 +31,10 @@ from facerf_cli.evaluation.yale_b import (
     layout,
     published,
 )
-from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import fit_photo, head_of, relight
+from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import Face
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import relight
+from facerf_cli.portrait.find import Face
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.relighting.composition import Target
 

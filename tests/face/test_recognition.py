@@ -8,9 +8,9 @@ import pytest
 import skimage.data
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.face import dlib_landmarks, recognition
+from facerf_cli.face import dlib_landmarks
+from facerf_cli.face.dlib_landmarks import face_descriptor
 from facerf_cli.face.landmarks import to_display
-from facerf_cli.face.recognition import descriptor_distance, face_descriptor
 from facerf_cli.files.images import read_image
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -32,7 +32,7 @@ def descriptor(landmarks_px: np.ndarray) -> np.ndarray:
 def test_a_face_is_its_own_wherever_it_stands(descriptor: np.ndarray, landmarks_px: np.ndarray) -> None:
     moved = np.pad(PHOTO, ((30, 5), (12, 40), (0, 0)))
     assert descriptor.shape == (128,)
-    assert descriptor_distance(face_descriptor(moved, np.add(landmarks_px, (12, 30))), descriptor) < 0.02
+    assert np.linalg.norm(face_descriptor(moved, np.add(landmarks_px, (12, 30))) - descriptor) < 0.02
 
 
 def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
@@ -40,8 +40,8 @@ def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
 ) -> None:
     darker = PHOTO * 0.8 + 0.01 * np.random.default_rng(0).normal(size=PHOTO.shape)
     elsewhere = face_descriptor(PHOTO, np.add(landmarks_px, (60, 90)))
-    assert descriptor_distance(face_descriptor(darker, landmarks_px), descriptor) < 0.2
-    assert descriptor_distance(elsewhere, descriptor) > 0.5
+    assert np.linalg.norm(face_descriptor(darker, landmarks_px) - descriptor) < 0.2
+    assert np.linalg.norm(elsewhere - descriptor) > 0.5
 
 
 def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,7 +51,7 @@ def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
             return [0.0] * 128
 
     recorder = Recorder()
-    monkeypatch.setattr(recognition, "_network", lambda: recorder)
+    monkeypatch.setattr(dlib_landmarks, "_recognition", lambda: recorder)
     places = np.stack([np.arange(68), 2 * np.arange(68)], -1)
     face_descriptor(np.full((9, 7, 3), [0.2, 0.5, 1.3]), places + PIXEL_CENTRE + 0.2)
     assert recorder.points == [tuple(place) for place in places.tolist()]  # a pixel's centre is whole there
@@ -65,7 +65,9 @@ def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> Non
         pixels = read_image(shared_data / "photos" / name).pixels
         face = find_faces(SHIPPED_NETWORKS.parsing, pixels, name)[0]
         found.append(face_descriptor(to_display(pixels) / 255.0, face.landmarks_px))
-    assert descriptor_distance(*found) < 0.6 < min(descriptor_distance(each, descriptor) for each in found)
+    assert (
+        np.linalg.norm(found[0] - found[1]) < 0.6 < min(np.linalg.norm(each - descriptor) for each in found)
+    )
 
 
 def test_other_shapes_are_refused(landmarks_px: np.ndarray) -> None:
@@ -79,6 +81,6 @@ def test_a_missing_model_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, landmarks_px: np.ndarray
 ) -> None:
     monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
-    recognition._network.cache_clear()
+    dlib_landmarks._recognition.cache_clear()
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
         face_descriptor(PHOTO, landmarks_px)

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS, Seen, Square
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 
 SIDE = 64
 
@@ -16,14 +16,14 @@ def places() -> tuple[torch.Tensor, torch.Tensor]:
     return x, y
 
 
-def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 1.0) -> Seen:
+def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 1.0) -> SquareView:
     """A view that gives each region [S, S] bool its class, later ones over earlier, on background."""
     label = torch.zeros(SIDE, SIDE, dtype=torch.long)
     for name, inside in regions.items():
         label[inside] = class_index(name)
     classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
     landmarks = square.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (LANDMARKS, 2)))
-    return Seen(
+    return SquareView(
         square,
         classes.clamp_min(1e-30).log()[None],
         landmarks,

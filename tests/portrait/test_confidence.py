@@ -9,8 +9,8 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.portrait.find import Confidence, FoundFace, confidence_in, detect_faces
-from facerf_cli.portrait.parse import LANDMARKS, Square
+from facerf_cli.portrait.find import Confidence, confidence_in, detect_faces
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
 
@@ -21,15 +21,14 @@ def face(
     turned: float = 1.0,
     covered: bool = False,
     presence: float = 1.0,
-) -> FoundFace:
+) -> SquareView:
     """A face seen well, but for what a test changes; `turned` narrows it."""
     everywhere = torch.ones_like(places()[0], dtype=torch.bool)
     seen = seen_of(Square(0, 0, 2 * size_px), {"hand" if covered else "skin": everywhere}, presence)
     flat = LANDMARKS_M[:, :2] * [turned, -1]
     points = np.zeros((LANDMARKS, 2))
     points[:68] = size_px * flat / np.ptp(flat, axis=0).max()
-    seen = replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
-    return FoundFace((0, 0, size_px, size_px), 1.0, points[:68], seen)
+    return replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
 
 
 def test_a_good_face_is_sure() -> None:
@@ -45,10 +44,10 @@ def test_a_good_face_is_sure() -> None:
         ("unclear", face(presence=0.2)),
         ("profile", face(turned=0.2)),
         ("covered", face(covered=True)),
-        ("blurred", replace(face(), seen=replace(face().seen, sharpness=0.13))),
+        ("blurred", replace(face(), sharpness=0.13)),
     ],
 )
-def test_what_makes_a_photo_hard_is_named(reason: str, hard: FoundFace) -> None:
+def test_what_makes_a_photo_hard_is_named(reason: str, hard: SquareView) -> None:
     confidence = confidence_in(hard)
     assert confidence.word == "doubtful" and confidence.reason == reason
 
@@ -68,12 +67,12 @@ def test_the_words_follow_the_score() -> None:
 def test_a_blurred_photo_is_doubtful_and_says_why() -> None:
     photo = skimage.data.astronaut()[:300, 60:360].astype(np.float32)
     (sharp,) = detect_faces(SHIPPED_NETWORKS.parsing, photo.astype(np.uint8))
-    assert isinstance(sharp, FoundFace) and confidence_in(sharp).factors["blurred"] == 1
-    blurs = [0.01 * sharp.seen.extent_px, 0.02 * sharp.seen.extent_px]
+    assert sharp.view is not None and confidence_in(sharp.view).factors["blurred"] == 1
+    blurs = [0.01 * sharp.view.extent_px, 0.02 * sharp.view.extent_px]
     found = [
         detect_faces(SHIPPED_NETWORKS.parsing, gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0]
         for blur in blurs
     ]
-    little, much = (confidence_in(one) for one in found if isinstance(one, FoundFace))
+    little, much = (confidence_in(one.view) for one in found if one.view)
     assert little.factors["blurred"] > 0.5 > much.factors["blurred"]
     assert much.word != "sure" and much.reason == "blurred"

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
-from facerf_cli.portrait.parse import LANDMARKS, Seen, Square
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 from facerf_cli.portrait.segment import with_ears
 from tests.portrait.seen import seen_of
 
 EARS, HAIR, SKIN, GLASSES = (class_index(name) for name in ("ears", "hair", "skin", "glasses"))
 
 
-def seen() -> Seen:
+def seen() -> SquareView:
     """A face 100 pixels large whose ears are upright lines at x 10 and x 90."""
     points = np.full((LANDMARKS, 2), 50.0)
     points[0], points[1] = (0, 0), (100, 100)

@@ -9,7 +9,7 @@ import torch
 from facerf_cli.image.strips import filled
 from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.parse import Seen, Square
+from facerf_cli.portrait.parse import Square, SquareView
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
@@ -30,7 +30,7 @@ def squares(monkeypatch: pytest.MonkeyPatch) -> list[Square]:
     """A network that sees a head, a garment below it, and another person on the left."""
     looked: list[Square] = []
 
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         looked.extend(wanted)
         found = []
         for square in wanted:
@@ -92,7 +92,7 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
 def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         found = []
         for square in wanted:
             x, y = photo_share(square)
@@ -112,7 +112,7 @@ def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
 
 
 def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         smallest = min(square.side_px for square in wanted)
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
         return [
@@ -131,7 +131,7 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_stay(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         found = []
         for square in wanted:
             x, y = photo_share(square)
@@ -149,7 +149,7 @@ def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_sta
 
 
 def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
         found = [seen_of(square, {"hair": everywhere}) for square in wanted]
         for seen in found:
@@ -175,7 +175,7 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
 def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
     monkeypatch: pytest.MonkeyPatch, name: str, share: float, matte: float
 ) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[Seen]:
+    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         found = [seen_of(square, {}) for square in wanted]
         for seen in found:
             seen.classes[0], seen.classes[CLASSES.index(name)] = 1 - share, share

@@ -18,10 +18,10 @@ from facerf_cli.capture.checks.shading import Stereo, angle_deg
 from facerf_cli.capture.findings import Finding
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera, fit_views
-from facerf_cli.face.landmarks import choose_face, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.portrait.find import detect_faces
+from facerf_cli.portrait.find import choose_face, detect_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 _TURN_DEG = 20.0  # sound rigs give 1 to 11, on Extended Yale B and synthetic faces

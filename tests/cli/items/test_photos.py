@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.face.landmarks import FaceBox
+from facerf_cli.portrait.find import FaceBox
 from facerf_cli.work.photos import _names
 
 ITEM = Item(Path("me.jpg"), Path("out/me"), "me")
