@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facerf_cli.batch.naming import NamePattern
+from facerf_cli.batch.inputs import NamePattern
 from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.cli.light_entries import lit_images

@@ -194,7 +194,7 @@ def _index(path: Path) -> None:
 
 
 def _report(path: Path) -> None:
-    from facerf_cli.batch.report import open_report
+    from facerf_cli.batch.run import open_report
 
     open_report(path, "segment", [], [], lambda _: [])
 
@@ -207,9 +207,8 @@ def _figures(path: Path) -> None:
 
 def _names(path: Path) -> None:
     """The file's content is a name: of an input, in a report, a page and a message."""
-    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
-    from facerf_cli.batch.naming import NamePattern
-    from facerf_cli.batch.report import rows_of
+    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
+    from facerf_cli.batch.run import rows_of
     from facerf_cli.run.logs import json_line, shown
     from facerf_cli.viewer.page import IndexEntry, index_page
 
@@ -236,8 +235,7 @@ def _names(path: Path) -> None:
 
 def _words(path: Path) -> None:
     """The file's content is the value of an option."""
-    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
-    from facerf_cli.batch.naming import NamePattern
+    from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
     from facerf_cli.batch.settings import Shard
     from facerf_cli.cli.light_entries import lit_images
     from facerf_cli.cli.output_options import parse_formats

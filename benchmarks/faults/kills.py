@@ -125,7 +125,7 @@ def _kill_at(call: str, count: int, after: bool) -> None:
         return wrapped
 
     if call == "row":
-        from facerf_cli.batch import report
+        from facerf_cli.batch import run as report
 
         report.json_line = counted(report.json_line)
     else:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from benchmarks._common import ROOT, arguments
 from benchmarks.faults.runs import VERBS, Verb, fresh
-from facerf_cli.batch.report import REPORT_NAME
+from facerf_cli.batch.run import REPORT_NAME
 
 _INTERRUPTS, _SIDE_PX = 3, 256
 

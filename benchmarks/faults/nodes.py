@@ -20,7 +20,7 @@ from pathlib import Path
 
 from benchmarks._common import ROOT, arguments, required_package
 from benchmarks.faults.runs import VERBS, faults_of, fresh, outputs
-from facerf_cli.batch.report import REPORT_NAME
+from facerf_cli.batch.run import REPORT_NAME
 
 _PATIENCE_S = 240
 _PORT = 6391

@@ -16,7 +16,7 @@ from typing import Literal
 
 from benchmarks._common import ASTRONAUT
 from benchmarks.faults import samples
-from facerf_cli.batch.report import REPORT_NAME
+from facerf_cli.batch.run import REPORT_NAME
 from facerf_cli.files import atomic
 
 PART = ".*part-*"  # name of a temporary folder

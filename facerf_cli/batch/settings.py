@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from facerf_cli.batch.recipe import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.workers import Workers
@@ -14,6 +13,7 @@ from facerf_cli.run.workers import Workers
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 Overwrite = Literal["never", "changed", "always"]
 T = TypeVar("T")
+NOT_IN_RECIPE = {"in_recipe": False}  # metadata of a field that shapes no output
 _SHARE = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 

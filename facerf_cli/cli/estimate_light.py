@@ -8,11 +8,10 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind
-from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.naming import file_pattern
-from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_files
+from facerf_cli.batch.inputs import Item, file_pattern
+from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, run_files
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.options import (
     FACE,

@@ -10,10 +10,8 @@ from typing import Annotated, Protocol, Self
 import typer
 
 from facerf_cli.batch.inputs import FILM_SUFFIXES, Item
-from facerf_cli.batch.made_from import FolderIndex
-from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, all_finished, run_files
+from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, RecipesOf
+from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, run_files
 from facerf_cli.batch.settings import Overwrite, Settings
 from facerf_cli.cli.options import IMAGE, folder_not_file
 from facerf_cli.cli.output_options import Format

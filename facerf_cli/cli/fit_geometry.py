@@ -6,9 +6,8 @@ from pathlib import Path
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.recipe import OneRecipe
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.made_from import OneRecipe
+from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,

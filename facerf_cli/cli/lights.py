@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.naming import NamePattern, split_frame
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
 from facerf_cli.cli.light_entries import lit_images
 from facerf_cli.cli.light_options import LightOptions
 from facerf_cli.cli.values import MOST_FRAMES, is_sweep, numbers, sweep

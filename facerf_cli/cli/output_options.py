@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.batch.recipe import NOT_IN_RECIPE
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.options import IMAGE, refuse_given
 from facerf_cli.errors import UsageError
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.batch.naming import OF_PHOTOS, NamePattern
+from facerf_cli.batch.inputs import OF_PHOTOS, NamePattern
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import FACE, METHOD
 from facerf_cli.errors import UsageError

@@ -11,9 +11,8 @@ from typing import Annotated
 import typer
 
 from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items
 from facerf_cli.batch.made_from import FolderIndex
-from facerf_cli.batch.naming import NamePattern
 from facerf_cli.batch.run import BatchOptions, all_finished, print_path, run_files
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
 from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 from facerf_cli.baselines import RelightKind
-from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.naming import NamePattern, split_frame
-from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.inputs import Item, NamePattern, split_frame
+from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import Outcome
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.backgrounds import BackgroundChoice
 from facerf_cli.cli.lights import LightSetup, PhotoLight, Sampling
 from facerf_cli.cli.output_options import OutputOptions

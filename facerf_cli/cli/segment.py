@@ -5,11 +5,10 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.naming import file_pattern
-from facerf_cli.batch.recipe import NOT_IN_RECIPE, DigestOf, Recipe, recipe_of
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_files
+from facerf_cli.batch.inputs import Item, file_pattern
+from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, run_files
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.options import (
     DryRunOption,
     InputColourspaceOption,

@@ -9,9 +9,16 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.batch.inputs import FILM_SUFFIXES, PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.naming import NamePattern, fields_of, split_frame
-from facerf_cli.batch.recipe import DigestOf, Recipe
+from facerf_cli.batch.inputs import (
+    FILM_SUFFIXES,
+    PHOTO_SUFFIXES,
+    Item,
+    NamePattern,
+    collect_items,
+    fields_of,
+    split_frame,
+)
+from facerf_cli.batch.made_from import DigestOf, Recipe
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import BATCH
 from facerf_cli.cli.photo_options import PhotoOptions

@@ -7,9 +7,8 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.recipe import OneRecipe
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_files, sums_up
+from facerf_cli.batch.made_from import OneRecipe
+from facerf_cli.batch.run import BatchOptions, Outcome, run_files, sums_up
 from facerf_cli.cli.options import (
     IMAGE,
     DryRunOption,

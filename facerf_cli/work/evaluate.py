@@ -15,10 +15,8 @@ from PIL import Image
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.made_from import FolderIndex
-from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_items, sums_up
+from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.errors import InputError, UsageError

@@ -10,7 +10,7 @@ from typing import Literal, TypeVar
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
-from facerf_cli.batch.recipe import NOT_IN_RECIPE
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.light_options import LightOptions, Refine
 from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.dataset.dataset import Dataset, read_dataset

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.recipe import NOT_IN_RECIPE
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.errors import UsageError

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
-from facerf_cli.batch.naming import OF_PHOTOS, NamePattern
+from facerf_cli.batch.inputs import OF_PHOTOS, PHOTO_SUFFIXES, Item, NamePattern
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose

@@ -14,6 +14,9 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.batch.report import Outcome
 from facerf_cli.batch.run import BatchOptions, run_items, sums_up
 from facerf_cli.batch.settings import Settings, workers_of
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.capture import Capture, ChartCorrection
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_items, sums_up
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
 from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.path_tracer import load_mitsuba

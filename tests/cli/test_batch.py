@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.recipe import Recipe
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.made_from import Recipe
+from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
@@ -167,9 +166,9 @@ SLOW_VERB = """
 import sys, time
 from pathlib import Path
 from facerf_cli.batch.run import BatchOptions, run_batch
-from facerf_cli.batch.report import Outcome
+from facerf_cli.batch.run import Outcome
 from facerf_cli.cli.options import Settings
-from facerf_cli.batch.recipe import Recipe
+from facerf_cli.batch.made_from import Recipe
 from facerf_cli.files.atomic import atomic_path
 
 def outputs_of(item):

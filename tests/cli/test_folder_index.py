@@ -8,10 +8,9 @@ import pytest
 
 from facerf_cli.batch import made_from as folder_index
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.recipe import NOT_IN_RECIPE, differences, recipe_of
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_batch
-from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.batch.made_from import differences, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError

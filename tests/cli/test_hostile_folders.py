@@ -8,10 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
-from facerf_cli.batch.naming import NamePattern
-from facerf_cli.batch.report import report_name
-from facerf_cli.batch.run import _exist, print_path
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
+from facerf_cli.batch.run import _exist, print_path, report_name
 from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import InputError

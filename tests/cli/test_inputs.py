@@ -6,8 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
-from facerf_cli.batch.naming import NamePattern, split_frame
+from facerf_cli.batch.inputs import (
+    PHOTO_SUFFIXES,
+    Item,
+    NamePattern,
+    collect_items,
+    expand_inputs,
+    split_frame,
+)
 from facerf_cli.errors import UsageError
 
 

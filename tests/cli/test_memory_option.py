@@ -6,8 +6,7 @@ import pytest
 from skimage.data import astronaut
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import _Work
+from facerf_cli.batch.run import Outcome, _Work
 from facerf_cli.batch.settings import Settings
 from facerf_cli.files.images import write_display
 from facerf_cli.main import global_options_first, main

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
 from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.recipe import NOT_IN_RECIPE
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
