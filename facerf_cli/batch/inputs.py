@@ -105,6 +105,11 @@ class Item:
     stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
     frame: int | None = field(default=None, compare=False)  # of a film, from 0
 
+    @property
+    def is_file(self) -> bool:
+        """True for a file that the user named or that was found in a folder of theirs."""
+        return self.mirrored is not None
+
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
         return Path(f"{self.output_base}{ending}")
@@ -128,7 +133,7 @@ class Item:
 def collect_items(
     inputs: Sequence[str],
     output_folder: Path,
-    suffixes: frozenset[str],
+    suffixes: frozenset[str] = PHOTO_SUFFIXES,
     pattern: NamePattern | None = None,
     null_separated: bool = False,
 ) -> list[Item]:

@@ -1,9 +1,8 @@
 """The contract of every verb that walks folders: what is read, skipped, written and reported.
 
-A verb passes functions to `run_batch` (files) or `run_items` (other items): `outputs_of(item)` names the
-files of a finished item, `process(item)` makes them, and `recipes_of` says what else shapes them. `process`
-raises `InputError` for a faulty item (the run continues); any other `FacerfError` concerns the whole run and
-ends it.
+A verb passes functions to `run_items`: `outputs_of(item)` names the files of a finished item,
+`process(item)` makes them, and `recipes_of` says what else shapes them. `process` raises `InputError` for a
+faulty item (the run continues); any other `FacerfError` concerns the whole run and ends it.
 """
 
 import logging
@@ -12,13 +11,13 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, file_pattern
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, read_row
 from facerf_cli.batch.settings import Overwrite, Settings, Shard, workers_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
@@ -148,42 +147,6 @@ class BatchOptions:
     print_outputs: bool = True  # on stdout; not those that are to be joined
 
 
-def run_batch(
-    verb: str,
-    inputs: Sequence[str],
-    process: Callable[[Item], Outcome],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
-    settings: Settings,
-    recipes_of: RecipesOf,
-    suffixes: frozenset[str] = PHOTO_SUFFIXES,
-    prepare: Callable[[], object] | None = None,
-    name: str | None = None,
-) -> int:
-    """Process the files that `inputs` name: `run_files` over `collect_items`, with the pattern of --name."""
-    items = collect_items(inputs, options.output, suffixes, file_pattern(name), settings.null_separated)
-    return run_files(verb, items, process, outputs_of, options, settings, recipes_of, prepare)
-
-
-def run_files(
-    verb: str,
-    items: Sequence[Item],
-    process: Callable[[Item], Outcome],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
-    settings: Settings,
-    recipes_of: RecipesOf,
-    prepare: Callable[[], object] | None = None,
-    index: FolderIndex | None = None,
-) -> int:
-    """Process items that are files: `run_items`, and a missing file is an error of its item."""
-    code = run_items(verb, items, _OfFile(process), outputs_of, options, settings, prepare, recipes_of, index)
-    missing = [item for item in items if options.dry_run and not os.path.exists(item.input_path)]
-    for item in missing:
-        log.error("%s: no such file; check the path", item.input_path)
-    return max(code, int(bool(missing)))
-
-
 def run_items(
     verb: str,
     items: Sequence[Item],
@@ -191,97 +154,97 @@ def run_items(
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
     settings: Settings,
-    prepare: Callable[[], object] | None = None,
     recipes_of: RecipesOf | None = None,
+    prepare: Callable[[], object] | None = None,
     index: FolderIndex | None = None,
 ) -> int:
-    """Process the items and return the exit code: 0 all done, 1 some failed.
+    """Process this process's share of the items; return the exit code: 0 all done, 1 some failed.
 
-    An item is finished if its outputs exist and, with `recipes_of`, were made from the same input by the
-    same recipe. With `--shard` only this process's share of them, which has a report of its own. `prepare` is
-    called once, before the first item, and not at all where everything is finished: it loads what `process`
-    needs, so that an error in that is reported once; in a dry run, too. An `index` that was read stands for
-    that of `recipes_of`. With several workers `process` runs
-    in other processes and must be picklable. Raises `UsageError` (exit 2) where the output folder cannot be
-    used.
+    Args:
+        verb: Its name, for the report and the index.
+        items: Files (`collect_items`), or other inputs. A file that is missing is an error of its item.
+        process: Makes the outputs of an item; picklable, since workers may call it in other processes.
+        outputs_of: The files of a finished item. It is finished if they exist and, with `recipes_of`, were
+            made from the same input by the same recipe.
+        options: Where outputs go, what is made again, and the number of jobs.
+        settings: The global options; with `--shard` the share, which has a report of its own.
+        recipes_of: The recipes of the outputs.
+        prepare: Called once before the first item, in a dry run too, but not where everything is finished:
+            it loads what `process` needs, so that an error in that is reported once.
+        index: The index that was read already, in place of that of `recipes_of`.
+
+    Raises:
+        UsageError: The output folder cannot be used.
     """
     items = settings.shard.share(items)
+    is_new = not options.output.exists()
     with ExitStack() as stack:
-        is_new = not options.output.exists()
         if not options.dry_run:
             try:
                 stack.enter_context(alone_in(options.output, _lock_name(settings.shard)))
             except OSError as error:
                 raise unusable(options.output, error) from error
-        batch = _Batch(verb, items, process, outputs_of, options, settings)
         if index is None and recipes_of:
             index = FolderIndex(options.output, verb, settings.shard, recipes_of)
-        return _run_alone(batch, is_new, prepare, index)
+        states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
+        todo = [replace(item, stale=stale) for item, (reason, stale) in states.items() if reason is not None]
+        finished = [item for item, (reason, _) in states.items() if reason is None]
+        again = Counter(reason for reason, _ in states.values() if reason)
+        if todo and prepare:
+            prepare()
+        if options.dry_run:
+            _log_made_again(again)
+            return _list_what_would_be_done(todo, finished, outputs_of)
+        report = open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
+        if index and (todo or index.has_news):
+            index.open()
+        if finished:
+            advice = "" if options.overwrite == "never" else " from the same inputs and options"
+            log.info("%d of %d already finished%s", len(finished), len(items), advice)
+        _log_made_again(again)
+        if index and index.edited:
+            kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
+            log.warning(kept, len(index.edited))
+        failures = 0
+        results = _results(verb, todo, process, outputs_of, options, settings, index is not None)
+        with closing(results):
+            for result in results:
+                if index and result.made:
+                    index.add(result.made, outputs_of(result.item))
+                add_row(report, verb, result)
+                failures += _print_result(result, options)
+        if failures and len(items) > 1:
+            log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
+        elif failures and is_new:
+            lock = options.output / _lock_name(settings.shard)
+            _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
+        return 1 if failures else 0
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """This process's share of a run: the arguments of `run_items`."""
-
-    verb: str
-    items: Sequence[Item]
-    process: Callable[[Item], Outcome]
-    outputs_of: Callable[[Item], Sequence[Path]]
-    options: BatchOptions
-    settings: Settings
-
-
-def _run_alone(
-    batch: _Batch, is_new: bool, prepare: Callable[[], object] | None, index: FolderIndex | None
-) -> int:
-    """Run the share while no other process writes to the folder; `is_new`: it did not exist before."""
-    verb, outputs_of, options, settings = batch.verb, batch.outputs_of, batch.options, batch.settings
-    states = {item: _why_again(item, outputs_of(item), options, index) for item in batch.items}
-    reasons = {item: reason for item, (reason, _) in states.items()}
-    todo = [replace(item, stale=states[item][1]) for item in batch.items if reasons[item] is not None]
-    finished = [item for item in batch.items if reasons[item] is None]
-    if todo and prepare:
-        prepare()
-    if options.dry_run:
-        _say_what_is_made_again(reasons)
-        return _list_what_would_be_done(todo, finished, outputs_of)
-    report = open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
-    if index and (todo or index.has_news):
-        index.open()
-    _say_what_is_skipped(reasons, options)
-    if index and index.edited:
-        kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
-        log.warning(kept, len(index.edited))
-    failures = _process(batch, todo, report, index)
-    if failures and len(batch.items) > 1:
-        log.error("%d of %d failed; %s has a row for each", failures, len(batch.items), report)
-    elif failures and is_new:
-        lock = options.output / _lock_name(settings.shard)
-        _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
-    return 1 if failures else 0
-
-
-def _process(batch: _Batch, todo: Sequence[Item], report: Path, index: FolderIndex | None) -> int:
-    """Process the items that are not finished, write their rows, and count failures."""
-    failures = 0
+def _results(
+    verb: str,
+    todo: Sequence[Item],
+    process: Callable[[Item], Outcome],
+    outputs_of: Callable[[Item], Sequence[Path]],
+    options: BatchOptions,
+    settings: Settings,
+    indexed: bool,
+) -> Generator[ItemResult]:
+    """Process items by the workers and yield their results in order; raise what concerns the whole run."""
     memory.collect_as_usual()
-    workers = workers_of(batch.settings, batch.options.jobs, batch.options.in_a_row)
+    workers = workers_of(settings, options.jobs, options.in_a_row)
     at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-    work = _Work(batch.process, index is not None, batch.settings.job_bytes(at_once))
+    work = _Work(process, indexed, settings.job_bytes(at_once))
     try:
         with closing(spread(work, todo, workers, _broken)) as results:
-            for result in _with_progress(results, len(todo), batch.verb, batch.settings):
+            for result in _with_progress(results, len(todo), verb, settings):
                 if result.stops_the_run is not None:
                     raise result.stops_the_run
-                if index and result.made:
-                    index.add(result.made, batch.outputs_of(result.item))
-                add_row(report, batch.verb, result)
-                failures += _print_result(result, batch.options)
+                yield result
     finally:
         if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
-            for folder in {path.parent for item in todo for path in batch.outputs_of(item)}:
+            for folder in {path.parent for item in todo for path in outputs_of(item)}:
                 sweep_leftovers(folder)
-    return failures
 
 
 def all_finished(
@@ -325,18 +288,6 @@ def sums_up(
 
 
 @dataclass(frozen=True)
-class _OfFile:
-    """`process` for items that are files."""
-
-    process: Callable[[Item], Outcome]
-
-    def __call__(self, item: Item) -> Outcome:
-        require_regular(item.input_path)
-        with all_or_none():
-            return self.process(item)
-
-
-@dataclass(frozen=True)
 class _Work:
     """Runs `process` on an item and returns an `ItemResult`, whatever happens."""
 
@@ -354,7 +305,10 @@ class _Work:
         try:
             can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
             read = read_row(item.input_path) if self.indexed and can_be_read else None
-            outcome = self.process(item)
+            if item.is_file:
+                require_regular(item.input_path)
+            with all_or_none() if item.is_file else nullcontext():
+                outcome = self.process(item)
             made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
             return result(outcome=outcome, made=made)
         except InputError as error:
@@ -402,28 +356,22 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
             empty.rmdir()
 
 
-def _say_what_is_skipped(reasons: Mapping[Item, str | None], options: BatchOptions) -> None:
-    """Log how many items are finished, and how many are made again for each reason."""
-    if finished := sum(reason is None for reason in reasons.values()):
-        advice = "" if options.overwrite == "never" else " from the same inputs and options"
-        log.info("%d of %d already finished%s", finished, len(reasons), advice)
-    _say_what_is_made_again(reasons)
-
-
-def _say_what_is_made_again(reasons: Mapping[Item, str | None]) -> None:
-    counts = Counter(filter(None, reasons.values()))
-    for reason, count in sorted(counts.items()):
+def _log_made_again(reasons: Counter[str]) -> None:
+    for reason, count in sorted(reasons.items()):
         log.info("%d made again: %s", count, reason)
 
 
 def _list_what_would_be_done(
-    todo: list[Item], finished: list[Item], outputs_of: Callable[[Item], Sequence[Path]]
+    todo: Sequence[Item], finished: Sequence[Item], outputs_of: Callable[[Item], Sequence[Path]]
 ) -> int:
     for item in todo:
         for path in outputs_of(item):
             print_path(f"{item.input_path} -> {path}")
     log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
-    return 0
+    missing = [item for item in (*todo, *finished) if item.is_file and not os.path.exists(item.input_path)]
+    for item in missing:
+        log.error("%s: no such file; check the path", item.input_path)
+    return int(bool(missing))
 
 
 def _print_result(result: ItemResult, options: BatchOptions) -> int:

@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.made_from import OneRecipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.cli.options import (
     LIGHT,
     DryRunOption,
@@ -155,7 +155,8 @@ def convert_light(
     convert = ConvertLight(forms, from_axes, width, order, lights, signed)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
-    code = run_batch(
-        "convert-light", inputs, convert, convert.outputs_of, options, settings, OneRecipe(convert), _SUFFIXES
+    items = collect_items(inputs, output, _SUFFIXES, null_separated=settings.null_separated)
+    code = run_items(
+        "convert-light", items, convert, convert.outputs_of, options, settings, OneRecipe(convert)
     )
     raise typer.Exit(code)

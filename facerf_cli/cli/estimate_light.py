@@ -10,7 +10,7 @@ import typer
 from facerf_cli.baselines import Kind
 from facerf_cli.batch.inputs import Item, file_pattern
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, run_files
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, RefineOption
 from facerf_cli.cli.options import (
@@ -204,7 +204,7 @@ def estimate_light(
         )
     work = EstimateLight(how, width, sh_order, shots)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_files(
+    code = run_items(
         "estimate-light",
         whole_shots(items, shots),
         work,

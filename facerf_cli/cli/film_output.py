@@ -11,7 +11,7 @@ import typer
 
 from facerf_cli.batch.inputs import FILM_SUFFIXES, Item
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, RecipesOf
-from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, run_files
+from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, run_items
 from facerf_cli.batch.settings import Overwrite, Settings
 from facerf_cli.cli.options import IMAGE, folder_not_file
 from facerf_cli.cli.output_options import Format
@@ -152,7 +152,7 @@ def run_to_film(
     index = FolderIndex(options.output, "relight", settings.shard, work.recipes_of)
     if not all_finished(items, work.outputs_of, options, settings, index):
         work = work.readable(dry_run=False)
-    code = run_files("relight", items, work, work.outputs_of, options, settings, work.recipes_of)
+    code = run_items("relight", items, work, work.outputs_of, options, settings, work.recipes_of)
     if code or not all(path.exists() for path in images):
         log.error("%s: not written, since frames failed; the others stay in %s", film.path, film.folder)
         return 1

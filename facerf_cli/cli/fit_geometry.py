@@ -5,9 +5,9 @@ from pathlib import Path
 
 import typer
 
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, collect_items, file_pattern
 from facerf_cli.batch.made_from import OneRecipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.cli.options import (
     DryRunOption,
     FaceModelOption,
@@ -96,15 +96,17 @@ def fit_geometry(
     photo.check()
     work = FitGeometry(photo)
     options = BatchOptions(output, overwrite, dry_run, jobs)
-    code = run_batch(
+    items = collect_items(
+        inputs, output, pattern=file_pattern(name), null_separated=photo.settings.null_separated
+    )
+    code = run_items(
         "fit-geometry",
-        inputs,
+        items,
         work,
         work.outputs_of,
         options,
         photo.settings,
         OneRecipe(work),
         prepare=photo.preparation(dry_run, FITTING),
-        name=name,
     )
     raise typer.Exit(code)

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, collect_items, file_pattern
 from facerf_cli.batch.made_from import OneRecipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.cli.options import (
     IMAGE,
     LIGHT,
@@ -171,15 +171,15 @@ def predict_olat(
     work = PredictOlat(photo, lights, pose, chosen, size, network_alone, precision, format_, page)
     options = BatchOptions(output, overwrite, dry_run, jobs)
     kinds = ["portrait" if page or chosen == "photo" else "field"]
-    code = run_batch(
+    items = collect_items(inputs, output, pattern=file_pattern(name), null_separated=settings.null_separated)
+    code = run_items(
         "predict-olat",
-        inputs,
+        items,
         work,
         work.outputs_of,
         options,
         settings,
         OneRecipe(work),
         prepare=photo.preparation(dry_run, networks_of(kinds)),
-        name=name,
     )
     raise typer.Exit(code)

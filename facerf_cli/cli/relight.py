@@ -13,7 +13,7 @@ import typer
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items
 from facerf_cli.batch.made_from import FolderIndex
-from facerf_cli.batch.run import BatchOptions, all_finished, print_path, run_files
+from facerf_cli.batch.run import BatchOptions, all_finished, print_path, run_items
 from facerf_cli.cli.backgrounds import parse_aov, parse_background
 from facerf_cli.cli.film_output import FilmOrFolderOption, FpsOption, film_output, run_to_film
 from facerf_cli.cli.light_options import LightOptions, for_other_photos
@@ -349,7 +349,7 @@ def relight(
     if not finished:
         usable = work.readable(dry_run)
         index.want(usable.recipes_of)
-    code = run_files(
+    code = run_items(
         "relight", items, usable, usable.outputs_of, options, settings, usable.recipes_of, index=index
     )
     if ball and not dry_run and settings.shard.number == 1:

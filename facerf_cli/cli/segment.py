@@ -7,7 +7,7 @@ import typer
 
 from facerf_cli.batch.inputs import Item, file_pattern
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, run_files
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.cli.options import (
     DryRunOption,
@@ -98,7 +98,7 @@ def segment(
         photo.preparation(dry_run, ("parsing",))()
         follow_all(shots, photo, dry_run)
 
-    code = run_files(
+    code = run_items(
         "segment", items, work, work.outputs_of, options, photo.settings, work.recipes_of, prepare
     )
     raise typer.Exit(code)

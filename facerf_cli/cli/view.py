@@ -8,7 +8,7 @@ import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.batch.made_from import OneRecipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_files, sums_up
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.cli.options import (
     IMAGE,
     DryRunOption,
@@ -111,7 +111,7 @@ def view(
         raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
     options = BatchOptions(folder, overwrite, dry_run, jobs)
     prepare = photo.preparation(dry_run, networks_of(["portrait"]))
-    code = run_files("view", items, work, work.outputs_of, options, photo.settings, OneRecipe(work), prepare)
+    code = run_items("view", items, work, work.outputs_of, options, photo.settings, OneRecipe(work), prepare)
     if not one and not dry_run and sums_up(items, work.outputs_of, options, photo.settings):
         from facerf_cli.work.view_photos import write_index
 

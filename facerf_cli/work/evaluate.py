@@ -102,7 +102,7 @@ def run_protocol(
             f"{options.output}: {len(other)} items ({other[0].name}, ...) were evaluated with other options, "
             "another checkpoint or other inputs; leave out --overwrite never, or give another folder"
         )
-    code = run_items(verb, items, work, work.outputs_of, batch, settings, begin, recipes)
+    code = run_items(verb, items, work, work.outputs_of, batch, settings, recipes, begin)
     if code:
         log.error("no summary is written while images are missing; finished items are kept, so run it again")
     elif not options.dry_run and sums_up(items, work.outputs_of, batch, settings):

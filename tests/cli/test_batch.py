@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.made_from import Recipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
@@ -43,7 +43,8 @@ def run(inputs: list[Path | str], output: Path, recipe: Recipe | None = None, **
     configure_logging()
     texts = [str(entry) for entry in inputs]
     chosen = BatchOptions(output, **options)  # type: ignore[arg-type]
-    return run_batch("copy", texts, copy, outputs_of, chosen, Settings(), lambda digest_of: [recipe or {}])
+    items = collect_items(texts, output)
+    return run_items("copy", items, copy, outputs_of, chosen, Settings(), lambda digest_of: [recipe or {}])
 
 
 def rows(output: Path) -> dict[str, dict]:
@@ -165,7 +166,8 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 SLOW_VERB = """
 import sys, time
 from pathlib import Path
-from facerf_cli.batch.run import BatchOptions, run_batch
+from facerf_cli.batch.inputs import collect_items
+from facerf_cli.batch.run import BatchOptions, run_items
 from facerf_cli.batch.run import Outcome
 from facerf_cli.cli.options import Settings
 from facerf_cli.batch.made_from import Recipe
@@ -184,7 +186,8 @@ def slow(item):
 
 if __name__ == "__main__":
     options = BatchOptions(Path(sys.argv[2]), jobs=int(sys.argv[3]))
-    run_batch("slow", [sys.argv[1]], slow, outputs_of, options, Settings(), lambda digest_of: [{}])
+    items = collect_items([sys.argv[1]], Path(sys.argv[2]))
+    run_items("slow", items, slow, outputs_of, options, Settings(), lambda digest_of: [{}])
 """
 
 

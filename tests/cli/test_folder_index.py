@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.batch import made_from as folder_index
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.made_from import differences, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
@@ -116,7 +116,8 @@ def test_only_stale_outputs_are_made(photos: Path, tmp_path: Path, capsys: pytes
     def call() -> int:
         recipes = [{"light": light} for light in lights]
         options, settings = BatchOptions(out), Settings()
-        return run_batch("copy", [str(photos)], write, files, options, settings, lambda digest_of: recipes)
+        items = collect_items([str(photos)], out)
+        return run_items("copy", items, write, files, options, settings, lambda digest_of: recipes)
 
     assert call() == 0
     (out / "a_a.bin").write_bytes(b"retouched")
@@ -182,7 +183,8 @@ def test_shards_know_what_the_others_made(
 ) -> None:
     for number in (1, 2):
         settings, options = Settings(shard=Shard(number, 2)), BatchOptions(tmp_path / "out")
-        run_batch("copy", [str(photos)], copy, outputs_of, options, settings, lambda digest_of: [{}])
+        items = collect_items([str(photos)], tmp_path / "out")
+        run_items("copy", items, copy, outputs_of, options, settings, lambda digest_of: [{}])
     assert made(capsys) == ["a", "b"]
     run([photos], tmp_path / "out")
     assert made(capsys) == []
@@ -208,8 +210,8 @@ def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path:
         (out / "other" / "b_copy.bin").write_bytes(b"b")
         raise InputError(f"{item.input_path}: is bad")
 
-    given = [str(tmp_path / "a.png")]
-    run_batch("copy", given, fail, outputs_of, BatchOptions(out), Settings(), lambda digest_of: [{}])
+    given = collect_items([str(tmp_path / "a.png")], out)
+    run_items("copy", given, fail, outputs_of, BatchOptions(out), Settings(), lambda digest_of: [{}])
     assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 

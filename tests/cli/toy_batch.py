@@ -9,8 +9,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, Outcome, run_batch
+from facerf_cli.batch.inputs import Item, collect_items
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
@@ -68,9 +68,8 @@ def run(
     """Copy PHOTOS to OUTPUT; notes go to the folder above."""
     settings = Settings(shard=shard or Shard(), ray=ray)
     batch = BatchOptions(output, **options)  # type: ignore[arg-type]
-    return run_batch(
-        "copy", [str(photos)], Copy(output.parent), outputs_of, batch, settings, lambda digest_of: [{}]
-    )
+    items = collect_items([str(photos)], output)
+    return run_items("copy", items, Copy(output.parent), outputs_of, batch, settings, lambda digest_of: [{}])
 
 
 if __name__ == "__main__":
