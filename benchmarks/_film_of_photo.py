@@ -7,7 +7,7 @@ from skimage.transform import SimilarityTransform, warp
 
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
-from facerf_cli.image.resample import fitted, resized
+from facerf_cli.image.strips import fitted, resized
 
 SIDE_PX = 512  # of the longer side of a photo
 NOISE = 0.006  # standard deviation, display values: 1.5 of 255

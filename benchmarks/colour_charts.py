@@ -31,8 +31,8 @@ from facerf_cli.capture.chart import (
     squares_px,
 )
 from facerf_cli.capture.chart_photo import find_chart, outline_patches
-from facerf_cli.files.drawings import contact_sheet
 from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.sheets import contact_sheet
 
 sys.path.insert(0, str(ROOT))  # the renderer of charts is the tests'
 from tests.capture.chart_image import background, chart_image

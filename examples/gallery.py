@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.image.resample import fitted, resized
+from facerf_cli.image.strips import fitted, resized
 from facerf_cli.main import main
 
 HERE = Path(__file__).parent

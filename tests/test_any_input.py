@@ -27,7 +27,7 @@ from facerf_cli.files.light_files import (
     write_light,
     write_numbers,
 )
-from facerf_cli.files.toml_files import read_rig
+from facerf_cli.files.texts import read_rig
 from facerf_cli.run.logs import escaped, json_line, shown
 
 # The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.

@@ -1,4 +1,7 @@
-"""The inputs of a command line as a sorted list of items, each with its place in the output folder."""
+"""The inputs of a command line as a sorted list of items, each with its place in the output folder.
+
+Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an input fills.
+"""
 
 import os
 import re
@@ -16,6 +19,16 @@ OF_IMAGES = (*OF_PHOTOS, "light", "frame")
 _SEPARATORS = "._-"  # one of these before an empty field goes with it
 _WIDTH = re.compile(r"0?[1-9]?")
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)", re.DOTALL)  # a name, and the frame numbers that it ends in
+PHOTO_SUFFIXES = frozenset(
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
+    | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
+)
+FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
+_STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
+_FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
+_NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
+_MOST_FRAMES = 100_000
+_LONGEST_PATH = 4096  # characters
 
 
 def split_frame(name: str) -> tuple[str, str]:
@@ -78,20 +91,6 @@ def fields_of(path: Path, mirrored: PurePosixPath) -> dict[str, str]:
         "ext": path.suffix[1:].lower(),
         "frame": frame.rpartition(".")[2],
     }
-
-
-PHOTO_SUFFIXES = frozenset(
-    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
-    | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
-)
-FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
-_STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
-
-
-_FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
-_NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
-_MOST_FRAMES = 100_000
-_LONGEST_PATH = 4096  # characters
 
 
 @dataclass(frozen=True, order=True)

@@ -1,4 +1,6 @@
-"""The index of an output folder: what each output was made from, so that only stale ones are made again.
+"""What each output was made from, so that only stale ones are made again: recipes, and a folder's index.
+
+A recipe is all that shapes an output beside its input.
 
 `.facerf-index.jsonl` holds three kinds of rows: files that were read (size, time, inode and SHA-256, so that
 an unchanged file is not read again), recipes, and outputs (their recipe, input and SHA-256). The last
@@ -20,9 +22,7 @@ from typing import Any
 from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.downloads import file_sha256
-from facerf_cli.files.json_reader import parse_json
-from facerf_cli.files.regular import is_regular, regular_size, require_regular
+from facerf_cli.files.texts import file_sha256, is_regular, parse_json, regular_size, require_regular
 from facerf_cli.run.logs import json_line
 
 RESULTS_VERSION = 10  # raised where the same recipe gives other pixels
@@ -52,6 +52,8 @@ _OPTIONS = {
 Recipe = dict[str, Any]  # names and JSON values
 DigestOf = Callable[[Path], str]  # SHA-256 of a file
 RecipesOf = Callable[[DigestOf], Sequence[Recipe]]  # of each output of an item, or one for all of them
+_INDEXES = ".facerf-index*.jsonl"
+Row = dict[str, Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,10 +133,6 @@ def _of_folder(path: Path, digest_of: DigestOf) -> str:
 
 def _content(files: Iterable[Path], digest_of: DigestOf) -> str:
     return "sha256:" + " ".join(digest_of(path)[:16] for path in files)
-
-
-_INDEXES = ".facerf-index*.jsonl"
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -21,16 +21,15 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, read_row
 from facerf_cli.batch.settings import Overwrite, Settings, Shard, workers_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import all_or_none, atomic_path, sweep_leftovers
-from facerf_cli.files.folder_lock import alone_in
-from facerf_cli.files.json_reader import parse_json
-from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
+from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import process_died, spread
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,6 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
         ],
     }
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
-
-
-log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)

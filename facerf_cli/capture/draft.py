@@ -25,7 +25,7 @@ from facerf_cli.capture.stage_json import STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
-from facerf_cli.files.regular import read_text
+from facerf_cli.files.texts import read_text
 from facerf_cli.image.colour import LINEAR, find_space
 from facerf_cli.run.logs import counted
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.toml_files import read_toml
+from facerf_cli.files.texts import read_toml
 
 GLOBAL = "global"  # the table of options before the verb
 _LIMIT_BYTES = 1 << 20

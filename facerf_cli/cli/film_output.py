@@ -82,7 +82,7 @@ class FilmOutput:
         import json
         from functools import cache
 
-        from facerf_cli.files.downloads import file_sha256
+        from facerf_cli.files.texts import file_sha256
 
         digest_of = cache(file_sha256)
         made_from = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
@@ -90,7 +90,7 @@ class FilmOutput:
 
     def is_finished(self, key: str, overwrite: Overwrite) -> bool:
         """True if the film is there and need not be made again: its metadata say what it was made from."""
-        from facerf_cli.files.film_writer import comment_of
+        from facerf_cli.files.film import comment_of
 
         if overwrite == "always" or not self.path.is_file():
             return False
@@ -98,7 +98,7 @@ class FilmOutput:
 
     def join(self, images: Sequence[Path], shots: Sequence[Shot], key: str) -> None:
         """Write the film from its frames, in order, and remove them."""
-        from facerf_cli.files.film_writer import Timing, film_timing, write_film
+        from facerf_cli.files.film import Timing, film_timing, write_film
         from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None

@@ -9,7 +9,7 @@ from pathlib import Path
 from facerf_cli.cli.light_keys import GivenLight, light_by_keys, read_keys
 from facerf_cli.cli.values import azel
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.toml_files import read_rig
+from facerf_cli.files.texts import read_rig
 from facerf_cli.light.studio import StudioLight
 
 _FORMS = ("AZ,EL", "AZ,EL,R,G,B")

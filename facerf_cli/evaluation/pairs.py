@@ -20,7 +20,7 @@ from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.files.image_metadata import oiio_error, utf8_path
 from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
-from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.files.texts import is_regular, require_regular
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import find_faces
 

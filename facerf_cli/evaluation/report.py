@@ -18,7 +18,7 @@ from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST
 from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, metric_named, published_for
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, read_document
-from facerf_cli.files.pages import filled_page
+from facerf_cli.files.sheets import filled_page
 from facerf_cli.run.logs import json_line
 
 Format = Literal["facerf-evaluation-3"]

@@ -30,7 +30,7 @@ from facerf_cli.face.gauss_newton import (
 from facerf_cli.face.morphable import BUILTIN, NPZ_ERRORS, MorphableModel, check_npz_sizes
 from facerf_cli.face.silhouette import CONTOUR_RAYS, NOSE, POINTS_PER_RAY
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.texts import require_regular
 from facerf_cli.raster.camera import Camera, project
 
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # the largest mean landmark errors of a good and of a fair fit

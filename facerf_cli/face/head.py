@@ -11,7 +11,7 @@ from facerf_cli.face.crop import GIVE_LANDMARKS
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.image.resample import fitted, resized
+from facerf_cli.image.strips import fitted, resized
 from facerf_cli.raster.texture import inpaint, normal_map, unwrap
 
 _INSIDE_PHOTO = 0.99  # share of a texel's pixels that lie inside the photo, from which on it is visible

@@ -7,8 +7,7 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_landmarks
 from facerf_cli.files.documents import Document, Points68, checked
-from facerf_cli.files.json_reader import read_json
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.texts import read_json, require_regular
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import strips
 

@@ -1,18 +1,24 @@
-"""Atomic writes: an output is written into a hidden folder beside it, made durable, and renamed.
+"""Atomic writes, and one run at a time in an output folder.
 
+An output is written into a hidden folder beside it, made durable, and renamed.
 The hidden folder belongs to this process alone: its name is random and `mkdir` refuses a name that exists, so
 no link that another user has put there is followed. A power cut leaves the old output or the new one: the
 data is on the disk before the rename, and the rename before the next step (Pillai et al., 'All File Systems
 Are Not Created Equal', OSDI 2014).
+
+A run holds the lock of its output folder; the next one waits, and then finds what the first has made. The
+lock is the system's (`flock`), so that it ends with its process, however that ends.
 """
 
 import atexit
 import errno
 import hashlib
+import logging
 import os
 import platform
 import secrets
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,18 +26,19 @@ from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
+from facerf_cli.run.logs import LOGGER_NAME, shown
 from facerf_cli.run.stopping import clean_by, end_again
 
-_ABANDONED_S = (
-    24 * 3600
-)  # another machine's temporary folder counts as abandoned after so long without a write
+if sys.platform != "win32":
+    import fcntl
+
+_ABANDONED_S = 24 * 3600  # without a write: then another machine's temporary folder counts as abandoned
 _MARK = ".part-"
-_LONGEST_STEM = (
-    40  # characters of a name, of up to 4 bytes, that its temporary folder repeats; names end at 255
-)
+_LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, that its temporary folder repeats
 _open: set[Path] = set()  # temporary folders of this process
 _watched: list[list[Path]] = []  # what was written since each `all_or_none` began
 _swept: set[Path] = set()  # folders whose leftovers this process has removed
+log = logging.getLogger(LOGGER_NAME)
 
 
 @contextmanager
@@ -184,3 +191,61 @@ def _sync_folder(folder: Path) -> None:
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.EACCES, errno.EBADF, errno.ENOTSUP, errno.EISDIR):
             raise
+
+
+@contextmanager
+def alone_in(folder: Path, name: str) -> Iterator[None]:
+    """Hold the lock `name` of a folder, which is created; wait for a process that holds it, and say so.
+
+    Folders that were created and are empty in the end are removed. Where the file system has no locks, as on
+    Windows, nothing is held. Raises OSError where the folder cannot be written to.
+    """
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
+    lock = folder / name
+    descriptor = _taken(lock)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
+        os.close(descriptor)
+        with suppress(OSError):
+            for path in created:
+                path.rmdir()
+
+
+def _taken(lock: Path) -> int:
+    """Open and lock the file; again where its last owner has removed it meanwhile."""
+    while True:
+        lock.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+        try:
+            _wait_for(descriptor, lock)
+            if _is_at(descriptor, lock):
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, str(os.getpid()).encode())
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def _wait_for(descriptor: int, lock: Path) -> None:
+    if sys.platform == "win32":
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        owner = shown(os.pread(descriptor, 20, 0).decode(errors="replace"))
+        wait = "%s: another facerf (process %s) writes there; waiting for it (--jobs and --shard share work)"
+        log.warning(wait, lock.parent, owner)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    except OSError:  # this file system has no locks
+        pass
+
+
+def _is_at(descriptor: int, lock: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), os.stat(lock, follow_symlinks=False))
+    except FileNotFoundError:
+        return False

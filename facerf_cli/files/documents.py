@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.json_reader import LIMIT_BYTES, read_json
+from facerf_cli.files.texts import LIMIT_BYTES, read_json
 
 # Names become parts of paths: no separators, no hidden files, no way out of a folder.
 _NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")

@@ -3,7 +3,6 @@
 By hand, since no small library resumes, bounds the size and locks against a second process.
 """
 
-import hashlib
 import http.client
 import logging
 import os
@@ -24,6 +23,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, one_line
 
 if sys.platform != "win32":
@@ -36,12 +36,6 @@ _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")  # where http is safe
 _NO_NETWORK = (URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError)
 
 log = logging.getLogger(LOGGER_NAME)
-
-
-def file_sha256(path: Path) -> str:
-    """Return a file's SHA-256 as 64 hex digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""HEIC and HEIF photos, as phones store them; decoded by pi-heif, an extra (`facerf[heic]`)."""
+"""HEIC and HEIF photos, as phones store them; decoded by pi-heif, an extra (`facerf[heic]`).
+
+Some damaged files crash pi-heif, so it runs in a process of its own (`files/apart.py`).
+"""
 
 import importlib.util
 from pathlib import Path
@@ -8,14 +11,36 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.apart import arrays_apart
-from facerf_cli.files.heif_arrays import CODES, PIXELS, PROFILE, SIZE
 from facerf_cli.run import memory
 
 HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
-_READERS = "facerf_cli.files.heif_arrays"  # in a process of their own
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 # Colour spaces by the code points of primaries and transfer function (ITU-T H.273), where no ICC profile is.
 _SPACES = {(1, 13): "sRGB", (1, 1): "sRGB", (12, 13): "Display P3", (2, 2): "sRGB"}
+PIXELS, PROFILE, CODES, SIZE = "pixels", "profile", "codes", "size"
+
+
+def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray]:
+    """The main image, upright, [H, W, C] uint8 or uint16, and its ICC profile or its colour's code points.
+
+    Of an image of more than `most_px` pixels only the size (W, H); over `limit_px` is a ValueError.
+    """
+    import pi_heif
+
+    image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
+    width, height = image.size
+    if width * height > limit_px:
+        most = f"at most {limit_px / 1e6:.0f} megapixels are read"
+        raise ValueError(f"{width} x {height} pixels; {most}, so make it smaller")
+    if width * height > most_px:
+        return {SIZE: np.array([width, height])}
+    pixels = np.array(image)  # a copy: the memory of pi-heif ends with its image
+    arrays = {PIXELS: pixels.reshape(height, width, -1)}
+    if profile := image.info.get("icc_profile"):
+        arrays[PROFILE] = np.frombuffer(profile, np.uint8)
+    elif code := image.info.get("nclx_profile"):
+        arrays[CODES] = np.array([code["color_primaries"], code["transfer_characteristics"]])
+    return arrays
 
 
 def is_heif(path: Path) -> bool:
@@ -35,7 +60,7 @@ def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[
             f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
         )
     try:
-        arrays = arrays_apart(_READERS, "heif_arrays", path, limit_px, memory.left_bytes() // bytes_px)
+        arrays = arrays_apart(__name__, "heif_arrays", path, limit_px, memory.left_bytes() // bytes_px)
     except ValueError as error:
         raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
     if SIZE in arrays:

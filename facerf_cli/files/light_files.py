@@ -22,7 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.texts import require_regular
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION

@@ -25,8 +25,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
 from facerf_cli.files.images import HALF_MAX
-from facerf_cli.files.json_reader import parse_json
-from facerf_cli.files.regular import is_regular, require_regular
+from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line

@@ -1,4 +1,4 @@
-"""Images in strips of rows, so that what is computed from a large photo takes little memory at a time."""
+"""Images at another size, and in strips of rows, so that what is computed from a large photo takes little memory at a time."""
 
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -99,3 +99,28 @@ def between(at: np.ndarray, small: int, large: int) -> tuple[np.ndarray, np.ndar
     place = ((at + 0.5) * (small / large) - 0.5).clip(0, small - 1)
     first = place.astype(np.int64)
     return first, (first + 1).clip(max=small - 1), (place - first).astype(np.float32)
+
+
+def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """An image [H, W, C] or [H, W] at another size, smoothed where it becomes smaller."""
+    planes = torch.from_numpy(np.ascontiguousarray(image, np.float32))
+    planes = planes[None] if planes.ndim == 2 else planes.permute(2, 0, 1)
+    sized = F.interpolate(planes[None], (height, width), mode="bilinear", align_corners=False, antialias=True)
+    plain = sized[0].permute(1, 2, 0).numpy()
+    return np.ascontiguousarray(plain[..., 0] if image.ndim == 2 else plain)
+
+
+def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Band:
+    """`resized`, by rows; those of a larger image are computed as they are asked for."""
+    if size[0] < image.shape[0] or size[1] < image.shape[1]:
+        small = resized(image, *size)
+        return lambda rows: small[rows]
+    maps = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+    rest = (size[1], *image.shape[2:])
+    return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *rest)
+
+
+def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:
+    """The size of a frame whose longer side is `most_px` at most."""
+    scale = min(1.0, most_px / max(height, width))
+    return max(1, round(height * scale)), max(1, round(width * scale))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.texts import parse_json
 
 FORMAT = "facerf-checkpoint-1"
 BEST = "best.safetensors"  # in a run's folder

@@ -13,7 +13,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import LightNetwork

@@ -21,8 +21,7 @@ from facerf_cli.image.colour import (
     luminance,
     srgb_to_linear,
 )
-from facerf_cli.image.resample import fitted, resized
-from facerf_cli.image.strips import whole
+from facerf_cli.image.strips import fitted, resized, whole
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import composition_of, relit_by
 from facerf_cli.portrait.classes import class_index

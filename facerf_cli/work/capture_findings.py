@@ -22,7 +22,7 @@ from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, stopping
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.json_reader import parse_json
+from facerf_cli.files.texts import parse_json
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, counted, json_line, one_line
 from facerf_cli.run.workers import one_thread, process_died, spread
 

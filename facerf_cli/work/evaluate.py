@@ -36,9 +36,9 @@ from facerf_cli.evaluation.strips import Strip, StripKeeper, strip_of
 from facerf_cli.evaluation.summary import Layout, print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
-from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.image_metadata import embed_xmp
 from facerf_cli.files.images import write_exr
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import checkpoint_file, serving_files
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
 from facerf_cli.work.evaluation_settings import EvaluateOptions

@@ -57,6 +57,9 @@ from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.run.workers import one_thread, process_died, spread
 from facerf_cli.synth.sky.skies import parse_envmaps
+from facerf_cli.files.texts import file_sha256
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.workers import one_thread
 from facerf_cli.work.capture_findings import (
     CheckOnly,
     check_all,

@@ -26,7 +26,7 @@ from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.image.colour import ExposureRule, most_exposure_ev
 from facerf_cli.image.strips import Band, Layer, filled
-from facerf_cli.light.backdrop import backdrop
+from facerf_cli.light.envmap import backdrop
 from facerf_cli.pipeline import composition_of, reflectance_of, relit_by
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Relit, Target

@@ -18,10 +18,10 @@ from facerf_cli.face.fit import FaceFit, fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.drawings import contact_sheet, mark_light
 from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
+from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.image.colour import (
     SOFT_VIEW,
     ExposureRule,
@@ -29,8 +29,7 @@ from facerf_cli.image.colour import (
     auto_exposure_ev,
     encode_display,
 )
-from facerf_cli.image.resample import resized, resized_rows
-from facerf_cli.image.strips import Band, Layer, filled, whole
+from facerf_cli.image.strips import Band, Layer, filled, resized, resized_rows, whole
 from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.composition import Relit, Target

@@ -17,7 +17,7 @@ from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.image.resample import fitted, resized
+from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.pipeline import composition_of, reflectance_of
 from facerf_cli.relighting.models import Models

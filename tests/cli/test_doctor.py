@@ -10,7 +10,7 @@ from safetensors.numpy import save_file
 
 from facerf_cli._version import __version__
 from facerf_cli.cli.doctor import EXTRAS, MISSING
-from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.work import doctor_facts as doctor
 

@@ -14,7 +14,7 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
-from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from tests.cli.test_batch import copy, outputs_of, rows, run
 

@@ -8,8 +8,8 @@ from safetensors.torch import load_file, save_file
 
 from facerf_cli.cli.train import TrainOptions
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.downloads import file_sha256
 from facerf_cli.files.images import read_image
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.features import VggFeatures

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.film import Film, film_facts
-from facerf_cli.files.film_writer import Timing, comment_of, film_timing, write_film
+from facerf_cli.files.film import Film, Timing, comment_of, film_facts, film_timing, write_film
 from facerf_cli.files.images import write_display
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")

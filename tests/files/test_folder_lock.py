@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.files.folder_lock import alone_in
+from facerf_cli.files.atomic import alone_in
 from tests.processes import wait_until
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 HOLDER = """
 import sys, time
 from pathlib import Path
-from facerf_cli.files.folder_lock import alone_in
+from facerf_cli.files.atomic import alone_in
 with alone_in(Path(sys.argv[1]), ".lock"):
     Path(sys.argv[2], "held").touch()
     while not Path(sys.argv[2], "go").exists():

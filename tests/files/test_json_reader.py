@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import json_reader
+from facerf_cli.files import texts as json_reader
 from facerf_cli.files.documents import Document, Name, checked, distinct
-from facerf_cli.files.json_reader import parse_json, read_json
+from facerf_cli.files.texts import parse_json, read_json
 
 
 def test_a_document_within_the_limits_is_read_as_it_stands() -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.toml_files import MOST_RIG_LIGHTS, read_rig
+from facerf_cli.files.texts import MOST_RIG_LIGHTS, read_rig
 
 
 def test_values_become_the_text_of_an_option(tmp_path: Path) -> None:

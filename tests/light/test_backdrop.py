@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from facerf_cli.image.strips import whole
-from facerf_cli.light.backdrop import backdrop
+from facerf_cli.light.envmap import backdrop
 from facerf_cli.light.sphere import direction_to_uv
 from facerf_cli.raster.camera import Camera, pixel_centres_px, pixel_rays, rays_of_rows
 

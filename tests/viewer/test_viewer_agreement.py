@@ -10,7 +10,7 @@ import torch
 from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_display, most_exposure_ev
-from facerf_cli.image.resample import resized
+from facerf_cli.image.strips import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.image.resample import fitted, resized
+from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import golden_spiral, rig_directions
 from facerf_cli.viewer.basis import Basis, basis_of_stack, evenly_spread
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_jpeg, strip_of

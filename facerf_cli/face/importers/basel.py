@@ -25,8 +25,7 @@ from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face.importers.basel_arrays import CELLS, LANDMARKS, MAX_SHAPES
 from facerf_cli.face.importers.source import SourceModel, require_mesh
 from facerf_cli.files.apart import arrays_apart
-from facerf_cli.files.json_reader import parse_json
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.texts import parse_json, require_regular
 from facerf_cli.run.logs import one_line
 
 _READERS = "facerf_cli.face.importers.basel_arrays"  # in a process of their own

@@ -11,7 +11,7 @@ from facerf_cli.face.importers.ict import read_ict_facekit
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.files.regular import require_regular
+from facerf_cli.files.texts import require_regular
 from facerf_cli.run.logs import one_line
 
 _MAX_LETTERS = 10_000  # of a list of vertex numbers

@@ -1,9 +1,12 @@
-"""Overviews for people: contact sheets of images, and labels."""
+"""Overviews for people: contact sheets of images, labels, and HTML pages."""
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from PIL import Image, ImageDraw
 
 _GAP_PX = 2  # black, between tiles
@@ -44,3 +47,16 @@ def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> No
     distance = np.hypot(x - 0.7 * direction[0], y - 0.7 * direction[1])
     corner[np.hypot(x, y) < 1] = 0.08 * brightness
     corner[(distance < 0.28) & ((direction[2] >= 0) | (distance > 0.14))] = brightness
+
+
+def filled_page(template: Path, **values: Any) -> str:
+    """Fill a template, which may include its neighbours; a value that is missing is an error."""
+    environment = Environment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template(template.name).render(**values)

@@ -1,0 +1,190 @@
+"""Files that other people wrote, read within limits: text, JSON, TOML and the rigs of lights in it.
+
+Only regular files are opened: a pipe or a device could be waited for without end. In JSON a key that occurs
+twice and a number that is not finite are errors. The module imports nothing heavy, since the index of a
+finished folder is read with it.
+"""
+
+import hashlib
+import json
+import math
+import os
+import stat
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from facerf_cli.errors import InputError
+
+LIMIT_BYTES = 64 << 20  # of a document
+_MOST_VALUES = 4_000_000  # takes about half a gigabyte
+_MOST_DEPTH = 64
+_LARGEST = 1 << 63  # magnitude of an integer; a longer one overflows where it meets an array
+_OPENING = (",", "[", "{")  # there are at most as many values as these, and one
+MOST_RIG_LIGHTS = 32
+_RIG_LIMIT_BYTES = 1 << 16
+
+Settings = dict[str, str]
+
+
+def is_regular(path: Path) -> bool:
+    """Return whether a path leads to a regular file; False for names that the system refuses."""
+    return regular_size(path) is not None
+
+
+def regular_size(path: Path) -> int | None:
+    """The bytes of a regular file; None for anything else, and for names that the system refuses."""
+    try:
+        state = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return state.st_size if stat.S_ISREG(state.st_mode) else None
+
+
+def require_regular(path: Path, advice: str = "check the path") -> None:
+    """Raise InputError unless a path leads to a regular file."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {advice}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
+    except ValueError:  # a null character
+        raise InputError(f"{str(path)!a}: no file can have this name; {advice}") from None
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path}: is a folder, not a file; {advice}")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")
+
+
+def read_text(path: Path, limit_bytes: int, advice: str) -> str:
+    """Read a regular text file of at most `limit_bytes`, in UTF-8; other bytes are replaced."""
+    require_regular(path, advice)
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(limit_bytes + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
+    if len(content) > limit_bytes:
+        raise InputError(f"{path}: too large, over {limit_bytes >> 20} MiB; {advice}")
+    return content.decode(errors="replace")
+
+
+def file_sha256(path: Path) -> str:
+    """Return a file's SHA-256 as 64 hex digits."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text in UTF-8; raises ValueError for anything else and beyond the limits."""
+    text = text.decode() if isinstance(text, bytes) else text
+    if sum(map(text.count, _OPENING)) >= _MOST_VALUES:
+        raise ValueError(f"more than {_MOST_VALUES} values")
+    try:
+        value = json.loads(text, parse_constant=_not_finite, object_pairs_hook=_unique_keys)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    _check(value)
+    return value
+
+
+def read_json(path: Path, missing: str, limit_bytes: int = LIMIT_BYTES) -> Any:
+    """Read a JSON file; `missing` says what to do if the file does not exist, or is none of ours."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            raise InputError(f"{path}: is no file; give a JSON file")
+        with path.open("rb") as stream:
+            content = stream.read(limit_bytes + 1)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file; {missing}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if len(content) > limit_bytes:
+        raise InputError(f"{path}: larger than {limit_bytes >> 20} MiB; {missing}")
+    try:
+        return parse_json(content)
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON ({error}); {missing}") from None
+
+
+def _check(value: Any) -> None:
+    """Raise ValueError for a deep value or a number that is too large, a level of the document at a time."""
+    level = [value]
+    for _ in range(_MOST_DEPTH):
+        if not all(_fits(entry) for entry in level if isinstance(entry, int | float)):
+            raise ValueError("a number in it is too large")
+        level = [
+            entry
+            for parent in level
+            if isinstance(parent, dict | list)
+            for entry in (parent.values() if isinstance(parent, dict) else parent)
+        ]
+        if not level:
+            return
+    raise ValueError(f"nested more than {_MOST_DEPTH} deep")
+
+
+def _fits(number: int | float) -> bool:
+    return abs(number) < _LARGEST if isinstance(number, int) else math.isfinite(number)
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise ValueError(f"{twice[:60]!r} occurs twice in an object")
+    return table
+
+
+def _not_finite(text: str) -> float:
+    raise ValueError(f"{text} is not a finite number")
+
+
+def read_toml(path: Path, limit_bytes: int, too_long: str, advice: str) -> dict[str, Any]:
+    """Read the tables of a TOML file.
+
+    Raises InputError, which says `too_long` of a file over the limit, and `advice` of one that is no TOML.
+    """
+    require_regular(path)
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(limit_bytes + 1)
+        if len(data) > limit_bytes:
+            raise InputError(f"{path}: {too_long}")
+        return tomllib.loads(data.decode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except (ValueError, RecursionError) as error:  # also of the decoding
+        raise InputError(f"{path}: not TOML ({error}); {advice}") from None
+
+
+def read_rig(path: Path) -> dict[str, Settings]:
+    """Read the settings of each light by its name, as the text that an option would have.
+
+    [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
+    """
+    too_long = f"more than {_RIG_LIMIT_BYTES} bytes; a rig file holds lights alone"
+    tables = read_toml(path, _RIG_LIMIT_BYTES, too_long, "see docs/lights.md")
+    if not 1 <= len(tables) <= MOST_RIG_LIGHTS:
+        raise InputError(f"{path}: {len(tables)} lights; give 1 to {MOST_RIG_LIGHTS}")
+    return {name: _settings(table, f"{path}: {name}") for name, table in tables.items()}
+
+
+def _settings(table: Any, where: str) -> Settings:
+    if not isinstance(table, dict):
+        raise InputError(f"{where}: not a light; write [NAME], and its keys below")
+    return {key: _text(value, f"{where}: {key}") for key, value in table.items()}
+
+
+def _text(value: Any, where: str) -> str:
+    parts = value if isinstance(value, list) else [value]
+    if isinstance(value, str):
+        return value
+    try:
+        if all(type(part) in (int, float) for part in parts):
+            return ",".join(f"{float(part)!r}" for part in parts)
+    except OverflowError:
+        pass
+    raise InputError(f"{where}: not a number; give numbers, lists of them, or text such as '0:360:24'")
