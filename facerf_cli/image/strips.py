@@ -1,4 +1,4 @@
-"""Images at another size, and in strips of rows, so that what is computed from a large photo takes little memory at a time."""
+"""Images at another size, and in strips of rows, so that a large photo takes little memory at a time."""
 
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
