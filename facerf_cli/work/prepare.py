@@ -11,12 +11,8 @@ import numpy as np
 from rich.progress import track
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.report import Outcome
-from facerf_cli.batch.run import BatchOptions, run_items, sums_up
-from facerf_cli.batch.settings import Settings, workers_of
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import Settings, workers_of
 from facerf_cli.capture.capture import Capture, ChartCorrection
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
@@ -52,14 +48,11 @@ from facerf_cli.face.joint_fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
-from facerf_cli.files.downloads import file_sha256
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.run.workers import one_thread, process_died, spread
 from facerf_cli.synth.sky.skies import parse_envmaps
-from facerf_cli.files.texts import file_sha256
-from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.run.workers import one_thread
 from facerf_cli.work.capture_findings import (
     CheckOnly,
     check_all,
