@@ -64,7 +64,7 @@ from facerf_cli.training.settings import Preset, Stage
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 
 _MAPS, _HEAPS = 60, 240  # backgrounds: surroundings, each seen from several sides, and heaps of shapes
-_TINY_WIDTHS, _TINY_BLOCKS = (8, 8, 12, 16), (0, 1, 1, 1)
+_TINY_U_WIDTHS, _TINY_BLOCKS = (8, 8, 12, 16), (0, 1, 1, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +107,7 @@ def parsing_objective(people: WholePeople, folder: Path, network: Any) -> Parsin
     settings = PortraitBankSettings(views=1, photos=1, side_px=96) if people.tiny else PortraitBankSettings()
     add_portraits(folder, people.models, people.indices, people.jobs, people.seed, settings)
     stored = StoredPortraits(folder, people.backgrounds, provenance)
-    own = ParsingSettings(_TINY_WIDTHS, _TINY_BLOCKS, side=64) if people.tiny else ParsingSettings()
+    own = ParsingSettings(_TINY_U_WIDTHS, _TINY_BLOCKS, side=64) if people.tiny else ParsingSettings()
     objective = ParsingObjectiveSettings(held_out_people=people.held_out)
     return ParsingObjective(stored, network or ParsingNetwork(own), objective)
 
@@ -122,7 +122,7 @@ def stored_transport(people: WholePeople, folder: Path) -> StoredTransport:
 
 def portrait_objective(source: PortraitSource, held_out: int, tiny: bool, network: Any) -> PortraitObjective:
     """The stage portrait on people of a source, of whom at most `held_out` are held out."""
-    own = PortraitSettings(_TINY_WIDTHS, _TINY_BLOCKS) if tiny else PortraitSettings()
+    own = PortraitSettings(_TINY_U_WIDTHS, _TINY_BLOCKS) if tiny else PortraitSettings()
     settings = PortraitObjectiveSettings(held_out_people=held_out, targets=2 if tiny else 4)
     return PortraitObjective(source, network or PortraitNetwork(own), settings)
 
