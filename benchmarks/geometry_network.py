@@ -21,8 +21,7 @@ from torch import Tensor
 
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FitSettings, fit_batch, fit_problem
-from facerf_cli.face.fit_start import FitStart, better_start, start_states
+from facerf_cli.face.fit import FitSettings, FitStart, better_start, fit_batch, fit_problem, start_states
 from facerf_cli.face.gauss_newton import FitState, Problem, minimise, residuals, total_cost
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS

@@ -22,8 +22,7 @@ from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
-from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
-from facerf_cli.face.fit_start import FitStart
+from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light

@@ -20,12 +20,12 @@ from facerf_cli.capture.findings import Selection
 from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.drawings import draw_fit
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
 from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Name, read_document, write_document
 from facerf_cli.files.images import HALF_MAX, write_display

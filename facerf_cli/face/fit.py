@@ -7,7 +7,7 @@ alone constrain identity little and most of the surface not at all, so the prior
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks
-from facerf_cli.face.fit_start import FitStart, better_start, seeded_state, weak_perspective
 from facerf_cli.face.gauss_newton import (
     INNER_COUNT,
     FitBasis,
@@ -25,17 +24,28 @@ from facerf_cli.face.gauss_newton import (
     Problem,
     fit_points,
     minimise,
+    pose_from_landmarks,
     residuals,
+    total_cost,
+    weak_perspective,
 )
-from facerf_cli.face.morphable import BUILTIN, NPZ_ERRORS, MorphableModel, check_npz_sizes
-from facerf_cli.face.silhouette import CONTOUR_RAYS, NOSE, POINTS_PER_RAY
-from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, OUTER_EYE_CORNERS
+from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model, read_npz
+from facerf_cli.face.topology import (
+    CONTOUR,
+    CONTOUR_RAYS,
+    LANDMARKS_M,
+    NOSE,
+    OUTER_EYE_CORNERS,
+    POINTS_PER_RAY,
+)
 from facerf_cli.files.texts import require_regular
-from facerf_cli.raster.camera import Camera, project
+from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
 
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # the largest mean landmark errors of a good and of a fair fit
 IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
 _INVISIBLE_M = 1e-4  # a shape direction that moves every landmark by less at one deviation is left out
+_SEED_ROUNDS = 2
+_NOISE_M = 0.0003  # this distance of a seed's point costs as much as one standard deviation of a coordinate
 _BORDER = 0.01  # share of the crop's side: contour landmarks closer to the photo's border are guesses
 _LARGEST_CROP_PX = 8192
 _MOST_ARRAY_BYTES = 1 << 16  # of a fit in a file
@@ -100,6 +110,19 @@ class FaceFit:
             )
         vertices = model.vertices(self.alpha[None], self.beta[None])[0]
         return vertices @ self.rotation.mT + self.translation_m
+
+
+@dataclass(frozen=True)
+class FitStart:
+    """Heads of B faces to start from, in the space of the fit's camera; coefficients of the built-in model.
+
+    alpha and beta may have fewer coefficients than the model; the missing ones are zero.
+    """
+
+    rotation: Tensor  # [B, 3, 3] head_to_camera
+    translation_m: Tensor  # [B, 3]
+    alpha: Tensor  # [B, Ki]
+    beta: Tensor  # [B, Ke]
 
 
 @dataclass(frozen=True)
@@ -248,6 +271,82 @@ def _iod_px(landmarks_px: Tensor) -> Tensor:
     return (landmarks_px[:, left] - landmarks_px[:, right]).norm(dim=-1)
 
 
+def better_start(problem: Problem, begin: FitState, start: FitStart) -> FitState:
+    """Choose for each face the state of least cost among `begin` and the two of `start_states`.
+
+    Landmarks determine the pose better than a network does, and the network determines the shape better.
+    """
+    for state in start_states(problem, start):
+        cheaper = total_cost(problem, state) < total_cost(problem, begin)  # False for NaN
+        begin = state.where(cheaper & (state.translation_m[:, 2] < 0), begin)
+    return begin
+
+
+def start_states(problem: Problem, start: FitStart) -> tuple[FitState, FitState]:
+    """The state closest to `start`, and the same shape in the pose that the inner landmarks give."""
+    state, basis = seeded_state(problem.basis, start), problem.basis
+    offset = state.coordinates @ basis.modes[:INNER_COUNT].flatten(0, 1).mT
+    points = basis.mean[:INNER_COUNT] + offset.reshape(len(offset), INNER_COUNT, 3)
+    inner_px = problem.target_px[:, -INNER_COUNT:]
+    pose = pose_from_landmarks(points, inner_px, problem.camera, state.rotation, state.translation_m)
+    return state, FitState(*pose, state.coordinates)
+
+
+def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
+    """The state closest to `start` in the basis of any face model."""
+    wanted = _points_camera(start).nan_to_num()
+    rotation, translation = start.rotation.double().nan_to_num(), start.translation_m.double().nan_to_num()
+    by_parameters = torch.cat(
+        [-skew_matrix(basis.mean), torch.eye(3).expand(len(basis.mean), 3, 3), basis.modes], -1
+    )
+    flat = (by_parameters * _weights()[:, None, None]).flatten(0, 1)
+    prior = torch.ones(flat.shape[1], dtype=flat.dtype)
+    prior[:6] = 0
+    factor = torch.linalg.cholesky(flat.mT @ flat + prior.diag())
+    coordinates = torch.zeros(len(wanted), flat.shape[1] - 6, dtype=flat.dtype)
+    for _ in range(_SEED_ROUNDS):
+        points = basis.mean + (coordinates @ basis.modes.flatten(0, 1).mT).reshape(len(wanted), -1, 3)
+        off = (wanted - translation[:, None]) @ rotation - points  # head frame
+        right = (off * _weights()[:, None]).flatten(1) @ flat
+        right[:, 6:] -= coordinates
+        step = torch.cholesky_solve(right.mT, factor).mT
+        translation = translation + (rotation @ step[:, 3:6, None])[..., 0]
+        rotation = rotation @ so3_exp(step[:, :3])
+        coordinates = coordinates + step[:, 6:]
+    return FitState(rotation, translation, coordinates)
+
+
+@cache
+def _weights() -> Tensor:
+    """Weights [N] of the basis's points in 1 / m; all contour points together count as the inner ones do."""
+    corners, _ = fit_points()
+    weights = torch.full(
+        (len(corners),), (INNER_COUNT / (len(corners) - INNER_COUNT)) ** 0.5, dtype=torch.float64
+    )
+    weights[:INNER_COUNT] = 1
+    return weights / _NOISE_M
+
+
+def _points_camera(start: FitStart) -> Tensor:
+    """The points of `fit_points` [B, N, 3] on the start's heads, camera space, float64."""
+    mean, identity, expression = _builtin_points()
+    alpha, beta = start.alpha.double(), start.beta.double()
+    offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
+    offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
+    return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
+
+
+@cache
+def _builtin_points() -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of the built-in model at `fit_points`."""
+    model, (corners, weights) = load_face_model(), fit_points()
+    mean, identity, expression = (
+        (basis[..., corners, :].double() * weights[..., None].double()).sum(-2)
+        for basis in (model.mean, model.identity, model.expression)
+    )
+    return mean, identity, expression
+
+
 def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px: int) -> np.ndarray:
     """Trust [68] that leaves out the contour landmarks (crop's pixels) at or beyond the photo's border.
 
@@ -270,10 +369,8 @@ def load_fit(path: Path) -> FaceFit:
     """Read a fit that `save_fit` wrote; raises InputError for any other file."""
     require_regular(path, "fit the photo again")
     try:
-        check_npz_sizes(path, _MOST_ARRAY_BYTES)
-        with np.load(path, allow_pickle=False) as file:
-            return fit_from_arrays({key: file[key] for key in file.files})
-    except NPZ_ERRORS as error:
+        return fit_from_arrays(read_npz(path, _MOST_ARRAY_BYTES))
+    except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{path}: not a fit that facerf wrote ({error}); fit the photo again") from None
 
 

@@ -13,14 +13,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.silhouette import POINTS_PER_RAY, RAYS_PER_LANDMARK, band_uv, outermost
-from facerf_cli.face.topology import CONTOUR, LANDMARK_UV, locate
-from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
+from facerf_cli.face.topology import (
+    CONTOUR,
+    LANDMARK_UV,
+    POINTS_PER_RAY,
+    RAYS_PER_LANDMARK,
+    band_uv,
+    locate,
+    outermost,
+)
+from facerf_cli.raster.camera import Camera, pixel_rays, project, skew_matrix, so3_exp
 
 INNER_COUNT = 68 - len(CONTOUR)
 _FIRST_DAMPING = 1e-3
 _SETTLED = 1e-7  # a face has settled when a step lowers its cost by less than this share
 _STUCK = 1e3  # or when no step lowers its cost at this damping
+_POSE_ROUNDS = 6
 _WINDOW = 2 * RAYS_PER_LANDMARK  # a contour landmark slides by at most two landmarks along the jaw
 
 
@@ -235,3 +243,65 @@ def damped_step(normal: Tensor, gradient: Tensor, coordinates: Tensor, damping: 
     diagonal = normal.diagonal(dim1=1, dim2=2)
     diagonal += prior + damping[:, None] * (diagonal + prior)
     return -torch.cholesky_solve(gradient[..., None], torch.linalg.cholesky(normal))[..., 0]
+
+
+def weak_perspective(basis: FitBasis, target_px: Tensor, camera: Camera) -> tuple[FitState, Tensor]:
+    """Pose the mean by a scaled orthographic fit to the inner ones of the landmarks target_px [B, 68, 2].
+
+    Returns the state and its pixels per metre [B].
+    """
+    model = basis.mean[:INNER_COUNT]
+    image = target_px[:, len(CONTOUR) :] * torch.tensor([1.0, -1.0], dtype=torch.float64)  # y up
+    middle = image.mean(1)
+    rotation, scale = _orthographic(model.expand(len(image), -1, -1), image)
+    depth_m = camera.focal_px / scale
+    offset = (middle - torch.tensor([camera.cx_px, -camera.cy_px], dtype=torch.float64)) / scale[:, None]
+    translation = torch.cat([offset, -depth_m[:, None]], 1) - rotation @ model.mean(0)
+    coordinates = torch.zeros(len(image), basis.modes.shape[-1], dtype=torch.float64)
+    return FitState(rotation, translation, coordinates), scale
+
+
+def pose_from_landmarks(
+    points: Tensor, px: Tensor, camera: Camera, rotation: Tensor, translation_m: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pose heads of known shape: rotations [B, 3, 3] and translations [B, 3], float64, without derivatives.
+
+    points [B, N, 3] in the head frame project to pixels [B, N, 2]; rotation and translation_m are a first
+    guess. A scaled orthographic fit at the guess's depths (DeMenthon and Davis, *Model-based object pose in
+    25 lines of code*, 1995) precedes a few rounds of orthogonal iteration (Lu, Hager and Mjolsness, *Fast and
+    globally convergent pose estimation from video images*, 2000).
+    """
+    depth_m = -(points @ rotation.mT + translation_m[:, None])[..., 2:]
+    rays = pixel_rays(px, camera)
+    rotation, _ = _orthographic(points, rays[..., :2] * depth_m)
+    line = rays[..., :, None] * rays[..., None, :] / (rays * rays).sum(-1)[..., None, None]  # [B, N, 3, 3]
+    off_line = line - torch.eye(3, dtype=rays.dtype)
+    middle = torch.linalg.inv(-off_line.mean(1))
+
+    def best_translation(rotation: Tensor) -> Tensor:
+        turned = (points @ rotation.mT)[..., None]
+        return (middle @ (off_line @ turned).mean(1))[..., 0]
+
+    for _ in range(_POSE_ROUNDS):
+        seen = points @ rotation.mT + best_translation(rotation)[:, None]
+        rotation = _closest_rotation((line @ seen[..., None])[..., 0], points)
+    return rotation, best_translation(rotation)
+
+
+def _orthographic(points: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations [B, 3, 3] and scales [B] that bring points [B, N, 3] to positions [B, N, 2], y up."""
+    centred, flat = points - points.mean(1, keepdim=True), image - image.mean(1, keepdim=True)
+    affine = torch.linalg.lstsq(centred, flat).solution.mT  # [B, 2, 3]
+    u, stretch, vh = torch.linalg.svd(affine, full_matrices=False)
+    rows = u @ vh
+    rotation = torch.cat([rows, torch.linalg.cross(rows[:, :1], rows[:, 1:])], 1)
+    return rotation, stretch.mean(-1)
+
+
+def _closest_rotation(wanted: Tensor, points: Tensor) -> Tensor:
+    """Rotations [B, 3, 3] that bring centred points [B, N, 3] closest to centred `wanted` (Kabsch, 1976)."""
+    moment = (wanted - wanted.mean(1, keepdim=True)).mT @ (points - points.mean(1, keepdim=True))
+    u, _, vh = torch.linalg.svd(moment)
+    signs = torch.ones(len(points), 3, dtype=points.dtype)
+    signs[:, 2] = torch.det(u @ vh).sign()
+    return u @ (signs[..., None] * vh)

@@ -22,7 +22,6 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
 from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
-from facerf_cli.face.fit_start import weak_perspective
 from facerf_cli.face.gauss_newton import (
     FitState,
     Problem,
@@ -37,6 +36,7 @@ from facerf_cli.face.gauss_newton import (
     pixels_by_pose,
     prior_cost,
     residuals,
+    weak_perspective,
 )
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LANDMARKS_M, OUTER_EYE_CORNERS, grid_triangles

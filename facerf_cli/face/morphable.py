@@ -20,26 +20,31 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
-from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by index
-# Errors that reading a damaged .npz can raise.
-_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile)
-# numpy parses a header as a text of Python, and believes its sizes.
-_HEADER_ERRORS = (SyntaxError, TokenError, OverflowError, MemoryError, SystemError)
-_ARRAY_ERRORS = (ValueError, OSError, LookupError, EOFError, RuntimeError, TypeError, AttributeError)
-NPZ_ERRORS = (*_ARRAY_ERRORS, *_HEADER_ERRORS, *_ZIP_ERRORS)
-_HEAD_KEYS = ("mean", "identity", "expression", "triangles", "part", "uv")
-_HEAD_PREFIX = "head_"  # of the head's arrays in a face model's file
+EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means, in imported models
+_NPZ_ERRORS = (  # that reading a damaged .npz can raise: numpy parses a header as a text of Python
+    *(ValueError, OSError, LookupError, EOFError, RuntimeError, TypeError, AttributeError, SyntaxError),
+    *(TokenError, OverflowError, MemoryError, SystemError, zlib.error, zipfile.BadZipFile),
+)
+# Types of a head's arrays in a face model's file, under names that begin with `_HEAD_PREFIX`.
+_HEAD_TYPES = {
+    "mean": np.float32,
+    "identity": np.float16,
+    "expression": np.float16,
+    "triangles": np.int32,
+    "part": np.uint8,
+    "uv": np.float32,
+}
+_HEAD_PREFIX = "head_"
 _MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head
 _MAX_COEFFICIENTS = 500
 _MAX_LETTERS = 2000  # of a name or a licence
 MAX_ARRAYS = 64  # of a file
-_COPIES = 3  # of its arrays: as read, as floats of halves, and in between
-_MAX_ARRAY_BYTES = 192 << 20  # 500 shapes of a head in half precision
+_MAX_ARRAY_BYTES, _MAX_FILE_BYTES = 192 << 20, 1 << 30  # 500 shapes of a head in half precision; all arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,7 @@ class HeadModel:
 
     def to(self, device: torch.device | str) -> "HeadModel":
         """The same model with its arrays on `device`."""
-        return replace(self, **{key: getattr(self, key).to(device) for key in _HEAD_KEYS})
+        return replace(self, **{key: getattr(self, key).to(device) for key in _HEAD_TYPES})
 
 
 @dataclass(frozen=True, eq=False)  # caches compare models by identity
@@ -142,12 +147,8 @@ def _read(path: Path) -> MorphableModel:
             f"{path}: no such face model; give '{BUILTIN}' or a file of `facerf face-model import`"
         )
     try:
-        if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
-            raise ValueError("it is not an .npz")
-        check_npz_sizes(path)
-        with np.load(path, allow_pickle=False) as file:
-            return _from_arrays(path, {key: file[key] for key in file.files})
-    except NPZ_ERRORS as error:
+        return _from_arrays(path, read_npz(path))
+    except (ValueError, TypeError, LookupError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
         raise InputError(
             f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
@@ -159,93 +160,60 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
         raise InputError(
             f"{path}: it has another UV layout; import the face model again with this version of facerf"
         )
-    vertices = GRID * GRID
-    for key in ("identity", "expression"):
-        shape = arrays[key].shape
-        if len(shape) != 3 or shape[1:] != (vertices, 3) or shape[0] > _MAX_COEFFICIENTS:
-            raise ValueError(f"{key} has shape {shape}, not [K, {vertices}, 3]")
-    if arrays["mean"].shape != (vertices, 3):
-        raise ValueError(f"mean has shape {arrays['mean'].shape}, not [{vertices}, 3]")
-    mean, identity, expression = (
-        torch.from_numpy(arrays[key].astype(np.float32)) for key in ("mean", "identity", "expression")
-    )
-    if not all(tensor.isfinite().all() for tensor in (mean, identity, expression)):
-        raise ValueError("it holds values that are not finite")
+    mean, identity, expression = _shapes(arrays, "", GRID * GRID)
     names = tuple(str(name) for name in arrays["expression_names"])
-    head = _head_from_arrays(arrays, len(identity), len(expression))
     name, licence = (_printable(arrays[key]) for key in ("name", "licence"))
+    head = _head(arrays, len(identity), len(expression)) if _HEAD_PREFIX + "mean" in arrays else None
     return MorphableModel(name, licence, mean, identity, expression, names, head)
 
 
-def _head_to_arrays(head: HeadModel | None) -> dict[str, Any]:
-    """Convert a head to arrays for a face model's file, bases in half precision; {} for None."""
-    if head is None:
-        return {}
-    kinds = (np.float32, np.float16, np.float16, np.int32, np.uint8, np.float32)
-    pairs = zip(_HEAD_KEYS, kinds, strict=True)
-    return {_HEAD_PREFIX + key: getattr(head, key).numpy().astype(kind) for key, kind in pairs}
+def _head(arrays: dict[str, np.ndarray], identities: int, expressions: int) -> HeadModel:
+    """The head of a face model's arrays; raises ValueError or KeyError for a damaged one."""
+    vertices, faces = (np.atleast_1d(arrays[_HEAD_PREFIX + key]).shape[0] for key in ("mean", "triangles"))
+    if not 3 <= vertices <= _MAX_VERTICES or not 1 <= faces <= _MAX_TRIANGLES:
+        raise ValueError(f"its head has {vertices} vertices and {faces} triangles")
+    mean, identity, expression = _shapes(arrays, _HEAD_PREFIX, vertices, identities, expressions)
+    triangles = _indices(arrays, "triangles", (faces, 3), vertices).astype(np.int64)
+    part = _indices(arrays, "part", (vertices,), len(HEAD_PARTS)).astype(np.uint8)
+    uv = _floats(arrays, _HEAD_PREFIX + "uv", (vertices, 2))
+    return HeadModel(mean, identity, expression, torch.from_numpy(triangles), torch.from_numpy(part), uv)
 
 
-def _head_from_arrays(arrays: dict[str, np.ndarray], identities: int, expressions: int) -> HeadModel | None:
-    """The head of a face model's arrays, or None; raises ValueError or KeyError for a damaged head."""
-    if not any(_HEAD_PREFIX + key in arrays for key in _HEAD_KEYS):
-        return None
-    found = {key: arrays[_HEAD_PREFIX + key] for key in _HEAD_KEYS}
-    _require_shapes(found, identities, expressions)
-    _require_indices(found)
-    kinds = (np.float32, np.float32, np.float32, np.int64, np.uint8, np.float32)
-    pairs = zip(_HEAD_KEYS, kinds, strict=True)
-    tensors = {key: torch.from_numpy(found[key].astype(kind)) for key, kind in pairs}
-    if not all(tensor.isfinite().all() for tensor in tensors.values()):
-        raise ValueError("its head holds values that are not finite")
-    return HeadModel(**tensors)
+def _shapes(
+    arrays: dict[str, np.ndarray],
+    prefix: str,
+    vertices: int,
+    identities: int | None = None,
+    expressions: int | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [N, 3] and shapes [Ki, N, 3] and [Ke, N, 3] of a file's arrays."""
+    mean = _floats(arrays, prefix + "mean", (vertices, 3))
+    counts = {"identity": identities, "expression": expressions}
+    identity, expression = (_floats(arrays, prefix + key, (counts[key], vertices, 3)) for key in counts)
+    return mean, identity, expression
 
 
-def _require_shapes(found: dict[str, np.ndarray], identities: int, expressions: int) -> None:
-    vertices, triangles = (len(found[key]) if found[key].ndim else 0 for key in ("mean", "triangles"))
-    if not 3 <= vertices <= _MAX_VERTICES or not 1 <= triangles <= _MAX_TRIANGLES:
-        raise ValueError(f"its head has {vertices} vertices and {triangles} triangles")
-    expected = {
-        "mean": (vertices, 3),
-        "identity": (identities, vertices, 3),
-        "expression": (expressions, vertices, 3),
-        "triangles": (triangles, 3),
-        "part": (vertices,),
-        "uv": (vertices, 2),
-    }
-    for key, shape in expected.items():
-        if found[key].shape != shape:
-            raise ValueError(f"{_HEAD_PREFIX}{key} has shape {found[key].shape}, not {list(shape)}")
+def _floats(arrays: dict[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
+    """An array as float32; raises ValueError for another shape (None: any of a basis), NaN or infinity."""
+    array = arrays[key]
+    expected = (len(array) if array.ndim else 0, *shape[1:]) if shape[0] is None else shape
+    if array.shape != expected or (shape[0] is None and len(array) > _MAX_COEFFICIENTS):
+        wanted = ", ".join("K" if length is None else str(length) for length in shape)
+        raise ValueError(f"{key} has shape {array.shape}, not [{wanted}]")
+    tensor = torch.from_numpy(array.astype(np.float32))
+    if not tensor.isfinite().all():
+        raise ValueError(f"{key} holds values that are not finite")
+    return tensor
 
 
-def _require_indices(found: dict[str, np.ndarray]) -> None:
-    for key, count in (("triangles", len(found["mean"])), ("part", len(HEAD_PARTS))):
-        values = found[key]
-        if values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= count:
-            raise ValueError(f"{_HEAD_PREFIX}{key} holds indices out of range")
-
-
-def check_npz_sizes(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> None:
-    """Check the number and sizes of the arrays in an .npz, and ask the budget for all of them, before a read.
-
-    Raises ValueError for too many or too large ones.
-    """
-    total = 0
-    with zipfile.ZipFile(path) as archive:
-        if len(archive.infolist()) > MAX_ARRAYS:
-            raise ValueError(f"it holds {len(archive.infolist())} arrays; at most {MAX_ARRAYS} are read")
-        for entry in archive.infolist():
-            with archive.open(entry) as file:
-                version = np.lib.format.read_magic(file)
-                read = np.lib.format.read_array_header_1_0 if version == (1, 0) else None
-                if read is None:
-                    raise ValueError(f"{entry.filename} is not an array of version 1.0")
-                shape, _, dtype = read(file)
-            size = max(entry.file_size, math.prod(shape) * dtype.itemsize)
-            if size > most_bytes:
-                raise ValueError(f"{entry.filename} is too large")
-            total += size
-    memory.require(str(path), _COPIES * total, "a smaller file")
+def _indices(arrays: dict[str, np.ndarray], key: str, shape: tuple[int, ...], count: int) -> np.ndarray:
+    """An array of a head's indices below `count`; raises ValueError for anything else."""
+    array = arrays[_HEAD_PREFIX + key]
+    if array.shape != shape:
+        raise ValueError(f"{_HEAD_PREFIX}{key} has shape {array.shape}, not {list(shape)}")
+    if array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
+        raise ValueError(f"{_HEAD_PREFIX}{key} holds indices out of range")
+    return array
 
 
 def _printable(array: np.ndarray) -> str:
@@ -253,8 +221,46 @@ def _printable(array: np.ndarray) -> str:
     return "".join(letter for letter in one_line(str(array))[:_MAX_LETTERS] if letter.isprintable())
 
 
+def read_npz(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:
+    """Read the arrays of an .npz by name, without pickles; `most_bytes` bounds each of them.
+
+    Raises ValueError with a reason in one line for any other file, and for too many or too large arrays.
+    """
+    try:
+        npz_shapes(path, most_bytes)
+        with np.load(path, allow_pickle=False) as file:
+            return {key: file[key] for key in file.files}
+    except _NPZ_ERRORS as error:
+        raise ValueError(one_line(str(error))) from None
+
+
+def npz_shapes(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> dict[str, tuple[int, ...]]:
+    """The shapes of the arrays in an .npz, from their headers alone; raises one of `_NPZ_ERRORS`."""
+    if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
+        raise ValueError("it is not an .npz")
+    shapes, total = {}, 0
+    with zipfile.ZipFile(path) as archive:
+        if len(archive.infolist()) > MAX_ARRAYS:
+            raise ValueError(f"it holds {len(archive.infolist())} arrays; at most {MAX_ARRAYS} are read")
+        for entry in archive.infolist():
+            with archive.open(entry) as file:
+                if np.lib.format.read_magic(file) != (1, 0):
+                    raise ValueError(f"{entry.filename} is not an array of version 1.0")
+                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+            size = max(entry.file_size, math.prod(shape) * dtype.itemsize)
+            total += size
+            if size > most_bytes or total > _MAX_FILE_BYTES:
+                raise ValueError(f"{entry.filename} is too large")
+            shapes[entry.filename.removesuffix(".npy")] = shape
+    return shapes
+
+
 def save_face_model(path: Path, model: MorphableModel) -> None:
     """Write a model as .npz without pickles; bases in half precision (steps below 0.02 mm)."""
+    head: dict[str, Any] = {}
+    if model.head is not None:
+        for key, kind in _HEAD_TYPES.items():
+            head[_HEAD_PREFIX + key] = getattr(model.head, key).numpy().astype(kind)
     with path.open("wb") as file:
         np.savez_compressed(
             file,
@@ -265,40 +271,28 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             identity=model.identity.numpy().astype(np.float16),
             expression=model.expression.numpy().astype(np.float16),
             expression_names=np.array(model.expression_names, dtype=np.str_),
-            **_head_to_arrays(model.head),
+            **head,
         )
 
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """A face model's name, licence and number of shapes, and the presence of a head."""
+    """A face model's name, licence and numbers of shapes."""
 
     name: str
     licence: str
     identities: int
     expressions: int
-    has_head: bool
 
 
 def read_model_facts(path: Path) -> ModelFacts | None:
     """Read the facts of a file of `facerf face-model import` without its shapes; None for any other file."""
     try:
-        if not zipfile.is_zipfile(path):
+        shapes = npz_shapes(path)
+        if "layout_version" not in shapes:
             return None
-        check_npz_sizes(path)
         with np.load(path, allow_pickle=False) as file:
-            if not {"layout_version", "name", "licence", "identity", "expression"} <= set(file.files):
-                return None
             name, licence = (_printable(file[key]) for key in ("name", "licence"))
-            has_head = "head_mean" in file.files
-        return ModelFacts(name, licence, _count(path, "identity"), _count(path, "expression"), has_head)
-    except (*NPZ_ERRORS, InputError):
+        return ModelFacts(name, licence, shapes["identity"][0], shapes["expression"][0])
+    except _NPZ_ERRORS:
         return None
-
-
-def _count(path: Path, key: str) -> int:
-    """The length of an array in an .npz, from its header alone."""
-    with zipfile.ZipFile(path) as archive, archive.open(f"{key}.npy") as file:
-        np.lib.format.read_magic(file)
-        shape, _, _ = np.lib.format.read_array_header_1_0(file)
-    return int(shape[0])

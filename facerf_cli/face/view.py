@@ -1,5 +1,9 @@
-"""A fitted face rendered by a camera: (u, v), normal and position of each pixel, and a soft mask."""
+"""A fitted face rendered by a camera: (u, v), normal and position of each pixel, and a soft mask.
 
+Also drawings for visual checks: a fit over its photo, and a face model shaded as clay from eight sides.
+"""
+
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,9 +14,12 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel
+from facerf_cli.face.topology import CONTOUR, grid_triangles, grid_uv, region_mask
+from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.image.strips import Band, strips
-from facerf_cli.raster.camera import Camera, project
+from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, vertex_normals
 from facerf_cli.run import memory
@@ -22,6 +29,26 @@ _FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
 _BYTES, _PHOTO_BYTES = 32, 16  # of a pixel of the view, and of a photo with its matte around it
 _STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
+# Of drawings.
+_CELLS = 16  # cells of the wire mesh along u and along v
+_SHADE, _LINE = 0.35, 0.5  # opacity of the shaded mesh and of its wires
+_WIRE_COLOUR = np.array([0.1, 0.5, 1.0], np.float32)
+_TARGET_COLOUR, _FITTED_COLOUR = (0.05, 1.0, 0.1), (1.0, 0.25, 0.0)
+_DOT = 1 / 160  # radius over the crop's side
+_POSES, _COLUMNS = 8, 4
+_FACE_SPAN_DEG = 80.0  # a face without a whole head is turned this far to either side
+_OVERSAMPLE = 3
+_FOCAL_PER_SIDE = 4.0
+_FILL = 0.9  # share of a cell that the model's bounding sphere fills
+_LIGHT = F.normalize(torch.tensor([-0.5, 0.6, 0.8]), dim=0)
+_AMBIENT, _DIFFUSE = 0.12, 0.75
+_BACKGROUND = 0.02
+_COLOURS = {
+    "skin": (0.62, 0.55, 0.50),
+    "eye": (0.8, 0.8, 0.8),
+    "mouth": (0.4, 0.16, 0.15),
+    "teeth": (0.7,) * 3,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,3 +185,91 @@ def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
     """Images [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black off the mesh."""
     images = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
     return images.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)
+
+
+def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarray:
+    """Draw the half-transparent mesh and landmarks over a linear photo [H, W, 3] at automatic exposure.
+
+    Green are the targets of the fit, orange its landmarks without the sliding contour.
+    """
+    image = (photo * np.float32(2 ** auto_exposure_ev(photo))).clip(0, 1)
+    height, width = photo.shape[:2]
+    vertices = fit.vertices_camera(model)
+    view = view_face(vertices, photo_camera(fit.crop, height, width), fit.crop.side_px)
+    region = image[view.window]  # a view: drawn in place
+    covered = view.coverage.numpy()[..., None]
+    shade = view.normal[..., 2:].clamp(0, 1).numpy()
+    region += _SHADE * covered * (shade - region)
+    line_px = max(1.0, fit.crop.side_px / 600)
+    region += _LINE * covered * _wires(view.uv.numpy(), line_px)[..., None] * (_WIRE_COLOUR - region)
+    fitted_px = project(model.landmarks(vertices[None])[0, len(CONTOUR) :], fit.camera).numpy()
+    radius_px = max(1.0, _DOT * fit.crop.side_px)
+    _dots(image, fit.crop.to_photo(fit.landmarks_px.numpy()), _TARGET_COLOUR, radius_px)
+    _dots(image, fit.crop.to_photo(fitted_px), _FITTED_COLOUR, 0.6 * radius_px)
+    return image
+
+
+def _wires(uv: np.ndarray, line_px: float) -> np.ndarray:
+    """Opacity [h, w] in 0..1 of lines of constant u and v, about `line_px` wide on the screen."""
+    lines = np.zeros(uv.shape[:2], np.float32)
+    if min(lines.shape) < 2:
+        return lines
+    for coordinate in np.moveaxis(_CELLS * uv, -1, 0):
+        down, right = np.gradient(coordinate)
+        off_px = np.abs(coordinate - np.round(coordinate)) / np.maximum(np.hypot(down, right), 1e-6)
+        lines = np.maximum(lines, np.clip((line_px + 1) / 2 - off_px, 0, 1))
+    return lines
+
+
+def _dots(image: np.ndarray, points_px: np.ndarray, colour: tuple[float, ...], radius_px: float) -> None:
+    """Draw antialiased discs at points [N, 2] into an image [H, W, 3]."""
+    for x, y in points_px:
+        left, top = (max(0, int(centre - radius_px - 1)) for centre in (x, y))
+        patch = image[top : max(top, int(y + radius_px + 2)), left : max(left, int(x + radius_px + 2))]
+        rows, columns = (np.arange(size) + PIXEL_CENTRE for size in patch.shape[:2])
+        distance = np.hypot(columns[None, :] + left - x, rows[:, None] + top - y)
+        patch += np.clip(radius_px + 0.5 - distance, 0, 1)[..., None] * (np.array(colour) - patch)
+
+
+def draw_turntable(model: MorphableModel, cell_px: int = 256) -> np.ndarray:
+    """Draw the mean from eight sides, linear Rec.709 [2 cell_px, 4 cell_px, 3]: the head, or the face alone.
+
+    A head makes a full turn, a face turns from one profile to the other; light comes from the upper left.
+    """
+    import trimesh  # takes as long as the rest of a relight's imports
+
+    if model.head is None:
+        angles = np.linspace(-_FACE_SPAN_DEG, _FACE_SPAN_DEG, _POSES)
+        vertices, triangles = model.mean, grid_triangles()
+        colours = torch.tensor(_COLOURS["skin"]).expand(len(vertices), 3)
+    else:
+        angles = np.arange(_POSES) * 360 / _POSES
+        vertices, triangles = model.head.mean, model.head.triangles
+        colours = torch.tensor([_COLOURS[part] for part in HEAD_PARTS])[model.head.part.long()]
+    vertices = vertices - (vertices.amin(0) + vertices.amax(0)) / 2
+    mesh = trimesh.Trimesh(vertices.numpy(), triangles.numpy(), process=False)
+    normals = torch.from_numpy(np.array(mesh.vertex_normals, np.float32))
+    cells = [_draw(vertices, triangles, normals, colours, float(angle), cell_px) for angle in angles]
+    rows = [np.concatenate(cells[at : at + _COLUMNS], 1) for at in range(0, _POSES, _COLUMNS)]
+    return np.concatenate(rows)
+
+
+def _draw(
+    vertices: Tensor, triangles: Tensor, normals: Tensor, colours: Tensor, yaw_deg: float, cell_px: int
+) -> np.ndarray:
+    """Draw one cell [cell_px, cell_px, 3], each pixel the mean of `_OVERSAMPLE`^2 samples."""
+    side_px = cell_px * _OVERSAMPLE
+    camera = Camera(_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
+    head_to_camera = pose_to_rotation(yaw_deg, 0, 0)
+    radius_m = float(vertices.norm(dim=-1).max())
+    # Rays along a sphere's outline are tangent to it: sin of the half angle, not tan.
+    away_m = radius_m / math.sin(math.atan(_FILL / (2 * _FOCAL_PER_SIDE)))
+    posed = vertices @ head_to_camera.T - torch.tensor([0, 0, away_m])
+    fragments = rasterize(posed, triangles, camera)
+    normal = F.normalize(interpolate(normals, triangles, fragments), dim=-1)
+    facing = normal @ (_LIGHT @ head_to_camera)  # the light stays with the camera
+    shade = _AMBIENT + _DIFFUSE * facing.clamp(min=0)
+    image = interpolate(colours, triangles, fragments) * shade[..., None]
+    image = torch.where(fragments.covered[..., None], image, torch.tensor(_BACKGROUND))
+    blocks = image.reshape(cell_px, _OVERSAMPLE, cell_px, _OVERSAMPLE, 3)
+    return blocks.mean((1, 3)).numpy()

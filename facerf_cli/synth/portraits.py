@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.silhouette import RAYS_PER_LANDMARK, silhouette_ids
-from facerf_cli.face.topology import CONTOUR
+from facerf_cli.face.topology import CONTOUR, RAYS_PER_LANDMARK, silhouette_ids
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.importers.source import EXPRESSION_STD
-from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.morphable import EXPRESSION_STD, MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
 from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients

@@ -19,7 +19,6 @@ from facerf_cli.dataset.pairs import Pair
 from facerf_cli.dataset.textures import DatasetTextures
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.silhouette import silhouette_ids
 from facerf_cli.face.topology import (
     CONTOUR,
     INNER_MOUTH_CORNERS,
@@ -27,6 +26,7 @@ from facerf_cli.face.topology import (
     grid_triangles,
     grid_uv,
     interior_mask,
+    silhouette_ids,
 )
 from facerf_cli.network.checkpoint import VGG16_LICENCE
 from facerf_cli.network.features import VggFeatures, layer_powers

@@ -4,9 +4,8 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.face.drawings import draw_turntable
 from facerf_cli.face.importers.ict import PUBLISHED, cached_face_model
-from facerf_cli.face.importers.import_model import import_face_model
+from facerf_cli.face.importers.resample import import_face_model
 from facerf_cli.face.morphable import (
     BUILTIN,
     BUILTIN_PATH,
@@ -16,6 +15,7 @@ from facerf_cli.face.morphable import (
     save_face_model,
 )
 from facerf_cli.face.topology import GRID, OUTER_EYE_CORNERS, grid_triangles
+from facerf_cli.face.view import draw_turntable
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance

@@ -10,10 +10,10 @@ import numpy as np
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.shots import Shot, shot_of
-from facerf_cli.face.drawings import draw_fit
 from facerf_cli.face.fit import save_fit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
+from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import LinearImage, write_display, write_exr

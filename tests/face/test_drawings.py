@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facerf_cli.face.drawings import _BACKGROUND, draw_turntable
 from facerf_cli.face.morphable import MorphableModel, load_face_model
+from facerf_cli.face.view import _BACKGROUND, draw_turntable
 
 CELL = 48
 

@@ -21,7 +21,6 @@ from facerf_cli.face.fit import (
     save_fit,
     trust_inside,
 )
-from facerf_cli.face.fit_start import weak_perspective
 from facerf_cli.face.gauss_newton import (
     Problem,
     apply_step,
@@ -29,6 +28,7 @@ from facerf_cli.face.gauss_newton import (
     minimise,
     residuals,
     total_cost,
+    weak_perspective,
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, grid_triangles

@@ -6,9 +6,16 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import FitSettings, fit_batch, fit_landmarks, fit_problem
-from facerf_cli.face.fit_start import FitStart, better_start, pose_from_landmarks, seeded_state
-from facerf_cli.face.gauss_newton import fit_points, minimise, total_cost
+from facerf_cli.face.fit import (
+    FitSettings,
+    FitStart,
+    better_start,
+    fit_batch,
+    fit_landmarks,
+    fit_problem,
+    seeded_state,
+)
+from facerf_cli.face.gauss_newton import fit_points, minimise, pose_from_landmarks, total_cost
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project

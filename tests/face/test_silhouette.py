@@ -1,8 +1,7 @@
 import torch
 
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.silhouette import contour_rays, silhouette_ids
-from facerf_cli.face.topology import CONTOUR, GRID, LANDMARK_UV
+from facerf_cli.face.topology import CONTOUR, GRID, LANDMARK_UV, contour_rays, silhouette_ids
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 
 YAWS_DEG = (0.0, 35.0, -35.0)

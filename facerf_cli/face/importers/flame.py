@@ -20,8 +20,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.source import SourceModel, read_npz, require_mesh
-from facerf_cli.face.morphable import NPZ_ERRORS
+from facerf_cli.face.importers.source import SourceModel, require_mesh
+from facerf_cli.face.morphable import read_npz
 from facerf_cli.files.inert_pickle import array_of, read_inert_pickle, read_inert_stream
 from facerf_cli.run.logs import one_line
 
@@ -153,7 +153,7 @@ def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[
         raise InputError(
             f"{path}: no landmarks (none of {keys}); give an embedding of FLAME's landmarks"
         ) from None
-    except (IndexError, *NPZ_ERRORS) as error:
+    except (IndexError, KeyError, TypeError, OverflowError, ValueError) as error:
         raise InputError(
             f"{path}: no landmarks ({one_line(str(error))[:160]}); give an embedding of FLAME's landmarks"
         ) from None

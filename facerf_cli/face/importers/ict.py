@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.source import EXPRESSION_STD, SourceHead, SourceModel
-from facerf_cli.face.morphable import HEAD_PARTS
+from facerf_cli.face.importers.source import SourceHead, SourceModel
+from facerf_cli.face.morphable import EXPRESSION_STD, HEAD_PARTS
 from facerf_cli.files.downloads import PublishedFile, cache_folder, fetch
 from facerf_cli.run.logs import one_line
 

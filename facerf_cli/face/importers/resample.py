@@ -1,8 +1,10 @@
-"""Resampling of a face model from its publisher's topology to the canonical grid.
+"""Import of a published face model: from its publisher's topology to the canonical grid.
 
 The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface. A whole
 head stays in its publisher's topology, in the head frame, with (u, v) that match the canonical grid.
 """
+
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,8 +15,16 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.distance import cdist
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.find_landmarks import find_landmarks, nearest_on_mesh, rigid_alignment
-from facerf_cli.face.importers.source import SourceHead, SourceModel
+from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
+from facerf_cli.face.importers.flame import read_flame
+from facerf_cli.face.importers.ict import read_ict_facekit
+from facerf_cli.face.importers.source import (
+    SourceHead,
+    SourceModel,
+    landmarks_of,
+    nearest_on_mesh,
+    rigid_alignment,
+)
 from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel, load_face_model
 from facerf_cli.face.topology import (
     GRID,
@@ -27,12 +37,59 @@ from facerf_cli.face.topology import (
     grid_uv,
     landmark_weights,
 )
+from facerf_cli.files.texts import require_regular
+from facerf_cli.run.logs import one_line
 
+_MAX_LETTERS = 10_000  # of a list of vertex numbers
 _HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # a length outside these ranges is in another unit
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
 _PULL_M = 0.005  # radius around a landmark in which the grid is pulled onto it
 _LEAST_COVERED = 0.75  # share of the grid that a model's surface must cover
 _LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and its angle in eye textures
+
+
+def import_face_model(kind: str, path: Path, landmarks: Path | None = None) -> MorphableModel:
+    """Import the model in `path`, of one of the kinds of `facerf face-model import`.
+
+    `landmarks` is an embedding for FLAME, or for any kind a .txt of 68 vertex numbers from 0. Raises
+    InputError for files that cannot be imported.
+    """
+    source = _read(kind, path, landmarks)
+    try:
+        return resample_model(source)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
+    listed = landmarks is not None and landmarks.suffix == ".txt"
+    if kind == "flame":
+        source = read_flame(path, None if listed else landmarks)
+    elif landmarks is not None and not listed:
+        raise InputError(f"{landmarks}: not for {kind}; give the landmarks as a .txt of 68 vertex numbers")
+    elif kind == "basel-2009":
+        source = read_basel_2009(path)
+    elif kind in ("basel-2017", "basel-2019"):
+        source = read_basel_2017(path, kind)
+    else:
+        source = read_ict_facekit(path)
+    if landmarks is not None and listed:
+        source.known.update(_listed(landmarks, source.mean))
+    return source
+
+
+def _listed(path: Path, mean: np.ndarray) -> dict[int, np.ndarray]:
+    """The landmarks on a mean [N, 3] by number, from a text file of 68 vertex numbers."""
+    require_regular(path, "give a .txt of 68 vertex numbers")
+    try:
+        numbers = [int(word) for word in path.read_text(encoding="utf-8")[:_MAX_LETTERS].split()]
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"{path}: cannot be read ({one_line(str(error))}); give a .txt of 68 vertex numbers"
+        ) from None
+    if len(numbers) != 68 or not 0 <= min(numbers) <= max(numbers) < len(mean):
+        raise InputError(f"{path}: holds {len(numbers)} numbers; give 68 from 0 to {len(mean) - 1}")
+    return dict(enumerate(mean[numbers]))
 
 
 def resample_model(source: SourceModel) -> MorphableModel:
@@ -75,13 +132,6 @@ def resample_model(source: SourceModel) -> MorphableModel:
         if source.head is None
         else _head_model(source, source.head, on_grid.numpy(), rotation, translation),
     )
-
-
-def landmarks_of(source: SourceModel) -> np.ndarray:
-    """The landmarks [68, 3] on the source's mean: the known ones, and the others found by shape."""
-    if len(source.known) == 68:
-        return np.stack([source.known[number] for number in range(68)])
-    return find_landmarks(source.mean, source.triangles, source.known)
 
 
 def _require_size(what: str, length_m: float, between_m: tuple[float, float]) -> None:

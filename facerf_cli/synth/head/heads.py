@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from facerf_cli.face.importers.source import EXPRESSION_STD
-from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel
+from facerf_cli.face.morphable import EXPRESSION_STD, HEAD_PARTS, HeadModel, MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG, LANDMARK_UV
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals

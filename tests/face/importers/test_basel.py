@@ -14,10 +14,8 @@ import scipy.io
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face.importers import basel
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
-from facerf_cli.face.importers.find_landmarks import rigid_alignment
-from facerf_cli.face.importers.import_model import import_face_model
-from facerf_cli.face.importers.resample import landmarks_of, resample_model
-from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.importers.resample import import_face_model, resample_model
+from facerf_cli.face.importers.source import SourceModel, landmarks_of, rigid_alignment
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, head, off_mm

@@ -13,11 +13,9 @@ import trimesh
 from scipy import sparse
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
-from facerf_cli.face.importers.import_model import import_face_model
-from facerf_cli.face.importers.resample import landmarks_of, resample_model
-from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.importers.resample import import_face_model, resample_model
+from facerf_cli.face.importers.source import SourceModel, landmarks_of, nearest_on_mesh, rigid_alignment
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, head, off_mm

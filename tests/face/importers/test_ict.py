@@ -12,11 +12,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.find_landmarks import rigid_alignment
 from facerf_cli.face.importers.ict import LANDMARK_IDS, VERTICES
-from facerf_cli.face.importers.import_model import import_face_model
-from facerf_cli.face.importers.resample import landmarks_of
-from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.importers.resample import import_face_model
+from facerf_cli.face.importers.source import SourceModel, landmarks_of, rigid_alignment
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model, save_face_model
 from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, landmark_weights
 
