@@ -2,42 +2,34 @@
 
 Each name that a pickle imports becomes a class of stand-ins, which only store what they are given; `array_of`
 then reads the numbers of an array of numpy, chumpy or scipy.sparse over the file's own bytes. FLAME's pickles
-therefore open without these packages, and a hostile pickle is refused.
+therefore open without chumpy, and a hostile pickle is refused.
 """
 
 import io
 import pickle
 import pickletools
+import re
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from scipy import sparse
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.texts import require_regular
 from facerf_cli.run.logs import one_line
 
 _MAX_BYTES = 512 << 20  # of a file
 _MAX_OPCODES = 200_000  # FLAME has a few thousand
 _MAX_TUPLES = 5000  # nested ones recurse where they are keys
-_MAX_DIMENSIONS = 8  # of an array
 _MAX_DENSE = 4 << 20  # entries of a sparse matrix; FLAME's joints are 5 x 5023
-# Number types that are read; without objects, text and records.
-_NUMBERS = frozenset({"f2", "f4", "f8", "b1", *(f"{kind}{size}" for kind in "iu" for size in (1, 2, 4, 8))})
-
-_FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
-_SCALAR = ("numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar")
-_BARE = ("copy_reg._reconstructor", "copyreg._reconstructor")  # arguments: class, base, state of the base
-# Names that begin with chumpy. are allowed, too.
-_ALLOWED = frozenset(
-    (
-        *("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct", "numpy.dtype"),
-        *(*_FROM_BUFFER, *_SCALAR, *_BARE, "numpy.ndarray", "_codecs.encode", "__builtin__.bytes"),
-        *("__builtin__.object", "builtins.object", "__builtin__.set", "builtins.set"),
-        *("collections.OrderedDict", "torch._utils._rebuild_tensor_v2"),
-        *("torch.storage._load_from_bytes", "torch.FloatStorage", "torch.LongStorage", "torch.DoubleStorage"),
-        *(f"scipy.sparse.{module}.{kind}_matrix" for kind in ("csc", "csr") for module in (kind, f"_{kind}")),
-        *(f"scipy.sparse._{kind}.{kind}_array" for kind in ("csc", "csr")),
-    )
+_NUMBERS = re.compile(r"f[248]|[iu][1248]|b1")  # types that are read: no objects, text or records
+_ALLOWED = re.compile(
+    r"numpy\.(_?core\.multiarray\.(_reconstruct|scalar)|_?core\.numeric\._frombuffer|dtype|ndarray)"
+    r"|(copy_reg|copyreg)\._reconstructor|_codecs\.encode|__builtin__\.(bytes|object|set)"
+    r"|builtins\.(object|set)|collections\.OrderedDict|torch\._utils\._rebuild_tensor_v2"
+    r"|torch\.storage\._load_from_bytes|torch\.(Float|Long|Double)Storage"
+    r"|scipy\.sparse\._?(csc|csr)\.(csc|csr)_(matrix|array)|chumpy\..*"
 )
 
 
@@ -71,7 +63,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> type[StandIn]:
         """Return a class of stand-ins for an allowed name."""
         whole = f"{module}.{name}"
-        if whole not in _ALLOWED and not whole.startswith("chumpy."):
+        if not _ALLOWED.fullmatch(whole):
             raise _Unreadable(f"names {whole[:80]}, which is not part of a face model")
         return type("StandIn", (StandIn,), {"name": whole})
 
@@ -82,30 +74,33 @@ def read_inert_pickle(path: Path) -> Any:
     No code of the file runs. A damaged file, and one that names anything other than arrays of numpy, chumpy
     and scipy.sparse, raises an InputError.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give a face model's .pkl")
-    if path.stat().st_size > _MAX_BYTES:
-        raise InputError(f"{path}: too large for a face model ({_MAX_BYTES >> 20} MiB at most)")
+    require_regular(path, "give a face model's .pkl")
     with path.open("rb") as file:
         return read_inert_stream(file, path)
 
 
 def read_inert_stream(file: BinaryIO, path: Path) -> Any:
     """Read the pickle that begins at an open file's position; errors name `path`."""
-    content = file.read(_MAX_BYTES)
+    content = file.read(_MAX_BYTES + 1)
     try:
         _check_work(content)
-        return _unwrapped(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
+        value = _Unpickler(io.BytesIO(content), encoding="latin-1").load()
     except _Unreadable as refused:
         raise InputError(f"{path}: refused: it {refused}; nothing of it was run") from None
     except Exception as error:  # whatever damage makes an unpickler raise
         raise InputError(
             f"{path}: not a readable pickle ({one_line(str(error))[:120]}); get the file again"
         ) from None
+    match value:
+        case StandIn(state=(_, _, StandIn(arguments=("O8" | "O", *_)), _, [entry])):  # one object, by np.save
+            return entry
+    return value
 
 
 def _check_work(content: bytes) -> None:
     """Refuse a pickle of too many instructions, and one that would make the unpickler take much memory."""
+    if len(content) > _MAX_BYTES:
+        raise _Unreadable(f"is too large for a face model ({_MAX_BYTES >> 20} MiB at most)")
     tuples = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content), 1):
         tuples += opcode.name.startswith(("TUPLE", "FROZENSET"))
@@ -115,88 +110,67 @@ def _check_work(content: bytes) -> None:
             raise _Unreadable(f"numbers an object {argument}")
 
 
-def _unwrapped(value: Any) -> Any:
-    """Return the only object of an array of objects, which is how numpy saves one object."""
-    match value:
-        case StandIn(state=(_, _, StandIn(arguments=("O8" | "O", *_)), _, [entry])):
-            return entry
-    return value
-
-
 def array_of(value: Any) -> np.ndarray:
-    """Return the numbers in a value of an inert pickle; ValueError if there are none.
+    """Return the numbers in a value of an inert pickle; ValueError, TypeError or KeyError if there are none.
 
     A chumpy object gives its `x`, and a scipy.sparse matrix of at most `_MAX_DENSE` entries a dense array.
     """
-    if isinstance(value, StandIn) and isinstance(value.state, dict):
-        if "indptr" in value.state:
-            return _dense(value)
-        if _class_name(value) == "chumpy.ch.Ch":
-            value = value.state.get("x")
+    match value:
+        case StandIn(state={"x": inner}) if _class_name(value) == "chumpy.ch.Ch":
+            return _numbers(inner)
+        case StandIn(state={"indptr": starts, "indices": indices, "data": data} as state):
+            rows, columns = map(int, state["_shape"] if "_shape" in state else state["shape"])
+            if not 0 < rows * columns <= _MAX_DENSE:
+                raise ValueError("a sparse matrix is too large")
+            kind = sparse.csc_matrix if "csc" in _class_name(value) else sparse.csr_matrix
+            matrix = kind((_numbers(data), _numbers(indices), _numbers(starts)), (rows, columns))
+            matrix.check_format(full_check=True)
+            return np.asarray(matrix.toarray(), np.float64)
     return _numbers(value)
 
 
 def _numbers(value: Any) -> np.ndarray:
     """Return the numbers in an array of numpy, a scalar of it, or a list."""
+    name = _class_name(value)
     match value:
         case np.ndarray():
             return value
         case StandIn(state=(_, shape, dtype, fortran, raw)):
-            return _array_over(_bytes(raw), dtype, shape, bool(fortran))
-        case StandIn(name=name, arguments=(raw, dtype, shape, order)) if name in _FROM_BUFFER:
-            return _array_over(_bytes(raw), dtype, shape, order == "F")
-        case StandIn(name=name, arguments=(dtype, raw)) if name in _SCALAR:
-            return _array_over(_bytes(raw), dtype, (), False)
+            return _array_over(raw, dtype, shape, "F" if fortran else "C")
+        case StandIn(arguments=(raw, dtype, shape, order)) if name.endswith("._frombuffer"):
+            return _array_over(raw, dtype, shape, order)
+        case StandIn(arguments=(dtype, raw)) if name.endswith(".scalar"):
+            return _array_over(raw, dtype, (), "C")
         case [*entries] if entries and all(isinstance(entry, (int, float)) for entry in entries):
             return np.array(entries)
-    name = _class_name(value) if isinstance(value, StandIn) else type(value).__name__
     raise ValueError(f"a {name} stands where numbers should be")
 
 
-def _class_name(value: StandIn) -> str:
-    """Return the name of the class that a stand-in is of."""
-    if value.name in _BARE and value.arguments and isinstance(value.arguments[0], type):
-        return str(getattr(value.arguments[0], "name", ""))
-    return value.name
+def _class_name(value: Any) -> str:
+    """Return the name of a value's class, or of the class that a stand-in is of."""
+    match value:
+        case StandIn(name="copy_reg._reconstructor" | "copyreg._reconstructor", arguments=(kind, *_)):
+            return str(getattr(kind, "name", ""))
+        case StandIn(name=name):
+            return name
+    return type(value).__name__
 
 
-def _dense(matrix: StandIn) -> np.ndarray:
-    """Return a compressed sparse matrix as a dense array; check its indices, which scipy does not."""
-    state = _require(matrix.state, dict)
-    data, indices, starts = (_numbers(state.get(key)) for key in ("data", "indices", "indptr"))
-    rows, columns = _require(state.get("_shape", state.get("shape")), tuple)
-    by_column = "csc" in _class_name(matrix)
-    lines, length = (columns, rows) if by_column else (rows, columns)
-    is_consistent = (
-        0 < _require(lines, int) * _require(length, int) <= _MAX_DENSE
-        and starts.shape == (lines + 1,)
-        and (starts[0], starts[-1]) == (0, len(data))
-        and len(indices) == len(data)
-        and bool((np.diff(starts) >= 0).all() and ((indices >= 0) & (indices < length)).all())
-    )
-    if not is_consistent:
-        raise ValueError("a sparse matrix is damaged")
-    dense = np.zeros((lines, length))
-    np.add.at(dense, (np.repeat(np.arange(lines), np.diff(starts)), indices.astype(np.int64)), data)
-    return dense.T if by_column else dense
-
-
-def _array_over(data: bytes, dtype: Any, shape: Any, fortran: bool) -> np.ndarray:
+def _array_over(raw: Any, dtype: StandIn, shape: Any, order: Any) -> np.ndarray:
     """Return a read-only view of the pickle's bytes; no memory is allocated for a size that a file claims."""
-    code = str(_require(dtype, StandIn).arguments[0])
-    order = str(dtype.state[1]) if isinstance(dtype.state, tuple) else "="
-    if code not in _NUMBERS or order not in "<>|=":
+    code = str(dtype.arguments[0])
+    byte_order = str(dtype.state[1]) if isinstance(dtype.state, tuple) else "="
+    if not _NUMBERS.fullmatch(code) or byte_order not in "<>|=":
         raise ValueError(f"it contains an array of type {code[:20]}")
-    kind = np.dtype(code).newbyteorder(order)  # type: ignore[arg-type]
-    lengths = tuple(_require(length, int) for length in _require(shape, tuple))
-    count = 1
-    for length in lengths:
-        count *= length
-        if length < 0 or count * kind.itemsize > len(data):
-            raise ValueError("it contains an array that is larger than its data")
-    if len(lengths) > _MAX_DIMENSIONS or count * kind.itemsize != len(data):
+    kind = np.dtype(code).newbyteorder(byte_order)  # type: ignore[arg-type]
+    data, lengths = _bytes(raw), tuple(map(int, shape))
+    try:
+        array = np.ndarray(lengths, kind, data, order="F" if order == "F" else "C")
+    except (ValueError, TypeError, OverflowError):  # it needs more bytes than there are
+        array = None
+    if array is None or array.nbytes != len(data) or min(lengths, default=0) < 0:
         raise ValueError("it contains an array that does not fit its data")
-    return np.ndarray(lengths, kind, data, order="F" if fortran else "C")
+    return array
 
 
 def _bytes(raw: Any) -> bytes:
@@ -208,11 +182,6 @@ def _bytes(raw: Any) -> bytes:
             return b""
         case str():
             return raw.encode("latin-1")
-    return bytes(_require(raw, (bytes, bytearray)))
-
-
-def _require(value: Any, kind: Any) -> Any:
-    """Return the value if it has the given type; otherwise raise a ValueError."""
-    if not isinstance(value, kind):
-        raise ValueError(f"a {type(value).__name__} in the wrong place")
-    return value
+        case bytes() | bytearray():
+            return bytes(raw)
+    raise ValueError("an array without its bytes")

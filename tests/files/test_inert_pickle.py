@@ -121,14 +121,13 @@ def array_pickle(shape: bytes, code: bytes = b"f8", data: bytes = bytes(8)) -> b
 
 HUGE = b"\x8a\x05\x00\x00\x00\x00\x7f"
 DAMAGED = {
-    "a huge claim": (array_pickle(HUGE + b"\x85"), "larger than its data"),
-    "a product that overflows": (array_pickle(HUGE * 2 + b"\x86"), "larger"),
-    "a negative length": (array_pickle(b"J\xff\xff\xff\xff\x85"), "larger than its data"),
+    "a huge claim": (array_pickle(HUGE + b"\x85"), "does not fit"),
+    "a product that overflows": (array_pickle(HUGE * 2 + b"\x86"), "does not fit"),
+    "a negative length": (array_pickle(b"J\xff\xff\xff\xff\x85"), "does not fit"),
     "fewer numbers than data": (array_pickle(b"K\x01\x85", data=bytes(16)), "does not fit"),
     "objects": (array_pickle(b"K\x01\x85", b"O8"), "array of type O8"),
     "text": (array_pickle(b"K\x01\x85", b"S8"), "array of type S8"),
     "records": (array_pickle(b"K\x01\x85", b"f8,f8"), "array of type"),
-    "many axes": (array_pickle(b"(" + b"K\x01" * 40 + b"t"), "does not fit"),
     "a memo far away": (b"\x80\x02Nr\xff\xff\xff\x7f.", ""),
     "a memo that is missing": (b"\x80\x02j\x00\x00\x00\x10.", ""),
     "a long missing text": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x0f.", ""),
