@@ -30,9 +30,10 @@ from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
-from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of, relit_by
+from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.composition import Composition
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
@@ -109,9 +110,9 @@ def estimates(
     photo = read_image(path).pixels
     landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
-    composition = Composition(models.face, photo, head)
+    composition = Composition(models.face, photo, head, reflectance=reflectance_of(models, head))
     weights = torch.stack([light.weights for light in lights])
-    all_relit = relit_by(composition, head, reflectance_of(models, head), RIG, weights)
+    all_relit = composition.relit(Lights(RIG, weights))
     for light, relit in zip(lights, all_relit, strict=True):
         face = replace(head.face, texture=relit.texture)
         for method, found in by_both(models, replace(head, face=face), features):

@@ -41,7 +41,7 @@ from facerf_cli import pipeline
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.relighting.sequence import Follower, ShotView
@@ -78,9 +78,8 @@ def shot_view(models: Models, frames: list[np.ndarray]) -> ShotView:
 def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:
     """Relight a frame by the target's light."""
     reflectance = pipeline.reflectance_of(models, head, "portrait", photo=frame, steady=steady)
-    composition = pipeline.composition_of(models, frame, head, reflectance)
-    light = (rig_directions(LIGHTS), TARGET[None])
-    return composition.image(next(pipeline.relit_by(composition, head, reflectance, *light))).pixels
+    light = RigLight(rig_directions(LIGHTS), TARGET)
+    return pipeline.Person(models, frame, head, reflectance).image(light).pixels
 
 
 def exposed(results: list[np.ndarray], clip: Clip) -> np.ndarray:

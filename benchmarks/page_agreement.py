@@ -21,7 +21,8 @@ from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, golden_spiral, rig_directions
-from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.pipeline import Person, find_for, head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.view_photos import head_place, of_photo, page_maps
@@ -64,12 +65,12 @@ def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     shown = drawn(text, [address for _, address, *_ in given], folder)
     print(f"{time.perf_counter() - begun:.0f} s for {len(shown)} states in software")
     field = reflectance_of(models, head, "portrait", photo=photo)
-    whole = composition_of(models, photo, head, field)
+    whole = Person(models, photo, head, field).composed()
     seen = whole.matte > 0.5
     print("light                    EV relight   page    mean   95 %   99 %    most")
     errors: dict[str, list[np.ndarray]] = {}
     for (kind, name, directions, weights), one in zip(given, shown, strict=True):
-        relit = next(relit_by(whole, head, field, directions, weights[None]))
+        relit = next(whole.relit(Lights(directions, weights[None])))
         strength = float(weights.sum(0) @ torch.tensor([0.2126, 0.7152, 0.0722]))
         ev = min(whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", strength))
         exposed = whole.image(relit, ev).pixels * np.float32(2.0**ev)

@@ -21,8 +21,9 @@ from skimage.metrics import structural_similarity
 from facerf_cli.errors import InputError
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relight, relit_by
+from facerf_cli.pipeline import Person, find_for, fit, head_of, reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
@@ -83,9 +84,9 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
             continue
         found = {"copy": np.repeat(photo[None], len(weights), 0)}
         for kind in ("field", "portrait"):
-            reflectance = reflectance_of(models, head, kind, photo=photo)
-            composition = composition_of(models, photo, head, reflectance, Target(background="none"))
-            relit = relit_by(composition, head, reflectance, rig, weights)
+            person = Person(models, photo, head, reflectance_of(models, head, kind, photo=photo))
+            composition = person.composed(Target(background="none"))
+            relit = composition.relit(Lights(rig, weights))
             found[kind] = np.stack([composition.image(one).pixels for one in relit])
         classes = view.portrait.classes.numpy() / 255
         alpha = view.alpha.numpy()
@@ -128,8 +129,8 @@ def _ssim(image: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:
 def print_speed(models: Models) -> None:
     """Print times in forward passes, and how well a photo comes back under its own light."""
     photo = read_image(ASTRONAUT).pixels
-    head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, "astronaut")[0])
-    field = reflectance_of(models, head, "portrait", photo=photo)
+    found = fit(models, photo, find_for(models.networks.parsing, "landmarks", photo, "astronaut")[0])
+    field = found.reflectance
     assert isinstance(field, PortraitField)
     rig = rig_directions(150)
     summary = rig_directions(48)
@@ -139,8 +140,7 @@ def print_speed(models: Models) -> None:
     times, _ = best_s(ways, 3)
     print(", ".join(f"{name} {seconds:.3f} s" for name, seconds in times.items()), end="; ")
     print(f"ratio {times['150 lights'] / times['a forward pass']:.1f}")
-    own = own_light(models, head.face).light
-    image = relight(models, photo, head, own, reflectance=field).pixels
+    image = found.image(own_light(models, found.head.face).light).pixels
     inside = field.person.segmentation.matte > 0.9
     error = float(((image - photo)[inside] ** 2).mean())
     print(f"the photo under its own light: {10 * np.log10(1 / error):.1f} dB inside the matte")

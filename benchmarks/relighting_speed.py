@@ -23,7 +23,8 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.files.images import read_image
 from facerf_cli.light.envmap import envmap_weights, rotated_weights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.pipeline import fit_photo, reflectance_of, relit_by
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.pipeline import fit_photo, reflectance_of
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import normal_map
 from facerf_cli.relighting.composition import Composition
@@ -80,7 +81,7 @@ def report_second_map(models: Models, rig: Tensor, side: int) -> None:
     photo = read_image(ASTRONAUT).pixels
     face = find_faces(models.networks.parsing, photo, "astronaut")[0]
     head = fit_photo(models, photo, face.landmarks_px, models.sides(side))
-    reflectance, composition = reflectance_of(models, head), Composition(models.face, photo, head)
+    composition = Composition(models.face, photo, head, reflectance=reflectance_of(models, head))
     maps = [
         torch.from_numpy(read_image(path).pixels)
         for path in sorted((ROOT / "examples" / "maps").glob("*.exr"))
@@ -88,7 +89,7 @@ def report_second_map(models: Models, rig: Tensor, side: int) -> None:
 
     def relit(count: int) -> None:
         weights = torch.stack([envmap_weights(envmap, rig) for envmap in maps[:count]])
-        for one in relit_by(composition, head, reflectance, rig, weights):
+        for one in composition.relit(Lights(rig, weights)):
             composition.image(one)
 
     seconds, _ = best_s({"one map": lambda: relit(1), "all maps": lambda: relit(len(maps))}, _ROUNDS)

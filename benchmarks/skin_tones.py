@@ -18,8 +18,9 @@ from _common import arguments, required
 
 from facerf_cli.image.colour import ExposureRule, luminance
 from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
+from facerf_cli.pipeline import find_for, fit
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, load_models
@@ -88,11 +89,10 @@ def measured(
     wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
-    head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, "the photo")[0])
-    reflectance = reflectance_of(models, head, "portrait", photo=photo)
-    composition = composition_of(models, photo, head, reflectance, Target(background="none"))
+    person = fit(models, photo, find_for(models.networks.parsing, "landmarks", photo, "the photo")[0])
+    composition = person.composed(Target(background="none"))
     shown = {}
-    lit = relit_by(composition, head, reflectance, rig, torch.cat([lamp, natural[1:]]))
+    lit = composition.relit(Lights(rig, torch.cat([lamp, natural[1:]])))
     for light, relit in zip(("lamp", "daylight"), lit, strict=True):
         face = np.percentile(luminance(composition.image(relit).pixels)[skin], PERCENTILES)
         for rule in RULES:

@@ -211,7 +211,7 @@ def relight(
         raise ValueError("photo is not the one that the head was fitted in; fit it again")
     with torch.no_grad():
         of_head = pipeline.reflectance_of(models, head, reflectance, network_alone, photo=photo)
-        image = pipeline.relight(models, photo, head, rig, target, of_head)
+        image = pipeline.Person(models, photo, head, of_head).image(rig, target)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])
 
 

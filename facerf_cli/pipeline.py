@@ -1,6 +1,6 @@
 """The method, one function an arrow: from one photo to the face under any light, from any head pose.
 
-    photo -> fit_photo or regress_photo -> head -> reflectance_of -> relight -> image
+    photo -> fit_photo or regress_photo -> head -> reflectance_of -> Person -> image
                                             head -> estimate_light -> light
                                             head -> predict_olat -> a texture for each light
 
@@ -8,8 +8,9 @@ The verbs on photos, the protocols of `evaluate` and most benchmarks call these 
 scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in camera space (docs/design.md).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import NearLights
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.parsing import ParsingNetwork
@@ -35,19 +36,16 @@ from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.portrait.segment import segment
-from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, Relit, RelitImage, Surround, Target
+from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
     MEMORY_BYTES,
     Field,
-    near_texture,
     photo_evidence,
     shrunk,
-    weighted_sums,
 )
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.own_light import own_light, photo_quotient
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
-from facerf_cli.relighting.whole_person import WholePerson
 
 
 def fit_photo(
@@ -147,23 +145,49 @@ def reflectance_of(
     return PortraitField.of(models.face, head, field, own, person, maps_of(models.networks.portrait, person))
 
 
-def composition_of(
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One face of a photo [H, W, 3], fitted once: each light, pose and layer then costs what itself costs.
+
+    Without a photo it is the face alone, in the frame of its crop.
+    """
+
+    models: Models
+    photo: np.ndarray | None
+    head: Head
+    reflectance: Reflectance
+
+    @cached_property
+    def matte(self) -> np.ndarray:
+        """The person's share [H, W] of the photo."""
+        assert self.photo is not None
+        if isinstance(self.reflectance, PortraitField):
+            return self.reflectance.person.segmentation.matte
+        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
+        return segment(self.models.networks.parsing, to_display(self.photo), landmarks_px).matte
+
+    def composed(self, target: Target = AS_IN_PHOTO) -> Composition:
+        """Prepare images of the person in a pose, before a background, that differ by their light alone."""
+        if self.photo is not None and target.composite == "photo" and target.matte is None:
+            target = replace(target, matte=self.matte)
+        return Composition(self.models.face, self.photo, self.head, target, self.reflectance)
+
+    def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
+        """The person under one light (paper, 'Relighting')."""
+        composition = self.composed(target)
+        return composition.image(next(composition.relit(Lights.of_rig(light))))
+
+
+def fit(
     models: Models,
-    photo: np.ndarray | None,
-    head: Head,
-    reflectance: Reflectance,
-    target: Target = AS_IN_PHOTO,
-) -> Composition:
-    """Compose a head in its photo; of a portrait field the whole person is relit."""
-    if photo is None or target.composite == "face":
-        return Composition(models.face, photo, head, target)
-    person = WholePerson(photo, reflectance) if isinstance(reflectance, PortraitField) else None
-    matte = target.matte
-    if matte is None:
-        matte = person.matte if person else person_matte(models, photo, head)
-    if target.alpha is not None:
-        matte = matte * target.alpha
-    return Composition(models.face, photo, head, replace(target, matte=matte), person)
+    photo: np.ndarray,
+    face: FaceBox,
+    kind: RelightKind = "portrait",
+    sides: Sides | None = None,
+) -> Person:
+    """Fit a face found in a photo [H, W, 3], and read its reflectance."""
+    head = head_of(models, photo, face, sides)
+    return Person(models, photo, head, reflectance_of(models, head, kind, photo=photo))
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,73 +297,3 @@ def estimate_light(
     refined = refine_light(evidence, weights, layers, estimator.non_negative)
     light = RigLight(rig, refined.weights)
     return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
-
-
-def person_matte(models: Models, photo: np.ndarray, head: Head) -> np.ndarray:
-    """Matte [H, W] of the person whose head was fitted in a photo."""
-    landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
-    return segment(models.networks.parsing, to_display(photo), landmarks_px).matte
-
-
-def relight(
-    models: Models,
-    photo: np.ndarray | None,
-    head: Head,
-    light: RigLight,
-    target: Target = AS_IN_PHOTO,
-    reflectance: Reflectance | None = None,
-) -> RelitImage:
-    """Relight the head of a photo [H, W, 3] (paper, 'Relighting').
-
-    Without a photo the face alone is shown, in the frame of its crop. `reflectance` is read from the head
-    if it is not given.
-    """
-    if reflectance is None:
-        reflectance = reflectance_of(models, head)
-    composition = composition_of(models, photo, head, reflectance, target)
-    weights = light.weights[None]
-    relit = next(relit_by(composition, head, reflectance, light.directions, weights, target))
-    return composition.image(relit)
-
-
-def relit_by(
-    composition: Composition,
-    head: Head,
-    reflectance: Reflectance,
-    directions: Tensor,
-    weights: Tensor,
-    target: Target = AS_IN_PHOTO,
-    near: NearLights | None = None,
-) -> Iterator[Relit]:
-    """Relight a head under M sums, rgb weights [M, L, 3], of lights [L, 3] and near ones, for a composition.
-
-    One prediction of the lights serves all sums. Of the field, which is linear in light, the surround is
-    summed over its lights, too; the models that the paper compares with are not linear where they are
-    clamped.
-    """
-    surround = composition.surround
-    turn = None if target.fit is None else head.fit.turn_to(target.fit.rotation)
-    lamps = near.around(composition.vertices_m.mean(0)) if near else []
-    if isinstance(surround, WholePerson) and isinstance(reflectance, PortraitField):
-        lit = reflectance.lit(directions, weights, lamps)
-        textures = reflectance.field.relit(directions, weights)
-        for points, some in lamps:
-            texture = near_texture(reflectance.field, points, composition.vertices_m, textures.shape[-1])
-            textures = textures + some[..., None, None] * texture
-        yield from map(Relit, reflectance.blended(textures, lit), lit.stacked)
-        return
-    changes = surround.changes if isinstance(surround, Surround) else None
-    pairs: Iterable[tuple[Tensor, Tensor | None]]
-    if changes and isinstance(reflectance, Field):
-        olats = reflectance.olats(directions, turn)
-        pairs = zip(*weighted_sums(olats, weights, lambda olats: olats, changes), strict=True)
-    else:
-        textures = reflectance.relit(directions, weights, turn)
-        pairs = ((x, changes(x[None])[0] if changes else None) for x in textures)
-    side = head.face.texture.shape[-1]
-    extra = [near_texture(reflectance, points, composition.vertices_m, side, turn) for points, _ in lamps]
-    for number, pair in enumerate(pairs):
-        relit = Relit(*pair)
-        for texture, (_, some) in zip(extra, lamps, strict=True):
-            relit = relit.plus(some[number], texture, changes(texture[None])[0] if changes else None)
-        yield relit

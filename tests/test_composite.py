@@ -24,13 +24,13 @@ from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwra
 from facerf_cli.relighting.composition import (
     Background,
     Composition,
-    PersonAround,
     PhotoDetail,
     Relit,
     RelitImage,
     Surround,
     Target,
 )
+from facerf_cli.relighting.whole_person import WholePerson
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
@@ -299,7 +299,7 @@ def test_what_is_before_the_face_is_not_of_it() -> None:
     whole = composition.face_share(rows)
     half = np.tile(np.arange(WIDTH_PX) < WIDTH_PX // 2, (HEIGHT_PX, 1))
     covered = SimpleNamespace(bare_face=half.__getitem__)
-    composition._person = cast(PersonAround, covered)
+    composition.person = cast(WholePerson, covered)
     left, columns = composition.view.window[1].start, np.arange(whole.shape[1])
     np.testing.assert_array_equal(composition.face_share(rows), whole * (left + columns < WIDTH_PX // 2))
 

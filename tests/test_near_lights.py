@@ -1,71 +1,63 @@
 """Near and soft lights on a whole person: sums, distance, shadows, and agreement with far lights."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.face.head import Head
-from facerf_cli.files.images import read_image
 from facerf_cli.image.strips import whole
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
-from facerf_cli.light.studio_points import NearLights, far_samples
-from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relit_by
-from facerf_cli.portrait.find import find_faces
+from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.relighting.composition import Composition, Target
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
+from tests import astronaut
 
-PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 TARGET = Target(background="none")
 DARK = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3)
 KEY, RIM = StudioLight(at_m=(0.5, 0.3, 0.8), size_m=0.3), StudioLight(at_m=(-0.6, 0.5, -0.4), spot_deg=50)
 
 
-class Person:
-    """The astronaut, and what relights her."""
+class Shown:
+    """The astronaut, and images of her."""
 
     def __init__(self) -> None:
-        self.models: Models = load_models()
-        self.photo = read_image(PHOTO).pixels
-        landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, self.photo, "astronaut")[0].landmarks_px
-        self.head: Head = fit_photo(self.models, self.photo, landmarks_px, self.models.sides(128))
-        field = reflectance_of(self.models, self.head, "portrait", photo=self.photo)
-        assert isinstance(field, PortraitField)
-        self.field = field
-        self.composition: Composition = composition_of(self.models, self.photo, self.head, field, TARGET)
-        self.matte = field.person.segmentation.matte
+        self.field: PortraitField = astronaut.field()
+        self.composition: Composition = astronaut.person().composed(TARGET)
+        self.matte = self.field.person.segmentation.matte
 
     def image(self, *lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
         """The person under near lights of a colour."""
-        near = NearLights(lights, torch.tensor(rgb).expand(1, len(lights), 3))
-        return self._shown(*DARK, near)
+        return over_black(self.composition, near(*lights, rgb=rgb))
 
     def under(self, directions: Tensor, shares: Tensor) -> np.ndarray:
         """The person under far lights [L, 3], white, of shares [L]."""
-        return self._shown(directions, shares[None, :, None].expand(-1, -1, 3), None)
+        return over_black(self.composition, Lights(directions, shares[None, :, None].expand(-1, -1, 3)))
 
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""
-        near = NearLights((light,), torch.ones(1, 1, 3)).around(self.composition.vertices_m.mean(0))
-        return self.field.lit(*DARK, near).reached[0, 0]
+        lights = near(light)
+        around = lights.around(self.composition.vertices_m.mean(0))
+        return self.field.lit(lights.directions, lights.weights, around).reached[0, 0]
 
-    def _shown(self, directions: Tensor, weights: Tensor, near: NearLights | None) -> np.ndarray:
-        given = (self.composition, self.head, self.field, directions, weights, TARGET, near)
-        relit = next(relit_by(*given))
-        return whole(self.composition.light_layer(relit), *self.composition.size_px)
+
+def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Lights:
+    return Lights(*DARK, lights, torch.tensor(rgb).expand(1, len(lights), 3))
+
+
+def over_black(composition: Composition, lights: Lights) -> np.ndarray:
+    return whole(composition.light_layer(next(composition.relit(lights))), *composition.size_px)
 
 
 @pytest.fixture(scope="module")
-def person() -> Person:
-    return Person()
+def person() -> Shown:
+    return Shown()
 
 
-def test_lights_add_up(person: Person) -> None:
+def test_lights_add_up(person: Shown) -> None:
     both, key, rim = (person.image(*lights) for lights in ((KEY, RIM), (KEY,), (RIM,)))
     assert key.max() > 0.1 and rim.max() > 0.1
     np.testing.assert_allclose(both, key + rim, atol=1e-3 * both.max())
@@ -73,16 +65,16 @@ def test_lights_add_up(person: Person) -> None:
     np.testing.assert_allclose(doubled, key * (2, 0.5, 0), atol=1e-3 * doubled.max())
 
 
-def test_a_near_light_far_away_is_a_far_light(person: Person) -> None:
+def test_a_near_light_far_away_is_a_far_light(person: Shown) -> None:
     """3 km away; a ray that grazes the proxy may differ, so the mean is compared."""
     direction = azel_to_direction(40.0, 20.0)
     x, y, z = (3000 * direction).tolist()
-    near, far = person.image(StudioLight(at_m=(x, y, z))), person.under(direction[None], torch.ones(1))
-    assert np.abs(near - far).mean() < 1e-3 * far[person.matte > 0.5].mean()
-    assert np.abs(near - far).max() < 0.1 * far.max()
+    close, far = person.image(StudioLight(at_m=(x, y, z))), person.under(direction[None], torch.ones(1))
+    assert np.abs(close - far).mean() < 1e-3 * far[person.matte > 0.5].mean()
+    assert np.abs(close - far).max() < 0.1 * far.max()
 
 
-def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Person) -> None:
+def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Shown) -> None:
     """Irradiance (d0 / d)^2 across the person: right by the head the near side has more of the light."""
     place = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, 1.0]), dim=0)
     shares = []
@@ -96,13 +88,13 @@ def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Pers
     assert shares[0] > 1.3 * shares[1]
 
 
-def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Person) -> None:
+def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown) -> None:
     """Lambert's law, by the proxy's positions: also on hair and garment, where no other field is mixed in."""
     maps = person.field.maps
     dark = {name: 0 * getattr(maps, name) for name in ("gloss", "lit", "around", "shadow")}
     matt = replace(person.field, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
     light = StudioLight(at_m=(0.1, 0.2, 0.3))
-    ((points, rgb),) = NearLights((light,), torch.ones(1, 1, 3)).around(person.composition.vertices_m.mean(0))
+    ((points, rgb),) = near(light).around(person.composition.vertices_m.mean(0))
     lit = matt.lit(*DARK, [(points, rgb)])
     offsets = points.places_m[0, :, None, None] - person.field.person.maps.positions_m
     cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)
@@ -112,7 +104,7 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Person
     torch.testing.assert_close(lit.shading[0, 0][reached], wanted[reached], rtol=2e-3, atol=1e-4)
 
 
-def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Person) -> None:
+def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Shown) -> None:
     skin = person.field.person.segmentation.layer("skin")[:] > 0.9
     means = [person.image(StudioLight(at_m=(0.0, 0.0, z)))[skin].mean() for z in (1.0, 4.0)]
     assert means[0] == pytest.approx(
@@ -121,7 +113,7 @@ def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Perso
 
 
 @pytest.mark.parametrize("is_near", [True, False], ids=["at", "from"])
-def test_large_lights_cast_soft_shadows(person: Person, is_near: bool) -> None:
+def test_large_lights_cast_soft_shadows(person: Shown, is_near: bool) -> None:
     """The slopes of the shadows on the skin are lower, the larger the light; the skin's share is the same."""
     x, y, z = azel_to_direction(60.0, 40.0).tolist()
 
@@ -139,21 +131,20 @@ def test_large_lights_cast_soft_shadows(person: Person, is_near: bool) -> None:
     assert means == pytest.approx([means[0]] * 3, abs=0.05)
 
 
-def test_a_light_inside_the_head_does_not_reach_the_face(person: Person) -> None:
+def test_a_light_inside_the_head_does_not_reach_the_face(person: Shown) -> None:
     skin = person.field.person.classes[1] > 0.95
     assert person.reached_by(StudioLight(at_m=(0.0, 0.1, -0.12)))[skin].mean() < 0.2
 
 
 @pytest.mark.parametrize("kind", ["field", "diffuse-sh"])
-def test_other_models_have_near_lights_too(person: Person, kind: str) -> None:
+def test_other_models_have_near_lights_too(person: Shown, kind: str) -> None:
     """Their textures add up, and so does what surrounds the face where it follows the field."""
-    reflectance = reflectance_of(person.models, person.head, kind)  # type: ignore[arg-type]
-    composition = composition_of(person.models, person.photo, person.head, reflectance, TARGET)
+    models, photo, head = astronaut.models(), astronaut.photo(), astronaut.head()
+    reflectance = reflectance_of(models, head, kind)  # type: ignore[arg-type]
+    composition = Person(models, photo, head, reflectance).composed(TARGET)
 
     def image(*lights: StudioLight) -> np.ndarray:
-        near = NearLights(lights, torch.ones(1, len(lights), 3))
-        relit = next(relit_by(composition, person.head, reflectance, *DARK, TARGET, near))
-        return whole(composition.light_layer(relit), *composition.size_px)
+        return over_black(composition, near(*lights))
 
     both, key, rim = image(KEY, RIM), image(KEY), image(RIM)
     np.testing.assert_allclose(

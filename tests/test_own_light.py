@@ -1,21 +1,17 @@
 """The light of a photo, by faces that the field itself has lit."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.files.images import read_image
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.pipeline import fit_photo
-from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.field import Field, shrunk
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.own_light import light_of_frames, own_light
+from tests import astronaut
 
-PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
 OFF_DEG = 7.0  # the last ring of the search has 6; the nearest light of the rig is 16 to 18 away
 RIG_DEG = 10.0
@@ -24,14 +20,12 @@ COLOUR = 0.25  # relative error of the lamp's colour: the photo shows it only ti
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models()
+    return astronaut.models()
 
 
 @pytest.fixture(scope="module")
-def face(models: Models) -> FaceTexture:
-    photo = read_image(PHOTO).pixels
-    head = fit_photo(models, photo, find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px)
-    small = shrunk(head.face)
+def face() -> FaceTexture:
+    small = shrunk(astronaut.head().face)
     return replace(small, visible=torch.ones_like(small.visible))
 
 

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,34 +9,25 @@ from facerf_cli.baselines import Kind
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import region_mask
-from facerf_cli.files.images import read_image
 from facerf_cli.light.estimate import estimate_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
-from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of, relight
-from facerf_cli.portrait.find import find_faces
+from facerf_cli.pipeline import Estimator, Person, estimate_light, predict_olat, reflectance_of
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.field import photo_evidence, weighted_sum
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
-
-PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
+from facerf_cli.relighting.models import Models
+from tests import astronaut
 
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models()
+    return astronaut.models()
 
 
 @pytest.fixture(scope="module")
-def photo() -> np.ndarray:
-    return read_image(PHOTO).pixels
-
-
-@pytest.fixture(scope="module")
-def head(models: Models, photo: np.ndarray) -> Head:
-    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px
-    return fit_photo(models, photo, landmarks_px, models.sides(128))
+def head() -> Head:
+    return astronaut.head()
 
 
 def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head) -> None:
@@ -76,17 +66,17 @@ def test_a_face_that_is_hardly_seen_has_no_light_to_read(head: Head) -> None:
 
 
 @pytest.mark.parametrize("kind", ["field", "portrait"])
-def test_two_lights_apart_add_up_to_both_at_once(
-    models: Models, photo: np.ndarray, head: Head, kind: Kind
-) -> None:
+def test_two_lights_apart_add_up_to_both_at_once(kind: Kind) -> None:
     """The whole person is linear in light."""
-    reflectance = reflectance_of(models, head, kind, photo=photo)
+    person = astronaut.person()
+    if kind == "field":
+        person = replace(person, reflectance=astronaut.field().field)
     directions = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
     rgb = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.1, 0.1]])
 
     def image(weights: torch.Tensor) -> np.ndarray:
         light = RigLight(directions, weights)
-        return relight(models, photo, head, light, Target(background="none"), reflectance).pixels
+        return person.image(light, Target(background="none")).pixels
 
     first = image(rgb * torch.tensor([[1.0], [0.0]]))
     second = image(rgb * torch.tensor([[0.0], [1.0]]))
@@ -101,7 +91,8 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     turned = replace(head.fit, rotation=pose_to_rotation(30, 0, 0))
     straight = replace(head.fit, rotation=pose_to_rotation(0, 0, 0))
     targets = [Target(fit, "face") for fit in (straight, turned)]
-    images = [relight(models, None, head, light, target) for target in targets]
+    person = Person(models, None, head, reflectance_of(models, head))
+    images = [person.image(light, target) for target in targets]
     for image in images:
         assert image.alpha is not None and image.pixels.shape == (256, 256, 3)
         assert (image.pixels[image.alpha == 0] == 0).mean() > 0.5

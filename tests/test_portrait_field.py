@@ -1,7 +1,6 @@
 """The portrait field of a photo: its own light gives the photo back, and the whole person is relit."""
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -10,48 +9,39 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
-from facerf_cli.face.head import Head
-from facerf_cli.files.images import read_image
 from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.pipeline import composition_of, fit_photo, reflectance_of, relight, relit_by
+from facerf_cli.pipeline import Person, fit, reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.composition import Target
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField, maps_of
 from facerf_cli.relighting.whole_person import WholePerson
-
-PHOTO = Path(__file__).parents[1] / "examples/astronaut.jpg"
+from tests import astronaut
 
 
 @pytest.fixture(scope="module")
 def models() -> Models:
-    return load_models()
+    return astronaut.models()
 
 
 @pytest.fixture(scope="module")
 def photo() -> np.ndarray:
-    return read_image(PHOTO).pixels
+    return astronaut.photo()
 
 
 @pytest.fixture(scope="module")
-def head(models: Models, photo: np.ndarray) -> Head:
-    return fit_photo(
-        models,
-        photo,
-        find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].landmarks_px,
-        models.sides(128),
-    )
+def person() -> Person:
+    return astronaut.person()
 
 
 @pytest.fixture(scope="module")
-def field(models: Models, photo: np.ndarray, head: Head) -> PortraitField:
-    found = reflectance_of(models, head, "portrait", photo=photo)
-    assert isinstance(found, PortraitField)
-    return found
+def field() -> PortraitField:
+    return astronaut.field()
 
 
 @dataclass
@@ -72,10 +62,10 @@ def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
 
 
 def test_under_its_own_light_the_photo_comes_back(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
-    own = own_light(models, head.face).light
-    image = relight(models, photo, head, own, reflectance=field).pixels
+    models, head = person.models, person.head
+    image = person.image(own_light(models, head.face).light).pixels
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
     assert 10 * np.log10(1 / error) > 35
@@ -85,11 +75,8 @@ def test_under_its_own_light_the_photo_comes_back(
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
-    head = fit_photo(
-        models, grey, find_faces(SHIPPED_NETWORKS.parsing, grey, "grey")[0].landmarks_px, models.sides(64)
-    )
-    field = reflectance_of(models, head, "portrait", photo=grey)
-    image = relight(models, grey, head, lamp(60), Target(background="none"), field).pixels
+    face = find_faces(SHIPPED_NETWORKS.parsing, grey, "grey")[0]
+    image = fit(models, grey, face, sides=models.sides(64)).image(lamp(60), Target(background="none")).pixels
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 
 
@@ -117,13 +104,11 @@ def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
 
 
 def test_a_lamp_lights_the_side_that_it_is_on(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
     target = Target(background="none")
-    right, left = (
-        relight(models, photo, head, lamp(azimuth), target, field).pixels.mean(-1) for azimuth in (75, -75)
-    )
+    right, left = (person.image(lamp(azimuth), target).pixels.mean(-1) for azimuth in (75, -75))
     matte = field.person.segmentation.matte > 0.5
     columns = np.arange(photo.shape[1])
     middle = field.person.square.x0_px + field.person.square.side_px / 2
@@ -135,23 +120,18 @@ def test_a_lamp_lights_the_side_that_it_is_on(
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
 
 
-def test_a_lamp_behind_leaves_the_face_dark(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField
-) -> None:
+def test_a_lamp_behind_leaves_the_face_dark(photo: np.ndarray, person: Person, field: PortraitField) -> None:
     target = Target(background="none")
-    behind, ahead = (
-        relight(models, photo, head, lamp(azimuth, 10), target, field).pixels for azimuth in (180, 0)
-    )
+    behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
 
 def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
-    light = lamp(40, 30)
-    composition = composition_of(models, photo, head, field)
-    relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
+    composition = person.composed()
+    relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
     layers = filled(composition.layers(names, relit), *composition.size_px)
     assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
@@ -159,21 +139,20 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= -0.01  # the correction may darken a highlight
     assert composition.image(relit).pixels.min() >= -0.01
-    face_alone = composition_of(models, None, head, field)
+    face_alone = replace(person, photo=None).composed()
     with pytest.raises(UsageError, match="--aov albedo"):
         face_alone.layers(("albedo",), relit)
 
 
 def test_no_pixel_depends_on_the_strip_that_it_is_in(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField, monkeypatch: pytest.MonkeyPatch
+    photo: np.ndarray, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Image and layers of a photo are the same in one strip and in strips of 32 rows."""
-    light = lamp(40, 30)
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 
     def shown() -> list[np.ndarray]:
-        composition = composition_of(models, photo, head, field)
-        relit = next(relit_by(composition, head, field, light.directions, light.weights[None]))
+        composition = person.composed()
+        relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
         layers = filled(composition.layers(names, relit), *composition.size_px)
         return [composition.image(relit).pixels, *layers.values()]
 
@@ -218,7 +197,7 @@ def test_without_light_all_is_black(field: PortraitField) -> None:
     assert lit.stacked.shape == (2, 9, *field.person.image.shape[1:]) and lit.stacked.abs().max() == 0
 
 
-def test_a_turned_head_is_the_fields(models: Models, head: Head, field: PortraitField) -> None:
+def test_a_turned_head_is_the_fields(field: PortraitField) -> None:
     light, turn = lamp(20), torch.eye(3)
     turned = field.relit(light.directions, light.weights[None], turn)
     torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))

@@ -25,17 +25,18 @@ from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.image.metrics import tone_of
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
     Estimator,
-    composition_of,
     explain,
     find_for,
     head_of,
     reflectance_of,
-    relight,
-    relit_by,
+)
+from facerf_cli.pipeline import (
+    Person as FittedPerson,
 )
 from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
@@ -63,7 +64,7 @@ class Method:
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
-        return relight(self.models, None, head, light, target, reflectance).pixels
+        return FittedPerson(self.models, None, head, reflectance).image(light, target).pixels
 
     def images(
         self,
@@ -76,10 +77,9 @@ class Method:
     ) -> Iterator[np.ndarray]:
         """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, network_alone, photo=photo)
-        composition = composition_of(self.models, photo, head, reflectance, target)
-        relit = relit_by(composition, head, reflectance, directions, weights, target)
-        for of_row in relit:
-            yield composition.image(of_row).pixels
+        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
+        for relit in composition.relit(Lights(directions, weights)):
+            yield composition.image(relit).pixels
 
 
 LIGHTS_DEG = (0, 30, 60, 90, 180)  # between a light and the camera's axis

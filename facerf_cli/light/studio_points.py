@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
-from facerf_cli.light.sphere import azel_to_direction, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio import StudioLight
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
@@ -104,18 +104,54 @@ class PointLights:
 
 
 @dataclass(frozen=True, eq=False)
-class NearLights:
-    """J near lights, and their rgb weights [M, J, 3] in M sums."""
+class Lights:
+    """M sums of lights: far ones from unit directions [L, 3], camera space, and J near ones; rgb weights.
 
-    lights: tuple[StudioLight, ...]
-    weights: Tensor
+    A light of weight 1 gives a white Lambertian surface that faces it radiance 1; of a near one, at the
+    face's centre. A rig's light is one sum.
+    """
+
+    directions: Tensor
+    weights: Tensor  # [M, L, 3]
+    near: tuple[StudioLight, ...] = ()
+    near_weights: Tensor | None = None  # [M, J, 3]
+
+    @staticmethod
+    def of_rig(light: RigLight) -> "Lights":
+        """A rig's light, as the only sum."""
+        return Lights(light.directions, light.weights[None])
+
+    @staticmethod
+    def each(directions: Tensor) -> "Lights":
+        """Each light [L, 3] alone, of rgb 1."""
+        return Lights(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3))
+
+    def __len__(self) -> int:
+        return len(self.weights)
+
+    def __getitem__(self, sums: slice) -> "Lights":
+        """Some of the sums, without the near lights that shine in none of them."""
+        if self.near_weights is None:
+            return Lights(self.directions, self.weights[sums])
+        some = self.near_weights[sums]
+        used = (some != 0).any(0).any(1)
+        near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
+        return Lights(self.directions, self.weights[sums], near, some[:, used])
 
     def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
-        """The lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
-        return [
-            (PointLights.of(light, centre_m), self.weights[:, number])
-            for number, light in enumerate(self.lights)
-        ]
+        """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
+        weights = () if self.near_weights is None else self.near_weights.unbind(1)
+        return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
+
+    def strengths(self) -> list[float]:
+        """Luminance of all light of each sum, from wherever it comes.
+
+        Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
+        """
+        total = self.weights.sum(1)
+        if self.near_weights is not None:
+            total = total + self.near_weights.sum(1)
+        return [float(value) for value in luminance(total.numpy())]
 
 
 def _grid(axis: Tensor, wide_deg: float) -> Tensor:

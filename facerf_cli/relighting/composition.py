@@ -15,9 +15,9 @@ the surround, which is clipped, and for the photo's background, which no light c
 negative weights, such as the paper's plain least squares gives, can make pixels negative.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
+from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
@@ -35,9 +36,13 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
 from facerf_cli.image.strips import Band, Layer, by_rows, filled
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint
+from facerf_cli.relighting.field import Field, near_texture, weighted_sums
+from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.whole_person import WholePerson
 
 _DARK = 0.08  # e above, a share of the source's mean
 _NOISY = 2.0  # times e: the luminance below which colours of pixels are noise
@@ -105,35 +110,11 @@ class RelitImage:
     alpha: np.ndarray | None = None
 
 
-class AroundFace(Protocol):
-    """Surroundings of the face that are relit: `Surround`, or the whole person of a portrait field."""
-
-    @property
-    def nbytes(self) -> int:
-        """Size of one light's tensor."""
-
-    def over_photo(self, photo: Pixels, lit: Tensor, display_ev: float) -> Band:
-        """The photo's pixels [H, W, 3] under the light of a tensor [C, s, s]; `display_ev` shows it well."""
-
-
-class PersonAround(AroundFace, Protocol):
-    """A photo's person under sums of lights: `WholePerson`."""
-
-    matte: np.ndarray  # the person's share of the photo [H, W]
-    bare_face: Band  # share [H, W] of the pixels that show the face itself, without hair or a hand before it
-
-    def layer(self, name: str, lit: Tensor) -> dict[str, Layer]:
-        """One of `PERSON_LAYERS` under a light, by the names that it has in a file."""
-
-    def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
-        """The exposure of the person under a light, by a rule."""
-
-
 class Composition:
     """Compose relit textures of one head into one frame: the photo's, or without a photo the crop's own.
 
-    What does not depend on the light is computed once. `person` relights all of the photo's person; without
-    it what lies around the face follows the face's light.
+    What does not depend on the light is computed once. With a portrait field, in a photo, all of its person
+    is relit; else what lies around the face follows the face's light.
     """
 
     def __init__(
@@ -142,7 +123,7 @@ class Composition:
         photo: np.ndarray | None,
         head: Head,
         target: Target = AS_IN_PHOTO,
-        person: PersonAround | None = None,
+        reflectance: Reflectance | None = None,
     ) -> None:
         fit = head.fit if target.fit is None else target.fit
         self.vertices_m = vertices = fit.vertices_camera(model)  # [V, 3], camera space
@@ -150,26 +131,71 @@ class Composition:
         crop = Crop(0.0, 0.0, float(fit.crop.size_px), fit.crop.size_px) if photo is None else fit.crop
         self.view = view_face(vertices, photo_camera(crop, *size_px), crop.side_px)
         self._photo = photo if target.composite == "photo" else None
+        self._head, self._target, self._reflectance = head, target, reflectance
         self.own: Pixels
-        self._face, self._target = head.face, target
-        self.detail: PhotoDetail | None = None
-        self.surround: AroundFace | None = None
-        self._person = person
-        if self._photo is not None:
-            matte, self.own = target.matte, self._photo
-            self.matte = np.broadcast_to(np.float32(1), size_px)
-            if matte is not None:
-                self.matte = matte.astype(np.float32, copy=False)
-                self.own = PersonColours(self._photo, self.matte)
-            seen = self.own.small if isinstance(self.own, PersonColours) else self._photo
-            self.guide_ev = display_ev(seen)
-            self.detail = PhotoDetail(head.face, self.view)
-            self.surround = person or Surround(vertices, crop, head.face.texture, size_px[1])
+        self.surround: Surround | WholePerson | None = None
+        self.person: WholePerson | None = None
+        if self._photo is None:
+            return
+        if isinstance(reflectance, PortraitField):
+            self.person = WholePerson(self._photo, reflectance)
+        matte, self.own = target.matte, self._photo
+        if matte is None and self.person:
+            matte = self.person.matte
+        if matte is not None and target.alpha is not None:
+            matte = matte * target.alpha
+        self.matte = np.broadcast_to(np.float32(1), size_px)
+        if matte is not None:
+            self.matte = matte.astype(np.float32, copy=False)
+            self.own = PersonColours(self._photo, self.matte)
+        shown = self.own.small if isinstance(self.own, PersonColours) else self._photo
+        self._display_ev = display_ev(shown)
+        self._detail = PhotoDetail(head.face, self.view)
+        self.surround = self.person or Surround(vertices, crop, head.face.texture, size_px[1])
 
     @property
     def size_px(self) -> tuple[int, int]:
         """Height and width of the frame."""
         return self.view.height_px, self.view.width_px
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the head under one sum of lights."""
+        return self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)
+
+    def relit(self, lights: Lights) -> Iterator[Relit]:
+        """Relight the head under each sum of lights (paper, 'Relighting'); one prediction serves all sums.
+
+        Of the field, which is linear in light, the surround is summed over its lights, too; the models that
+        the paper compares with are not linear where they are clamped.
+        """
+        reflectance, directions, weights = self._reflectance, lights.directions, lights.weights
+        near = lights.around(self.vertices_m.mean(0))
+        fit, side = self._target.fit, self._head.face.texture.shape[-1]
+        turn = None if fit is None else self._head.fit.turn_to(fit.rotation)
+        assert reflectance is not None
+        if self.person and isinstance(reflectance, PortraitField):
+            lit = reflectance.lit(directions, weights, near)
+            textures = reflectance.field.relit(directions, weights)
+            for points, rgb in near:
+                texture = near_texture(reflectance.field, points, self.vertices_m, side)
+                textures = textures + rgb[..., None, None] * texture
+            yield from map(Relit, reflectance.blended(textures, lit), lit.stacked)
+            return
+        changes = self.surround.changes if isinstance(self.surround, Surround) else None
+        pairs: Iterable[tuple[Tensor, Tensor | None]]
+        if changes and isinstance(reflectance, Field):
+            olats = reflectance.olats(directions, turn)
+            pairs = zip(*weighted_sums(olats, weights, lambda olats: olats, changes), strict=True)
+        else:
+            textures = reflectance.relit(directions, weights, turn)
+            pairs = ((x, changes(x[None])[0] if changes else None) for x in textures)
+        extra = [near_texture(reflectance, points, self.vertices_m, side, turn) for points, _ in near]
+        for number, pair in enumerate(pairs):
+            relit = Relit(*pair)
+            for texture, (_, rgb) in zip(extra, near, strict=True):
+                relit = relit.plus(rgb[number], texture, changes(texture[None])[0] if changes else None)
+            yield relit
 
     def image(self, relit: Relit, ev: float = 0.0, behind: Band | None = None) -> RelitImage:
         """The head in its frame as relit, scene-linear; see `bands`."""
@@ -207,9 +233,9 @@ class Composition:
 
     def _relit_person(self, relit: Relit) -> Band:
         """Pixels [H, W, 3], by rows, of the person, also where the matte leaves none of them."""
-        assert self.surround is not None and self.detail is not None and relit.surround is not None
-        around = self.surround.over_photo(self.own, relit.surround, self.guide_ev)
-        detail, view = self.detail.relit(self.own, relit.texture), self.view
+        assert self.surround is not None and relit.surround is not None
+        around = self.surround.over_photo(self.own, relit.surround, self._display_ev)
+        detail, view = self._detail.relit(self.own, relit.texture), self.view
 
         def of(rows: slice) -> np.ndarray:
             person = around(rows)
@@ -224,13 +250,13 @@ class Composition:
     def face_share(self, inside: slice) -> np.ndarray:
         """Share [h, w] of the face in rows of the view's window, without what is seen before it."""
         mask = self.view.mask[inside].numpy()
-        if self._person is None:
+        if self.person is None:
             return mask
-        return np.asarray(mask * self._person.bare_face(self.view.in_photo(inside))[:, self.view.window[1]])
+        return np.asarray(mask * self.person.bare_face(self.view.in_photo(inside))[:, self.view.window[1]])
 
-    def person(self, relit: Relit) -> tuple[Band, Band]:
+    def person_and_share(self, relit: Relit) -> tuple[Band, Band]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
-        mask, person = self._mask, self._person
+        mask, person = self._mask, self.person
 
         def share(rows: slice) -> np.ndarray:
             own = mask(rows) if person is None else person.matte[rows]
@@ -256,8 +282,8 @@ class Composition:
         if self._photo is not None:
             found["person.A"] = self.matte
         for name in names:
-            if self._person is not None and relit.surround is not None and name in PERSON_LAYERS:
-                found |= self._person.layer(name, relit.surround)
+            if self.person is not None and relit.surround is not None and name in PERSON_LAYERS:
+                found |= self.person.layer(name, relit.surround)
             elif name in FACE_LAYERS:
                 found |= self._face_layer(name)
             else:
@@ -278,11 +304,11 @@ class Composition:
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV of a relit head, by a rule."""
-        if self._person is not None and relit.surround is not None:
-            return self._person.exposure_ev(relit.surround, rule)
-        textures = relit.texture, self._face.texture
+        if self.person is not None and relit.surround is not None:
+            return self.person.exposure_ev(relit.surround, rule)
+        textures = relit.texture, self._head.face.texture
         lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
-        seen = self._face.visible.numpy()
+        seen = self._head.face.visible.numpy()
         return chosen_exposure_ev(rule, lit, plate, seen, seen)
 
 
@@ -411,10 +437,12 @@ class GroupComposition:
     def __init__(self, compositions: Sequence[Composition]) -> None:
         self._first, *self._others = compositions
 
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Height and width of the photo."""
-        return self._first.size_px
+        self.size_px = self._first.size_px
+        self.nbytes = sum(one.nbytes for one in compositions)
+
+    def relit(self, lights: Lights) -> Iterator[Group]:
+        """The people under each sum of lights."""
+        return zip(*(one.relit(lights) for one in (self._first, *self._others)), strict=True)
 
     def bands(self, relit: Group, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The people in the photo's frame; see `Composition.bands`."""
@@ -451,7 +479,7 @@ class GroupComposition:
 
     def _people(self, relit: Group) -> Iterator[tuple[Band, Band]]:
         for composition, one in zip(self._others, relit[1:], strict=True):
-            yield composition.person(one)
+            yield composition.person_and_share(one)
 
 
 def _over(top: Band, share: Band, below: Band) -> Band:

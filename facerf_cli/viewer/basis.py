@@ -23,7 +23,8 @@ from facerf_cli.image.colour import (
 )
 from facerf_cli.image.strips import fitted, resized, whole
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.pipeline import composition_of, relit_by
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.pipeline import Person
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import Models
@@ -148,14 +149,13 @@ def basis_of_photo(
     The images of single lights are composed small; their mean is composed as large as the photo [H, W, 3].
     """
     small_photo, small_head = shrunk_photo(photo, head, RATIO_PX)
-    small = composition_of(
-        models, small_photo, small_head, _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
-    )
+    small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
+    small = Person(models, small_photo, small_head, small_field).composed()
     rig = rig_directions()
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []
     mean: Relit | None = None
-    for relit in _single(composition, head, field, rig):
+    for relit in _single(composition, rig):
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
         part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
@@ -180,11 +180,10 @@ def _samples(coarse: np.ndarray, field: PortraitField) -> LightSamples:
     return LightSamples(coarse[:, _some(face)], coarse[:, _some(person)], (plate[0], plate[1]))
 
 
-def _single(composition: Composition, head: Head, field: PortraitField, lights: Tensor) -> Iterator[Relit]:
+def _single(composition: Composition, lights: Tensor) -> Iterator[Relit]:
     """A head under each of lights [L, 3] of rgb 1."""
     for some in torch.split(lights, _LIGHTS_AT_ONCE):
-        weights = torch.eye(len(some))[..., None].expand(-1, -1, 3)
-        yield from relit_by(composition, head, field, some, weights)
+        yield from composition.relit(Lights.each(some))
 
 
 def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) -> PortraitField:

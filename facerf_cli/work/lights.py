@@ -1,4 +1,4 @@
-"""Light setups as weights of lights: their maps read, drawn or estimated from a photo."""
+"""The lights of setups: maps read, drawn or estimated from a photo, and single lights; and their balls."""
 
 import logging
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,10 +14,9 @@ from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
-from facerf_cli.image.colour import luminance
 from facerf_cli.light.envmap import ball, rotated_weights
 from facerf_cli.light.rig_latlong import rig_to_latlong
-from facerf_cli.light.studio_points import NearLights, far_samples, intensity_of
+from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.light_of_photo import light_of_photo
@@ -59,44 +58,26 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def weights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
-    """Directions [L, 3] and rgb weights [M, L, 3] of M setups, without their near lights.
-
-    Maps are integrated over the rig's lights; single lights follow them as additional lights.
-    """
-    directions, weights = weights_of_far_lights(setups)
+def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
+    """The lights of M setups: maps integrated over the rig's lights, and single lights."""
+    single = single_lights(setups)
     if not any(setup.envmap for setup in setups):
-        return directions, weights
+        return single
     every = directions_of(rig)
     of_maps = _map_weights(setups, every, sampling)
-    return torch.cat([every, directions]), torch.cat([of_maps, weights], 1)
+    directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
+    return replace(single, directions=directions, weights=weights)
 
 
-def strengths(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> list[float]:
-    """Luminance of all light of each of M setups, from wherever it comes.
-
-    Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
-    """
-    total, near = weights_over_rig(setups, rig, sampling)[1].sum(1), near_lights_of(setups)
-    if near is not None:
-        total = total + near.weights.sum(1)
-    return [float(value) for value in luminance(total.numpy())]
-
-
-def weights_of_far_lights(setups: Sequence[LightSetup]) -> tuple[Tensor, Tensor]:
-    """Directions [L, 3] and rgb weights [M, L, 3] of the far lights of M setups; at least one, if dark."""
-    directions, weights = [], []
+def single_lights(setups: Sequence[LightSetup]) -> Lights:
+    """The lights of M setups without their maps; at least one far light, if dark, and each near one once."""
+    directions, weights = [torch.tensor([[0.0, 0.0, 1.0]])], [torch.zeros(len(setups), 1, 3)]
     for row, towards, rgb in _far_lights(setups):
         directions.append(towards)
         weights.append(torch.zeros(len(setups), len(towards), 3))
         weights[-1][row] = rgb
-    if not directions:
-        return torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(len(setups), 1, 3)
-    return torch.cat(directions), torch.cat(weights, 1)
-
-
-def near_lights_of(setups: Sequence[LightSetup]) -> NearLights | None:
-    """The near lights of M setups, each prepared once for all of them; None without any."""
+    some = slice(len(directions) > 1, None)
+    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -104,21 +85,26 @@ def near_lights_of(setups: Sequence[LightSetup]) -> NearLights | None:
         if light.at_m is not None
     ]
     if not near:
-        return None
+        return far
     lights = tuple(dict.fromkeys(light for _, light, _ in near))
-    weights = torch.zeros(len(setups), len(lights), 3)
+    near_weights = torch.zeros(len(setups), len(lights), 3)
     for row, light, rgb in near:
-        weights[row, lights.index(light)] += rgb
-    return NearLights(lights, weights)
+        near_weights[row, lights.index(light)] += rgb
+    return replace(far, near=lights, near_weights=near_weights)
 
 
-def weights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
-    """Weights [M, L, 3] of M setups over a stack's lights [L, 3]; single lights are moved to the nearest."""
+def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
+    """A setup for each light of a setup."""
+    return tuple(replace(setup, lights=(light,)) for light in setup.lights)
+
+
+def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
+    """The lights of M setups by a stack's own [L, 3]; single lights are moved to the nearest."""
     weights = _map_weights(setups, directions, sampling)
     for row, towards, rgb in _far_lights(setups):
         nearest = (towards @ directions.T).argmax(1)
         weights[row].index_add_(0, nearest, rgb)
-    return weights
+    return Lights(directions, weights)
 
 
 def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:

@@ -1,10 +1,8 @@
 """Images written in every format of the options."""
 
 import logging
-import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -13,21 +11,11 @@ import numpy as np
 
 from facerf_cli.cli.output_options import SUFFIXES, Format, OutputOptions
 from facerf_cli.errors import UsageError
-from facerf_cli.files.atomic import hidden_folder
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
-from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
 
 Exposure = float | Literal["auto"]
-_FLOATS = (
-    "rgb",
-    "A",
-    "person.A",
-    "position",
-    "depth",
-    "uv",
-)  # layers that are not only written as half floats
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -74,30 +62,6 @@ def write_output(
     at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1
     with ThreadPoolExecutor(at_once) as pool:
         list(pool.map(write, options.formats))
-
-
-@contextmanager
-def canvas(path: Path, held_bytes: int) -> Iterator[Callable[[str, tuple[int, ...]], np.ndarray]]:
-    """Yield a function that makes an array for a layer of an output, by its name and shape.
-
-    Arrays that do not fit the budget, with what is held already, are mapped to files in a hidden folder of
-    the output: the parts of an EXR are written one after the other. There layers that an EXR holds in half
-    floats are half floats.
-    """
-    with ExitStack() as stack:
-        left, folders = memory.limit_bytes() - held_bytes, list[Path]()
-
-        def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
-            nonlocal left
-            needed = 4 * math.prod(shape)
-            if left > needed:
-                left -= needed
-                return np.empty(shape, np.float32)
-            folders[:] = folders or [stack.enter_context(hidden_folder(path))]
-            kind = np.float32 if name in _FLOATS else np.float16
-            return np.memmap(folders[0] / f"{name}.values", kind, "w+", shape=shape)
-
-        yield empty
 
 
 def _space_of(options: OutputOptions) -> ColourSpace:

@@ -30,8 +30,8 @@ from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidenc
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
-from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.work.plan import KEPT_PX, beside_photo
 
 
 def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> Path:
@@ -56,8 +56,6 @@ def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> 
     raise InputError(f"{item.input_path}: {option} has no {candidates[0]}; add it there")
 
 
-_PHOTO_BYTES = 12  # of a pixel of the photo that is held
-_KEPT_PX = 12  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the view of a face
 _MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
 LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
@@ -110,7 +108,7 @@ def face_model(options: PhotoOptions) -> MorphableModel:
     return load_face_model(options.face_model)
 
 
-def read_photo(item: Item, options: PhotoOptions, kept_px: int = _KEPT_PX) -> LinearImage:
+def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> LinearImage:
     """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
     image = read_image(item.input_path, space, kept_px=kept_px)
@@ -260,7 +258,7 @@ def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
     """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
     path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
-    with memory.beside(_PHOTO_BYTES * math.prod(size_px)):
+    with beside_photo(size_px):
         image = read_image(path, "linear")
     matte = image.pixels.mean(-1) if image.alpha is None else image.alpha
     if matte.shape != tuple(size_px):

@@ -25,7 +25,6 @@ from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.work.outputs import canvas
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
@@ -39,11 +38,10 @@ from facerf_cli.work.photos import (
     read_photo,
     stamp,
 )
+from facerf_cli.work.plan import KEPT_OF_SEGMENTS_PX, segments_canvas
 from facerf_cli.work.sequence import segmented_frame
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
-_HELD_PX = 38  # bytes of a pixel: the photo, and
-_KEPT_PX = 26  # bytes of a pixel beside the photo: an 8-bit copy, the matte, the colours, a class
 _OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 # Hues of the classes but the background, in the order of CLASSES; near ones differ.
@@ -61,7 +59,7 @@ def write_segments(
         image, face, found = segmented_frame(*place, options)
         _write_segment(item, "", image, to_display(image.pixels), face, found)
         return [""], facts_of_networks(options)
-    image = read_photo(item, options, _KEPT_PX)
+    image = read_photo(item, options, KEPT_OF_SEGMENTS_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     parsing = load_models_once(options).networks.parsing
@@ -78,8 +76,8 @@ def _write_segment(
 
     metadata, found = stamp(item), found.cut(image.alpha)
     height, width = found.matte.shape
-    colours, held = PersonColours(image.pixels, found.matte)[:], _HELD_PX * height * width
-    with canvas(path("_segment.exr"), held) as empty:
+    colours = PersonColours(image.pixels, found.matte)[:]
+    with segments_canvas(path("_segment.exr"), (height, width)) as empty:
         layers = {"person.A": found.matte, **filled(found.layers(), height, width, empty)}
         write_exr(path("_segment.exr"), colours, found.matte, layers, metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)

@@ -19,7 +19,7 @@ from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.images import LinearImage, write_display
-from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.olat_stack import StackHeader, stream_olats, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.image.colour import (
@@ -30,10 +30,11 @@ from facerf_cli.image.colour import (
     encode_display,
 )
 from facerf_cli.image.strips import Band, Layer, filled, resized, resized_rows, whole
-from facerf_cli.pipeline import composition_of, predict_olat, reflectance_of, relit_by
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.pipeline import Person, predict_olat, reflectance_of
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.composition import Relit, Target
-from facerf_cli.run import memory
+from facerf_cli.relighting.field import weighted_sum
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
@@ -44,11 +45,11 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
+from facerf_cli.work.plan import prediction_bytes, require_web_images
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 _FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
-_HALF_AND_SHOWN = 9  # bytes a pixel of an image for web viewers: half floats, then bytes
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
 
 
@@ -92,8 +93,7 @@ def _from_in_front(item: Item, directions: Tensor) -> Tensor:
 def _write_relight_web(folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
     """Write the images, exposed alike so that the brightest is well shown."""
     lights, (height, width) = len(header.directions), header.seen.shape
-    needed = _HALF_AND_SHOWN * lights * height * width
-    memory.require(f"--format relight of {lights} lights", needed, "fewer --lights or a smaller --size")
+    require_web_images(lights, (height, width))
     halves, brightest = [], torch.zeros(height, width)
     for batch in olats:
         halves.append(batch.half())
@@ -118,16 +118,14 @@ def _of_person(
     """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
-    reflectance = reflectance_of(models, head, "portrait", work.network_alone, memory.limit_bytes(), photo)
+    field = reflectance_of(models, head, "portrait", work.network_alone, prediction_bytes(), photo)
     alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
-    target = Target(alpha=alpha, background="none")
-    composition = composition_of(models, photo, head, reflectance, target)
+    composition = Person(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
     size = composition.size_px
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
-            single = torch.eye(len(some))[..., None].expand(-1, -1, 3)
-            relit = relit_by(composition, head, reflectance, some, single)
+            relit = composition.relit(Lights.each(some))
             layers = np.stack([whole(composition.light_layer(one), *size) for one in relit])
             batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
@@ -135,9 +133,8 @@ def _of_person(
             tiles.append(small.permute(0, 2, 3, 1).numpy())
             yield batch
 
-    single = torch.eye(1)[..., None].expand(-1, -1, 3)
-    relit = next(iter(relit_by(composition, head, reflectance, directions[:1], single)))
-    normals = filled(composition.layers(("normal",), relit), *size)["normal"]
+    first = next(composition.relit(Lights.each(directions[:1])))
+    normals = filled(composition.layers(("normal",), first), *size)["normal"]
     header = StackHeader(
         kind="photo",
         directions=directions.numpy(),
@@ -170,7 +167,7 @@ def _olats(
         directions,
         rotation_of(work.pose),
         work.network_alone,
-        memory.limit_bytes(),
+        prediction_bytes(),
         work.precision == "bf16",
     )
     for textures in olats:
@@ -230,45 +227,69 @@ _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedStack:
-    """Composes stacks of images that are rendered already; seen [H, W] is the face's coverage."""
+class StackTextures:
+    """The OLAT textures in a stack as a `Reflectance`; the head stays in the pose of the stack."""
 
-    seen: np.ndarray
-    normals: np.ndarray  # [H, W, 3]
+    path: Path
+
+    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
+        """Sums [M, 3, T, T] of the stack's lights by weights [M, L, 3]."""
+        return weighted_sum(stream_olats(self.path), weights)
+
+
+@dataclass(frozen=True, eq=False)
+class _StackImages:
+    """The images of a stack, summed light by light."""
+
+    header: StackHeader
+    path: Path
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one sum."""
+        return 12 * self.header.seen.size
+
+    def relit(self, lights: Lights) -> Iterator[Relit]:
+        """Sums of the stack's lights."""
+        return map(Relit, weighted_sum(stream_olats(self.path), lights.weights))
+
+
+class RenderedStack(_StackImages):
+    """Composes stacks of images that are rendered already, of the face and its coverage."""
 
     @property
     def size_px(self) -> tuple[int, int]:
         """Height and width of the images."""
-        return self.seen.shape[0], self.seen.shape[1]
+        height, width = self.header.seen.shape
+        return height, width
 
     def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The face as relit, with its coverage as alpha."""
         pixels = _pixels(relit)
-        return {"rgb": pixels, "A": self.seen}
+        return {"rgb": pixels, "A": self.header.seen}
 
     def light_layer(self, relit: Relit) -> Band:
         """The face under one of several lights, over black."""
         pixels = _pixels(relit)
-        return lambda rows: pixels[rows] * self.seen[rows][..., None]
+        return lambda rows: pixels[rows] * self.header.seen[rows][..., None]
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """The layer of normals; raises UsageError for others."""
-        return _only_normals(names, self.normals)
+        return _only_normals(names, self.header.normals)
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure that shows the face well, whatever the rule: there is no photo to compare with."""
-        return auto_exposure_ev(_pixels(relit), self.seen)
+        return auto_exposure_ev(_pixels(relit), self.header.seen)
 
 
 @dataclass(frozen=True, eq=False)
-class PersonStack:
+class PersonStack(_StackImages):
     """Composes stacks of a photo's person over black, alone, or with `photo` [H, W, 3] in that photo.
 
     The photo may be larger than the stack: then the change of light is enlarged, and the photo keeps its
     detail. `keeps_background` shows the photo's own.
     """
 
-    header: StackHeader
     face: np.ndarray  # [H, W] coverage, by which the exposure is chosen
     photo: np.ndarray | None = None
     keeps_background: bool = True

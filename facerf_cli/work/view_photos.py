@@ -19,7 +19,7 @@ from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_he
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.pipeline import composition_of, reflectance_of
+from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
@@ -74,7 +74,7 @@ def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plat
     """The basis of a photo's person, and what a page shows around it."""
     field = reflectance_of(models, head, "portrait", photo=photo)
     assert isinstance(field, PortraitField)
-    composition = composition_of(models, photo, head, field)
+    composition = Person(models, photo, head, field).composed()
     basis = basis_of_photo(models, photo, head, field, composition)
     matte = composition.matte
     background = photo - matte[..., None] * composition.own[:]

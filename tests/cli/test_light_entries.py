@@ -11,7 +11,7 @@ from facerf_cli.cli.lights import collect_setups
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
 from facerf_cli.light.studio import StudioLight
-from facerf_cli.work.lights import near_lights_of, strengths, weights_over_rig
+from facerf_cli.work.lights import lights_over_rig
 
 
 def single(text: str) -> StudioLight:
@@ -152,23 +152,23 @@ def test_every_preset_is_a_rig() -> None:
 def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
     entries = ["name=a;at=0,0,1;stops=1", "b=30,0", "at=0,0,1;rgb=1,0,0", "at=0,0,2"]
     setups = collect_setups([], None, entries, Path("out"))  # the image of names comes last
-    near = near_lights_of(setups)
-    assert near is not None and [light.at_m for light in near.lights] == [(0, 0, 1), (0, 0, 2)]
-    assert near.weights.tolist() == [
+    lights = lights_over_rig(setups, "150", "cell")
+    assert [light.at_m for light in lights.near] == [(0, 0, 1), (0, 0, 2)]
+    assert lights.near_weights is not None and lights.near_weights.tolist() == [
         [[1, 0, 0], [0, 0, 0]],
         [[0, 0, 0], [1, 1, 1]],
         [[2, 2, 2], [0, 0, 0]],
     ]
-    directions, weights = weights_over_rig(setups, "150", "cell")
-    assert len(directions) == 1 and weights.sum((1, 2)).tolist() == [0, 0, 3]
-    assert near_lights_of(setups[:0]) is None
-    alone = weights_over_rig(setups[:1], "150", "cell")
-    assert len(alone[0]) == 1 and alone[1].abs().max() == 0  # a dark one, since models want one
+    assert len(lights.directions) == 1 and lights.weights.sum((1, 2)).tolist() == [0, 0, 3]
+    assert [light.at_m for light in lights[1:2].near] == [(0, 0, 2)]
+    alone = lights_over_rig(setups[:1], "150", "cell")
+    assert len(alone.directions) == 1 and alone.weights.abs().max() == 0  # a dark one, since models want one
 
 
 def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
     write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
     entries = ["0,0,3,3,3", "180,0", "at=0,0,1;stops=1", "from=around"]
     setups = collect_setups([str(tmp_path / "even.exr")], None, entries, Path("out"))
-    found = dict(zip([setup.name for setup in setups], strengths(setups, "150", "cell"), strict=True))
-    assert list(found.values()) == pytest.approx([2, 3, 1, 2, 4], rel=1e-3)  # an even map of 0.5 first
+    assert lights_over_rig(setups, "150", "cell").strengths() == pytest.approx(
+        [2, 3, 1, 2, 4], rel=1e-3
+    )  # an even map of 0.5 first

@@ -18,7 +18,7 @@ from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
-from facerf_cli.work.lights import readable, weights_over_rig, weights_over_stack, write_balls
+from facerf_cli.work.lights import lights_over_rig, lights_over_stack, readable, write_balls
 
 HEIGHT_PX = 16
 
@@ -54,7 +54,7 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     assert [setup.name for setup in setups] == ["a_light_rot90", "b_rot90"]
     assert "c.json has no 'format'; give a file that facerf wrote" in caplog.text
     (setup,) = collect_setups(given[:1], None, [], tmp_path / "out")
-    found = weights_over_stack((setup,), rig, "cell")[0]
+    found = lights_over_stack((setup,), rig, "cell")[0]
     assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
     with pytest.raises(UsageError, match="no inputs"):  # a folder is walked for maps alone
         collect_setups([str(tmp_path)], None, [], tmp_path / "out")
@@ -150,7 +150,8 @@ def test_a_lamp_and_a_one_texel_map_agree(tmp_path: Path, azimuth_deg: float) ->
     texel_deg = 360 / (2 * HEIGHT_PX)
     centre_deg = 180 - (math.floor(u * 2 * HEIGHT_PX) + 0.5) * texel_deg
     setups = collect_setups([str(envmap)], None, [f"{centre_deg},{elevation_deg}"], tmp_path / "out")
-    directions, weights = weights_over_rig(setups, "600", "cell")
+    lights = lights_over_rig(setups, "600", "cell")
+    directions, weights = lights.directions, lights.weights
     mean = torch.einsum("lc,ld->cd", weights[0], directions)
     lamp = torch.einsum("lc,ld->cd", weights[1], directions)
     torch.testing.assert_close(weights.sum(1), torch.ones(2, 3), rtol=2e-3, atol=0)
@@ -161,14 +162,16 @@ def test_a_lamp_and_a_one_texel_map_agree(tmp_path: Path, azimuth_deg: float) ->
 def test_rotation_adds_to_the_azimuth(tmp_path: Path) -> None:
     envmap = write_map(tmp_path / "one.exr", (0.5, 0.49))
     setups = collect_setups([str(envmap)], "40", [], tmp_path / "out")
-    directions, weights = weights_over_rig(setups, "600", "cell")
+    lights = lights_over_rig(setups, "600", "cell")
+    directions, weights = lights.directions, lights.weights
     azimuth = torch.atan2(*(weights[0, :, 0] @ directions)[[0, 2]].split(1))
     assert math.degrees(float(azimuth)) == pytest.approx(40 - 360 / (4 * HEIGHT_PX), abs=3)
 
 
 def test_lamps_shine_together_with_their_colours() -> None:
     setups = collect_setups([], None, ["90,0,1,0,0;-90,0,0,0,2", "0,0"], Path("out"))
-    directions, weights = weights_over_rig(setups, "150", "cell")
+    lights = lights_over_rig(setups, "150", "cell")
+    directions, weights = lights.directions, lights.weights
     assert directions.shape == (3, 3)  # the rig is not needed
     torch.testing.assert_close(directions[0], torch.tensor([1.0, 0, 0]), atol=1e-6, rtol=0)
     torch.testing.assert_close(weights[0], torch.tensor([[1.0, 0, 0], [0, 0, 2], [0, 0, 0]]))
@@ -178,7 +181,7 @@ def test_lamps_shine_together_with_their_colours() -> None:
 def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
     directions = rig_directions(50)
     setups = collect_setups([], None, ["30,20,1,2,3"], Path("out"))
-    weights = weights_over_stack(setups, directions, "cell")
+    weights = lights_over_stack(setups, directions, "cell").weights
     nearest = int((directions - azel_to_direction(30.0, 20.0)).norm(dim=-1).argmin())
     torch.testing.assert_close(weights[0, nearest], torch.tensor([1.0, 2, 3]))
     assert int((weights != 0).any(-1).sum()) == 1
@@ -221,7 +224,7 @@ def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     drawn = collect_setups(["procedural:2"], "0:360:2", [], tmp_path / "out", seed=3)
     assert [(setup.name, setup.frame) for setup in drawn] == [(setup.name, setup.frame) for setup in files]
     assert readable(drawn) == drawn
-    rigs = [weights_over_rig(setups, "12", "cell")[1] for setups in (files, drawn)]
+    rigs = [lights_over_rig(setups, "12", "cell").weights for setups in (files, drawn)]
     np.testing.assert_allclose(rigs[0], rigs[1], rtol=2e-3, atol=1e-4)
     balls(drawn[:1], tmp_path / "out", None)
     assert (tmp_path / f"out/balls/{drawn[0].name}.0000.png").exists()

@@ -4,17 +4,16 @@ import json
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
-from facerf_cli.pipeline import relit_by
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composition import Relit
+from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.sky.skies import kind_of
@@ -91,7 +90,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.work.relight._HELD", 1 << 30)  # so that one frame fits
+    monkeypatch.setattr("facerf_cli.work.plan._RELIT_HELD", 1 << 30)  # so that one frame fits
     line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
     assert relight(given, tmp_path, *line) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
@@ -108,14 +107,16 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
 ) -> None:
     held: list[weakref.ref] = []
 
-    def watched(*arguments: Any) -> Iterator[Relit]:
+    def watched(self: Composition, lights: Lights) -> Iterator[Relit]:
         assert sum(one() is not None for one in held) <= kept
-        for one in relit_by(*arguments):
+        for one in relit(self, lights):
             held.append(weakref.ref(one.texture))
             yield one
 
-    monkeypatch.setattr("facerf_cli.work.relight._HELD", 1 << 30)  # so that one light fits
-    monkeypatch.setattr("facerf_cli.work.relight.relit_by", watched)
+    relit = Composition.relit
+
+    monkeypatch.setattr("facerf_cli.work.plan._RELIT_HELD", 1 << 30)  # so that one light fits
+    monkeypatch.setattr(Composition, "relit", watched)
     assert relight(given, tmp_path, *lights, "--composite", composite) == 0
     assert len(held) > 2
 

@@ -16,7 +16,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import relight
+from facerf_cli.pipeline import Person as FittedPerson
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
@@ -81,7 +81,7 @@ class Double(Method):
         reflectance = Unlit(head.face, self.gain)
         for row in weights:
             light = RigLight(directions, row)
-            yield relight(self.models, photo, head, light, target, reflectance).pixels
+            yield FittedPerson(self.models, photo, head, reflectance).image(light, target).pixels
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,7 +148,7 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
     fits = Counter[str]()
     monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(
-        pipeline, "person_matte", lambda models, photo, head: np.ones(photo.shape[:2], np.float32)
+        pipeline.Person, "matte", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
     )
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own

@@ -12,7 +12,7 @@ from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import relight
+from facerf_cli.pipeline import Person
 from facerf_cli.portrait.find import Face
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.relighting.composition import Target
@@ -37,7 +37,7 @@ class Lambert:
         assert not network_alone and head.face.texture.shape == (3, 256, 256)
         for row in weights:
             light = RigLight(directions, row)
-            yield relight(self.models, photo, head, light, target, reflectance=self).pixels
+            yield Person(self.models, photo, head, self).image(light, target).pixels
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))

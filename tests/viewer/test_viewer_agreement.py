@@ -13,7 +13,8 @@ from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_displa
 from facerf_cli.image.strips import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
-from facerf_cli.pipeline import composition_of, find_for, head_of, reflectance_of, relit_by
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.pipeline import Person, find_for, head_of, reflectance_of
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.portrait_field import PortraitField
@@ -34,7 +35,7 @@ class Shown:
     text: str
 
     def relit(self, directions: torch.Tensor, weights: torch.Tensor) -> Relit:
-        return next(relit_by(self.whole, self.head, self.field, directions, weights[None]))
+        return next(self.whole.relit(Lights(directions, weights[None])))
 
     def truth(self, relit: Relit, ev: float) -> np.ndarray:
         """The PNG of `facerf relight` [H, W, 3]."""
@@ -58,7 +59,7 @@ def shown() -> Shown:
     assert isinstance(field, PortraitField)
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
-    whole = composition_of(models, photo, head, field)
+    whole = Person(models, photo, head, field).composed()
     return Shown(head, field, whole, page("me", "me.jpg", document, ""))
 
 

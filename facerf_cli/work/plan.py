@@ -1,0 +1,96 @@
+"""What a photo costs in memory (docs/memory.md): who is refused, how many lights are held, what goes to disk.
+
+Readers ask, by a file's header, for what they decode; what work makes of a photo is asked for here alone.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from facerf_cli.files.atomic import hidden_folder
+from facerf_cli.run import memory
+
+Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # an array for a layer, by its name and shape
+
+# Bytes of a pixel beside the photo that is read.
+KEPT_PX = 12  # an 8-bit copy, the matte, the view of a face; of a stack's photo an image for several formats
+KEPT_OF_SEGMENTS_PX = 26  # an 8-bit copy, the matte, the colours, a class
+# Bytes of a pixel that is held.
+_PHOTO_PX = 12
+_PERSON_PX = 24  # photo, matte and the view of a face
+_STACK_PX = 130
+_SEGMENTS_PX = _PHOTO_PX + KEPT_OF_SEGMENTS_PX
+_IMAGE_PX = 12
+_WEB_PX = 9  # of an image for web viewers: half floats, then bytes
+_RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
+# Layers that are not only written as half floats.
+_FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")
+
+
+def beside_photo(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
+    """What is read meanwhile is held with a photo [H, W]."""
+    return memory.beside(_PHOTO_PX * math.prod(size_px))
+
+
+def beside_person(size_px: tuple[int, ...], images: int = 0) -> AbstractContextManager[None]:
+    """What is read meanwhile is held with a photo [H, W], its person and further images of its size."""
+    return memory.beside((_PERSON_PX + images * _IMAGE_PX) * math.prod(size_px))
+
+
+def beside_stack(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
+    """What is read meanwhile is held with a stack of images [H, W]."""
+    return memory.beside(_STACK_PX * math.prod(size_px))
+
+
+def prediction_bytes() -> int:
+    """What a network's prediction may take."""
+    return memory.limit_bytes()
+
+
+def batches(count: int, bytes_each: int) -> list[slice]:
+    """As many of some sums of lights at a time as fit the memory."""
+    at_once = max(1, memory.limit_bytes() // (_RELIT_HELD * bytes_each))
+    return [slice(first, first + at_once) for first in range(0, count, at_once)]
+
+
+def require_web_images(lights: int, size_px: tuple[int, int]) -> None:
+    """Raise InputError where images [H, W] of all lights do not fit."""
+    needed = _WEB_PX * lights * math.prod(size_px)
+    memory.require(f"--format relight of {lights} lights", needed, "fewer --lights or a smaller --size")
+
+
+def image_canvas(path: Path, size_px: tuple[int, int], formats: int) -> AbstractContextManager[Empty]:
+    """`canvas` of a relit image; the writer of each format may hold as much as an image."""
+    return canvas(path, formats * _IMAGE_PX * math.prod(size_px))
+
+
+def segments_canvas(path: Path, size_px: tuple[int, int]) -> AbstractContextManager[Empty]:
+    """`canvas` of the classes of a photo."""
+    return canvas(path, _SEGMENTS_PX * math.prod(size_px))
+
+
+@contextmanager
+def canvas(path: Path, held_bytes: int) -> Iterator[Empty]:
+    """Yield a function that makes arrays for the layers of an output.
+
+    Arrays that do not fit the budget, with what is held already, are mapped to files in a hidden folder of
+    the output: the parts of an EXR are written one after the other. There layers that an EXR holds in half
+    floats are half floats.
+    """
+    with ExitStack() as stack:
+        left, folders = memory.limit_bytes() - held_bytes, list[Path]()
+
+        def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
+            nonlocal left
+            needed = 4 * math.prod(shape)
+            if left > needed:
+                left -= needed
+                return np.empty(shape, np.float32)
+            folders[:] = folders or [stack.enter_context(hidden_folder(path))]
+            kind = np.float32 if name in _FLOATS else np.float16
+            return np.memmap(folders[0] / f"{name}.values", kind, "w+", shape=shape)
+
+        yield empty
