@@ -33,7 +33,7 @@ from facerf_cli.evaluation.yale_b import (
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import fit_photo, head_of, relight
+from facerf_cli.pipeline import Person, fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
@@ -202,13 +202,14 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     sitter = Sitter(small, "yaleB07")
     photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
     head = fit_photo(models, photo, someone().landmarks_px)
+    person = Person(models, photo, head, reflectance_of(models, head))
     directions = torch.from_numpy(np.stack([flash.direction for flash in sitter.flashes])).float()
     for name, light in (("soft", "A-070E+00"), ("environment", "env_two_side")):
         questions = [Question(name, "win_left", light)]
         monkeypatch.setattr(Sitter, "questions", lambda self, asked=questions: iter(asked))
         (comparison,) = compare_sitter(small, "yaleB07", [Method("field", "field", models)])
         weights = torch.from_numpy(sitter.weights(light)).float()[:, None].expand(-1, 3)
-        expected = relight(models, photo, head, RigLight(directions, weights)).pixels.mean(-1).clip(0)
+        expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
         np.testing.assert_allclose(comparison.predictions["field"][..., 1], expected, rtol=1e-4, atol=1e-5)
 
 
