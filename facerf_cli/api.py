@@ -22,7 +22,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.files import images
 from facerf_cli.image.strips import filled
 from facerf_cli.light.envmap import check_envmap, envmap_weights
-from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import find_faces

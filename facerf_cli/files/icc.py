@@ -36,8 +36,7 @@ _SAME_MATRIX, _SAME_CURVE = 2e-3, 5e-4  # rounding in profiles of the same space
 _OUTSIDE = 0.1  # decoded values of a sound curve may leave 0..1 by this
 _FIXED = 65536  # s15Fixed16Number
 _MOST_TAGS, _MOST_ENTRIES = 200, 65536
-# Parameters of each function type: names g a b c d e f of the ICC specification.
-_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
+_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}  # how many each function type has
 
 
 def space_of_profile(profile: bytes, name: str) -> ColourSpace | None:
@@ -89,19 +88,23 @@ class _Curves:
 
 
 def _curve(tag: bytes) -> Curve:
-    """Parse a curveType or a parametricCurveType."""
+    """Parse a curveType or a parametricCurveType (names g a b c d e f of the ICC specification, table 68)."""
     if tag[:4] == b"para":
         (kind,) = struct.unpack_from(">H", tag, 8)
         if kind not in _PARAMETERS:
             raise ValueError(f"function type {kind}")
-        values = [value / _FIXED for value in struct.unpack_from(f">{_PARAMETERS[kind]}i", tag, 12)]
-        return _Parametric(kind, tuple(values))
+        g, *rest = (value / _FIXED for value in struct.unpack_from(f">{_PARAMETERS[kind]}i", tag, 12))
+        a, b = rest[:2] or (1.0, 0.0)
+        if kind < 3:  # without a line: below d it is constant
+            level = rest[2] if kind == 2 else 0.0
+            return _Parametric(g, a, b, 0.0, -b / a, level, level)
+        return _Parametric(g, *rest, *(0.0, 0.0)[: 6 - len(rest)])
     (count,) = struct.unpack_from(">I", tag, 8)
     if tag[:4] != b"curv" or count > _MOST_ENTRIES:
         raise ValueError("not a curve")
     if count <= 1:
         gamma = struct.unpack_from(">H", tag, 12)[0] / 256 if count else 1.0
-        return _Parametric(0, (gamma,))
+        return _Parametric(gamma)
     return _Table(tuple(value / 65535 for value in struct.unpack_from(f">{count}H", tag, 12)))
 
 
@@ -119,27 +122,19 @@ class _Table:
 
 @dataclass(frozen=True)
 class _Parametric:
-    """A function of table 68 of the ICC specification: (a x + b)^g + e from x = d on, and c x + f below."""
+    """(a x + b)^g + e from x = d on, and c x + f below."""
 
-    kind: int
-    parameters: tuple[float, ...]
+    g: float
+    a: float = 1.0
+    b: float = 0.0
+    c: float = 0.0
+    d: float = 0.0
+    e: float = 0.0
+    f: float = 0.0
 
     def __call__(self, encoded: np.ndarray) -> np.ndarray:
-        g, a, b, c, d, e, f = self._as_the_last_kind()
-        power = np.maximum(a * encoded + b, 0) ** g + e
-        return np.where(encoded >= d, power, c * encoded + f)
-
-    def _as_the_last_kind(self) -> tuple[float, ...]:
-        """Return g, a, b, c, d, e, f; types 0 to 3 leave some of them out."""
-        g, *rest = self.parameters
-        if self.kind == 0:
-            return g, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        a, b, *rest = rest
-        if self.kind == 1:
-            return g, a, b, 0.0, -b / a, 0.0, 0.0
-        if self.kind == 2:
-            return g, a, b, 0.0, -b / a, rest[0], rest[0]
-        return (g, a, b, *rest) if self.kind == 4 else (g, a, b, *rest, 0.0, 0.0)
+        power = np.maximum(self.a * encoded + self.b, 0) ** self.g + self.e
+        return np.where(encoded >= self.d, power, self.c * encoded + self.f)
 
 
 def _is_sound(space: ColourSpace) -> bool:

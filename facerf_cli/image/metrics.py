@@ -64,17 +64,6 @@ def si_mse_clipped(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) 
     return si_mse(prediction, np.minimum(truth, 1), mask)
 
 
-def si_rel(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return `si_mse` divided by the truth's mean square, 0..1, to compare dark and bright images.
-
-    The share of the truth's energy that no scale of the prediction explains: one minus the squared cosine of
-    the angle between them. NaN if the truth is black.
-    """
-    _, t, weight = _inside(prediction, truth, mask)
-    energy = float((weight * t * t).sum() / weight.sum())
-    return si_mse(prediction, truth, mask) / energy if energy > 0 else float("nan")
-
-
 def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     """Return `si_mse` with a scale for each channel, which ignores the colour of light and skin.
 

@@ -25,7 +25,7 @@ from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.files.sheets import labels
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.light.envmap import ball
-from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
 from facerf_cli.network.checkpoint import load_vgg

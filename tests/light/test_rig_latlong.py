@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.rig_latlong import rig_to_latlong
+from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, latlong_directions, rig_directions
 
 RIG = rig_directions()
