@@ -28,7 +28,7 @@ from facerf_cli.files.light_files import (
     write_numbers,
 )
 from facerf_cli.files.texts import read_rig
-from facerf_cli.run.logs import escaped, json_line, shown
+from facerf_cli.run.logs import escaped, json_line, printable_line
 
 # The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.
 DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)
@@ -47,7 +47,7 @@ def refused_or_read(read: Callable[[], object]) -> None:
     try:
         read()
     except FacerfError as error:
-        assert shown(str(error)) and shown(str(error)).isprintable()
+        assert printable_line(str(error)) and printable_line(str(error)).isprintable()
 
 
 @DRAWN
@@ -85,7 +85,7 @@ def test_a_row_of_any_text_is_one_printable_line(name: str) -> None:
 @DRAWN
 @given(text=TEXT)
 def test_what_is_shown_is_printable(text: str) -> None:
-    assert escaped(text).isprintable() and shown(text).isprintable()
+    assert escaped(text).isprintable() and printable_line(text).isprintable()
 
 
 @DRAWN

@@ -22,7 +22,7 @@ from pathlib import Path
 from benchmarks.faults import mutations
 from benchmarks.faults.doors import DOORS, Door
 from facerf_cli.errors import FacerfError
-from facerf_cli.run.logs import LOGGER_NAME, shown
+from facerf_cli.run.logs import LOGGER_NAME, printable_line
 
 MEMORY_BYTES, CASE_S, CHILD_CASES = 4 << 30, 60.0, 2000
 _LONGEST_MESSAGE = 3000
@@ -75,7 +75,7 @@ def outcome_of(door: Door, path: Path) -> tuple[str, str]:
 
 
 def _said_well(message: str) -> tuple[str, str]:
-    line = shown(message)
+    line = printable_line(message)
     if not line or len(line) > _LONGEST_MESSAGE or not line.isprintable():
         return "uncaught", f"message: {len(line)} characters: {line[:200]!a}"
     return "refused", ""

@@ -209,7 +209,7 @@ def _names(path: Path) -> None:
     """The file's content is a name: of an input, in a report, a page and a message."""
     from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
     from facerf_cli.batch.run import rows_of
-    from facerf_cli.run.logs import json_line, shown
+    from facerf_cli.run.logs import json_line, printable_line
     from facerf_cli.viewer.page import IndexEntry, index_page
 
     name = os.fsdecode(path.read_bytes().replace(b"/", b"").replace(b"\0", b"")[:180]) + ".png"
@@ -230,7 +230,7 @@ def _names(path: Path) -> None:
     (row,) = rows_of(report)
     assert row["item"] == json.loads(json_line({"item": item.name}))["item"]
     assert "<script>x" not in index_page([IndexEntry(f"<script>x{name}", name, "")])
-    assert shown(name).isprintable()
+    assert printable_line(name).isprintable()
 
 
 def _words(path: Path) -> None:

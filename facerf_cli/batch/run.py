@@ -24,7 +24,7 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, json_line, shown, unexpected
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, json_line, printable_line, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import process_died, spread
 
@@ -122,7 +122,7 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
         "input": result.item.input_path,
         "status": "failed" if result.error else "done",
         "seconds": result.seconds,
-        "error": shown(result.error) or None,
+        "error": printable_line(result.error) or None,
         "outputs": [
             path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
             for path in outcome.outputs

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.run.logs import shown
+from facerf_cli.run.logs import printable_line
 
 _MEMORY_BYTES = 6 << 30
 _TIME_S = 300
@@ -42,7 +42,7 @@ def arrays_apart(
             )
         except subprocess.TimeoutExpired:
             raise ValueError(f"reading it takes longer than {time_s:.0f} s") from None
-        said = shown(ended.stderr.decode(errors="replace"))
+        said = printable_line(ended.stderr.decode(errors="replace"))
         if ended.returncode == _REFUSED:
             raise ValueError(said)
         if ended.returncode:

@@ -26,7 +26,7 @@ from functools import cache
 from pathlib import Path
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.run.logs import LOGGER_NAME, shown
+from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
 
 if sys.platform != "win32":
@@ -236,7 +236,7 @@ def _wait_for(descriptor: int, lock: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        owner = shown(os.pread(descriptor, 20, 0).decode(errors="replace"))
+        owner = printable_line(os.pread(descriptor, 20, 0).decode(errors="replace"))
         wait = "%s: another facerf (process %s) writes there; waiting for it (--jobs and --shard share work)"
         log.warning(wait, lock.parent, owner)
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -435,7 +435,7 @@ def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = No
         mixed = soft if share is None else linear + share[..., None] * (soft - linear)
         return encode_display(mixed, PLAIN_VIEW)
     for name, matrix in _ocio_bridges():
-        found = ocio.shown(
+        found = ocio.displayed(
             _by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config, view.display
         )
         if found is not None:

@@ -55,7 +55,7 @@ def converted(pixels: np.ndarray, source: str, target: str, config: str = "") ->
     return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
 
 
-def shown(
+def displayed(
     pixels: np.ndarray, source: str, view: str, config: str = "", display_name: str = ""
 ) -> np.ndarray | None:
     """Encode values for a display, by default the configuration's, by a view; None if OpenColorIO cannot."""

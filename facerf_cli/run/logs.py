@@ -103,7 +103,7 @@ class LineFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Format the record as text."""
         prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
-        text = prefix + shown(record.getMessage())
+        text = prefix + printable_line(record.getMessage())
         if not record.exc_info:
             return text
         trace = self.formatException(record.exc_info).split("\n")
@@ -118,7 +118,7 @@ class JsonFormatter(logging.Formatter):
         row = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),
-            "message": shown(record.getMessage()),
+            "message": printable_line(record.getMessage()),
         }
         if record.exc_info:
             row["traceback"] = self.formatException(record.exc_info)
@@ -176,7 +176,7 @@ def escaped(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def shown(text: str) -> str:
+def printable_line(text: str) -> str:
     """The text as one printable line of limited length, for a log or a report."""
     line = escaped(one_line(text[: 4 * _LONGEST_LINE]))
     return line if len(line) <= _LONGEST_LINE else line[: _LONGEST_LINE - 3] + "..."

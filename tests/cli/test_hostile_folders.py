@@ -20,7 +20,7 @@ from facerf_cli.files.images import decode
 from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.olat_stack import is_olat_stack, read_olat_stack
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
-from facerf_cli.run.logs import json_line, shown
+from facerf_cli.run.logs import json_line, printable_line
 from tests.cli.toy_batch import run
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -64,8 +64,10 @@ def test_a_name_of_two_lines_fills_a_pattern(tmp_path: Path) -> None:
 
 def test_a_message_is_one_printable_line_of_limited_length() -> None:
     for name in HOSTILE:
-        assert shown(f"{name}: is bad").isprintable() and "is bad" in shown(f"{name}: is bad")
-    assert shown("\x1b[31m\u2028x") == "\\x1b[31m x" and len(shown("x" * 10**6)) <= 2000
+        assert printable_line(f"{name}: is bad").isprintable() and "is bad" in printable_line(
+            f"{name}: is bad"
+        )
+    assert printable_line("\x1b[31m\u2028x") == "\\x1b[31m x" and len(printable_line("x" * 10**6)) <= 2000
     assert json.loads(json_line({"name": "\x7f\u2028\U0001f642\U000e0001"})) == {
         "name": "\x7f\u2028\U0001f642\U000e0001"
     }
