@@ -15,10 +15,8 @@ from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.envmap import ball, rotated_weights
-from facerf_cli.light.rig_latlong import rig_to_latlong
-from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.light.forms import rig_to_latlong
-from facerf_cli.light.studio_points import NearLights, far_samples, intensity_of
+from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.light_of_photo import light_of_photo
