@@ -126,13 +126,9 @@ class FitStart:
 
 
 @dataclass(frozen=True)
-class FitBatch:
+class FitBatch(FitStart):
     """Fits of B faces, float64."""
 
-    rotation: Tensor  # [B, 3, 3], head to camera
-    translation_m: Tensor  # [B, 3]
-    alpha: Tensor  # [B, Ki]
-    beta: Tensor  # [B, Ke]
     error_iod: Tensor  # [B], see FaceFit
 
     def vertices_camera(self, model: MorphableModel) -> Tensor:
@@ -379,10 +375,9 @@ def fit_to_arrays(fit: FaceFit) -> dict[str, np.ndarray]:
 
     Numbers are in single precision: the last digits of a fit's doubles depend on memory alignment.
     """
-    numbers = {"error_iod": np.float32(fit.error_iod)}
-    tensors = {name: getattr(fit, name).numpy() for name in _TENSORS}
     crop = {name: np.array(value) for name, value in asdict(fit.crop).items()}
-    return {"model": np.array(fit.model), **numbers, **crop, **tensors}
+    tensors = {name: getattr(fit, name).numpy() for name in _TENSORS}
+    return {"model": np.array(fit.model), "error_iod": np.float32(fit.error_iod), **crop, **tensors}
 
 
 def fit_from_arrays(arrays: Mapping[str, np.ndarray]) -> FaceFit:

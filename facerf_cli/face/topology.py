@@ -23,7 +23,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from facerf_cli.raster.rasterize import Fragments, front_facing
-from facerf_cli.raster.texture import sample_texture
+from facerf_cli.raster.texture import sample_texture, smoothstep
 
 LAYOUT_VERSION = 1
 GRID = 129  # vertices along each side of the grid; odd, so that one column lies on the midline
@@ -164,11 +164,9 @@ def region_mask(name: str, side: int) -> Tensor:
     uv = np.stack(np.meshgrid(centre, centre), -1)
     distance_mm = inside_mm(name, uv)
     edge_mm = max(_EDGE_MM[name], UV_SIZE_MM.max() / side)  # never sharper than a texel
-    ramp = np.clip(distance_mm / edge_mm + 0.5, 0, 1)
-    mask = ramp * ramp * (3 - 2 * ramp)
-    mirrored = mask[:, ::-1]
-    mask = np.maximum(mask, mirrored) if name in _PAIRED else (mask + mirrored) / 2
-    return torch.from_numpy(mask).float()
+    mask = smoothstep(torch.from_numpy(distance_mm / edge_mm + 0.5))
+    mirrored = mask.flip(1)
+    return (torch.maximum(mask, mirrored) if name in _PAIRED else (mask + mirrored) / 2).float()
 
 
 def inside_mm(name: str, uv: np.ndarray) -> np.ndarray:
@@ -199,16 +197,16 @@ def _outline_mm(name: str) -> np.ndarray:
         arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * UV_SIZE_MM]
     elif name == "neck":
         corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * UV_SIZE_MM
-        return np.concatenate([_smooth(landmarks[:17]), corners])
+        return np.concatenate([_spline(landmarks[:17]), corners])
     elif name == "face":
         forehead = [*_FOREHEAD_UV, *((1 - u, v) for u, v in _FOREHEAD_UV[-2::-1])]
         arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *forehead, LANDMARK_UV[0]]) * UV_SIZE_MM]
     else:
         raise ValueError(f"{name!r}: not a region of the face; choose one of {', '.join(REGIONS)}")
-    return np.concatenate([_smooth(arc) for arc in arcs])
+    return np.concatenate([_spline(arc) for arc in arcs])
 
 
-def _smooth(points: np.ndarray, steps: int = 6) -> np.ndarray:
+def _spline(points: np.ndarray, steps: int = 6) -> np.ndarray:
     """Sample a cubic spline [N, 2] through `points`, parametrised by chord length."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
     knots = np.arange(len(points))

@@ -21,13 +21,10 @@ from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.image.strips import Band, strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import sample_texture, vertex_normals
-from facerf_cli.run import memory
+from facerf_cli.raster.texture import sample_texture, smoothstep, vertex_normals
 
 _TINY = 1e-8
 _FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
-_BYTES, _PHOTO_BYTES = 32, 16  # of a pixel of the view, and of a photo with its matte around it
-_STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
 # Of drawings.
 _CELLS = 16  # cells of the wire mesh along u and along v
@@ -71,11 +68,6 @@ class FaceView:
     def normal(self) -> Tensor:
         """Unit normals [h, w, 3], camera space."""
         return self.surface(slice(0, len(self.uv)))[..., :3]
-
-    @property
-    def position_m(self) -> Tensor:
-        """Positions [h, w, 3], camera space."""
-        return self.surface(slice(0, len(self.uv)))[..., 3:]
 
     def render(self, texture: Tensor, rows: slice = slice(None)) -> Tensor:
         """Render a texture [C, T, T] in the window [h, w, C], or in rows of it, zero off the mesh."""
@@ -127,9 +119,6 @@ def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
 def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceView:
     """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
     top, left, window = _window(vertices_camera, camera)
-    needed = camera.height_px * camera.width_px * _PHOTO_BYTES + window.height_px * window.width_px * _BYTES
-    needed += needed // _BETWEEN + _STRIP_BYTES
-    memory.require(f"a face of {window.width_px} x {window.height_px} pixels", needed, "a smaller photo")
     triangles = grid_triangles()
     size = window.height_px, window.width_px
     uv, coverage, mask = torch.empty(*size, 2), torch.empty(size), torch.empty(size)
@@ -142,7 +131,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     inside = (mask * coverage > 0.02).numpy()
     if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
-        mask = mask * smooth(edge_px / max(_FEATHER * side_px, 1))
+        mask = mask * smoothstep(edge_px / max(_FEATHER * side_px, 1))
     attributes = torch.cat([vertex_normals(vertices_camera, triangles), vertices_camera], 1)
 
     def surface(rows: slice) -> Tensor:
@@ -167,12 +156,6 @@ def _window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
     top, bottom = (int(v.floor().clamp(0, camera.height_px - 1)) for v in (y.min() - 1, y.max() + 1))
     width, height = right + 1 - left, bottom + 1 - top
     return top, left, Camera(camera.focal_px, width, height, camera.cx_px - left, camera.cy_px - top)
-
-
-def smooth(x: Tensor) -> Tensor:
-    """Smooth step of 0..1, flat at both ends."""
-    x = x.clamp(0, 1)
-    return x * x * (3 - 2 * x)
 
 
 def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -53,7 +53,7 @@ class Correction:
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
         ratio = _ratio(photo, explained, floor)
         mean = float((explained.mean(0) * person).sum() / total)
-        excess = _smooth(ratio - 1, person)
+        excess = _blurred_within(ratio - 1, person)
         plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
         grey = olats.mean(1)
         brightness = plain._brightness(grey)
@@ -93,7 +93,7 @@ def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
     return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
 
 
-def _smooth(maps: Tensor, person: Tensor) -> Tensor:
+def _blurred_within(maps: Tensor, person: Tensor) -> Tensor:
     """Maps [C, S, S] on a person [S, S], blurred without what is off the person."""
     both = blurred(torch.cat([maps * person, person[None]]), _BLUR_PX)
     return both[:-1] / both[-1:].clamp_min(1e-6) * person

@@ -131,7 +131,7 @@ def detect_faces(
         return [Face(*found) for found in detect_landmarks(image_srgb)]
     found: list[SquareView] = []
     for squares in _attempts(image_srgb):
-        seen = [one for one in _looked_at(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
+        seen = [one for one in look(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
         refined = [again for one in _distinct(seen) if (again := _refined(parsing, image_srgb, one))]
         found = _distinct([*found, *refined])
         if not everyone and _sure(found):
@@ -157,10 +157,6 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     yield [*map(_square, detected_boxes(image, _DETECTOR_PX)), _whole(image)]
     yield [_whole(image, sides=_BEYOND), *(_whole(image, turn_rad) for turn_rad in _TURNS)]
     yield _tiles(image)
-
-
-def _looked_at(parsing: ParsingNetwork, image: np.ndarray, squares: list[Square]) -> list[SquareView]:
-    return look(parsing, image, squares) if squares else []
 
 
 def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: SquareView) -> SquareView | None:

@@ -104,13 +104,13 @@ def sharpness_of(crops: Tensor) -> Tensor:
     """
     edge = crops.shape[-1] // 4 - _POOLED
     grey = crops[..., edge:-edge, edge:-edge].mean(1, keepdim=True)
-    fine = _smooth(_smooth(grey, 1), 1)
-    bands = grey - fine, fine - _smooth(_smooth(fine, 4), 4)
+    fine = _box_mean(_box_mean(grey, 1), 1)
+    bands = grey - fine, fine - _box_mean(_box_mean(fine, 4), 4)
     high, low = (band[..., _POOLED:-_POOLED, _POOLED:-_POOLED].abs().mean((1, 2, 3)) for band in bands)
     return high / low.clamp_min(1e-4)
 
 
-def _smooth(grey: Tensor, reach: int) -> Tensor:
+def _box_mean(grey: Tensor, reach: int) -> Tensor:
     return F.avg_pool2d(grey, 2 * reach + 1, 1, reach, count_include_pad=False)
 
 

@@ -49,7 +49,7 @@ _Light = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Person:
+class _MeanPerson:
     """The mean person, head frame: vertices [N, 3], triangles [F, 3].
 
     A vertex follows the displacement of the face's vertices `carriers` [N, 4] by `weights` [N, 4] times
@@ -93,7 +93,7 @@ class ProxyMaps:
 
 def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop) -> Proxy:
     """Shape the proxy of a fitted face; classes [C, S, S] are what is seen in the square around it."""
-    person = _person()
+    person = _mean_person()
     face = model.vertices(fit.alpha[None], fit.beta[None])[0]
     mean = person.face_m
     scale = ((face - face.mean(0)) * (mean - mean.mean(0))).sum(0) / (mean - mean.mean(0)).square().sum(0)
@@ -230,14 +230,14 @@ def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
 
 
 @cache
-def _person() -> _Person:
+def _mean_person() -> _MeanPerson:
     tensors, metadata = load_checkpoint(ASSET)
     if metadata.get("layout_version") != LAYOUT_VERSION:
         raise InputError(f"{ASSET}: made for another UV layout; make it again")
     model = load_face_model(BUILTIN)
     face = model.vertices(torch.zeros(1, len(model.identity)), torch.zeros(1, len(model.expression)))[0]
     tensors["triangles"], tensors["carriers"] = tensors["triangles"].long(), tensors["carriers"].long()
-    return _Person(**tensors, face_m=face)
+    return _MeanPerson(**tensors, face_m=face)
 
 
 def own_shading(image: Tensor, classes: Tensor, normals: Tensor, rig: Tensor, visible: Tensor) -> Tensor:

@@ -106,17 +106,15 @@ def seen_classes(
     near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
     seen = look(parsing, image_srgb, [body, chest, *near])
-    wide, middle, *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
-    classes = _only_background().repeat(1, *size)
-    wide.part_of(classes).copy_(wide.classes)
-    middle.part_of(classes).lerp_(middle.classes, middle.feather)
+    (wide, inside), (middle, feather), *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
+    classes = torch.lerp(torch.where(inside > 0, wide, _only_background()), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
-    for one, sides in zip(close, _NEAR_SIDES, strict=True):
-        weighed = one.feather * sides**-_STEEPNESS
-        one.part_of(mean).addcmul_(one.classes, weighed)
-        one.part_of(weight).add_(weighed)
-        one.part_of(share).copy_(torch.maximum(one.part_of(share), one.feather))
-    classes.lerp_(mean.div_(weight.clamp_min_(1e-6)), share)
+    for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
+        weighed = feather * sides**-_STEEPNESS
+        mean.addcmul_(one, weighed)
+        weight += weighed
+        share = torch.maximum(share, feather)
+    classes.lerp_(mean / weight.clamp_min(1e-6), share)
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
@@ -171,41 +169,19 @@ def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
     return np.stack(np.meshgrid(x, y), -1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Laid:
-    """Classes [C, h', w'] of a square over the part of a small image that it covers.
+def _over_photo(view: SquareView, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
+    """Classes [C, h, w] of an upright square over a small image of the whole photo, and their weight [h, w].
 
-    Their weight [h', w'], `feather`, is 1 well inside the square and falls to 0 at its border.
+    The weight is 1 well inside the square and falls to 0 at its border.
     """
-
-    rows: slice
-    columns: slice
-    classes: Tensor
-    feather: Tensor
-
-    def part_of(self, image: Tensor) -> Tensor:
-        """The part of an image [..., h, w] that the square covers."""
-        return image[..., self.rows, self.columns]
-
-
-def _over_photo(seen: SquareView, size: tuple[int, int], shape: tuple[int, ...]) -> _Laid:
-    """The classes of an upright square, over a small image of the whole photo."""
-    places = _shares(seen.square, size, shape)
-    rows, columns = (slice(int((at <= 0).sum()), int((at < 1).sum())) for at in places)
-    down, right = places[0][rows], places[1][columns]
-    grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
-    classes = F.grid_sample(seen.classes[None], grid, padding_mode="border", align_corners=False)[0]
-    fall = [(torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in (down, right)]
-    return _Laid(rows, columns, classes, torch.minimum(fall[0][:, None], fall[1]))
-
-
-def _shares(square: Square, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Rows [h] and columns [w] of a small image as places in an upright square, in its sides."""
     down, right = (
-        ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle) / square.side_px + 0.5
-        for count, length, middle in zip(size, shape, (square.y_px, square.x_px), strict=False)
+        ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle) / view.square.side_px + 0.5
+        for count, length, middle in zip(size, shape, (view.square.y_px, view.square.x_px), strict=False)
     )
-    return down, right
+    grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
+    classes = F.grid_sample(view.classes[None], grid, padding_mode="border", align_corners=False)[0]
+    fall = [(torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in (down, right)]
+    return classes, torch.minimum(fall[0][:, None], fall[1])
 
 
 def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndarray) -> Tensor:

@@ -47,14 +47,6 @@ def pixel_rays(px: Tensor, camera: Camera) -> Tensor:
     return torch.stack([x, y, -torch.ones_like(x)], -1)
 
 
-def pixel_centres_px(camera: Camera, device: torch.device | str = "cpu") -> Tensor:
-    """Return the position (x, y) in pixels of every pixel's centre [H, W, 2], float32."""
-    y = torch.arange(camera.height_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
-    x = torch.arange(camera.width_px, device=device, dtype=torch.float32) + PIXEL_CENTRE
-    grid_y, grid_x = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([grid_x, grid_y], -1)
-
-
 def rays_of_rows(camera: Camera, size: tuple[int, int], rows: slice) -> Tensor:
     """Viewing rays [n, w, 3] through pixels of some rows of the camera's image at another size (h, w)."""
     y = (torch.arange(size[0])[rows] + PIXEL_CENTRE) * (camera.height_px / size[0])

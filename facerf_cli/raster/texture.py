@@ -51,6 +51,12 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]  # sum(-1) is much slower
 
 
+def smoothstep(x: Tensor) -> Tensor:
+    """Smooth step of 0..1, flat at both ends."""
+    x = x.clamp(0, 1)
+    return x * x * (3 - 2 * x)
+
+
 def texel_centres_uv(
     side: int, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"
 ) -> Tensor:
@@ -153,12 +159,12 @@ def _visibility(
     """Return the visibility [T, T] in 0..1 of points [T, T, 3] of the mesh."""
     normals = normal_map(vertices_camera, triangles, points.shape[0]).permute(1, 2, 0)
     cosine = -_dot(normals, points) / _dot(points, points).sqrt()
-    fade = ((cosine - settings.unseen_cosine) / (settings.seen_cosine - settings.unseen_cosine)).clamp(0, 1)
+    facing = smoothstep((cosine - settings.unseen_cosine) / (settings.seen_cosine - settings.unseen_cosine))
     px = project(points, camera)
     size = torch.tensor([camera.width_px, camera.height_px], dtype=px.dtype, device=px.device)
     inside = ((px >= 0) & (px <= size)).all(-1) & (points[..., 2] < 0)
     nearer_m = _in_front_by(points, normals, vertices_camera, triangles, _depth_camera(camera, settings))
-    return (fade * fade * (3 - 2 * fade)) * (inside & (nearer_m < settings.hidden_m))
+    return facing * (inside & (nearer_m < settings.hidden_m))
 
 
 def _depth_camera(camera: Camera, settings: UnwrapSettings) -> Camera:

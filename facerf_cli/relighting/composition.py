@@ -33,13 +33,13 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
-from facerf_cli.face.view import FaceView, photo_camera, smooth, view_face
+from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
 from facerf_cli.image.strips import Band, Layer, by_rows, filled
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
-from facerf_cli.raster.texture import inpaint
+from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.whole_person import WholePerson
@@ -376,7 +376,7 @@ class Surround:
         self._mask = torch.from_numpy(self._view.full(self._view.mask))
         outside = (self._mask < 0.5).numpy()
         away_px = torch.from_numpy(distance_transform_edt(outside, sampling=(_UPRIGHT, 1.0))).float()
-        self._near = 1 - smooth(away_px / (_REACH * _SURROUND_PX))
+        self._near = 1 - smoothstep(away_px / (_REACH * _SURROUND_PX))
         self._crop, self._width_px = crop, width_px
         self._mean_source, self._around_source = self._mean_and_blur(source[None])
 

@@ -6,9 +6,9 @@ import torch
 from facerf_cli.raster.camera import (
     Camera,
     crop_camera,
-    pixel_centres_px,
     pose_to_rotation,
     project,
+    rays_of_rows,
     rotation_to_pose,
     so3_exp,
 )
@@ -27,10 +27,12 @@ def test_projection_by_hand() -> None:
     torch.testing.assert_close(px, torch.tensor([[21.0, 9], [31, 9], [21, 4]]))
 
 
-def test_pixel_centres_of_an_image_that_is_not_square() -> None:
-    centres = pixel_centres_px(Camera(1, 7, 4, 0, 0))
-    assert centres.shape == (4, 7, 2)
-    assert centres[0, 0].tolist() == [0.5, 0.5] and centres[3, 6].tolist() == [6.5, 3.5]
+def test_rays_of_an_image_at_twice_the_size_pass_through_its_pixel_centres() -> None:
+    camera = Camera(50, 7, 4, 3, 2)
+    px = project(rays_of_rows(camera, (8, 14), slice(2, 5)), camera)
+    assert px.shape == (3, 14, 2)
+    torch.testing.assert_close(px[0, 0], torch.tensor([0.25, 1.25]))
+    torch.testing.assert_close(px[2, 13], torch.tensor([6.75, 2.25]))
 
 
 def test_pose_signs() -> None:

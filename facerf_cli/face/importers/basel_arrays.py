@@ -45,47 +45,28 @@ def arrays_2017(path: Path) -> dict[str, np.ndarray]:
 
 
 def _landmarks(file: Any) -> bytes | None:
-    """The JSON of named points; None where the file names none."""
-    try:
-        dataset = _dataset(file, LANDMARKS)
-    except ValueError:
+    """The JSON of named points as bytes; None where the file names none."""
+    if LANDMARKS not in file:
         return None
+    dataset = file[LANDMARKS]
     if dataset.nbytes > _MAX_TEXT:
         raise ValueError(f"{LANDMARKS} is too long")
-    text = _text(dataset[()])
-    return text.encode() if isinstance(text, str) else text
+    stored = dataset[()]  # text, bytes, or an array of one text or of its bytes
+    if isinstance(stored, np.ndarray) and stored.dtype.kind in "OSU" and stored.size == 1:
+        stored = stored.item()
+    if isinstance(stored, str):
+        return stored.encode()
+    return stored if isinstance(stored, bytes) else np.asarray(stored).tobytes()
 
 
 def _numbers(file: Any, name: str) -> np.ndarray:
-    """Read the numbers of a dataset; raises ValueError for links, large datasets and values not finite."""
-    dataset = _dataset(file, name)
+    """Read the numbers of a dataset; raises ValueError where it is missing, too large or not finite."""
+    if name not in file:
+        raise ValueError(f"it lacks {name}")
+    dataset = file[name]
     if dataset.dtype.kind not in "fiu" or dataset.size > MAX_ENTRIES or dataset.ndim > 2:
         raise ValueError(f"{name} is {dataset.dtype} of shape {list(dataset.shape)}")
     values = dataset[()]
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds values that are not finite")
     return values.astype(np.float64) if values.ndim < 2 else values
-
-
-def _dataset(file: Any, name: str) -> Any:
-    """The dataset `name`, stored in this file."""
-    import h5py
-
-    at = file
-    for part in name.split("/"):
-        link = at.get(part, getlink=True) if isinstance(at, h5py.Group) else None
-        if link is None:
-            raise ValueError(f"it lacks {name}")
-        if not isinstance(link, h5py.HardLink):
-            raise ValueError(f"{name} is a link")
-        at = at[part]
-    if not isinstance(at, h5py.Dataset) or at.external or at.is_virtual:
-        raise ValueError(f"{name} is not a dataset of this file")
-    return at
-
-
-def _text(stored: Any) -> str | bytes:
-    """Convert a text as h5py reads it: text, bytes, or an array of one text or of its bytes."""
-    if isinstance(stored, np.ndarray) and stored.dtype.kind in "OSU" and stored.size == 1:
-        stored = stored.item()
-    return stored if isinstance(stored, (str, bytes)) else np.asarray(stored).tobytes()
