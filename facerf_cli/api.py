@@ -4,8 +4,10 @@ Images are scene-linear Rec.709, float32 [H, W, 3]; angles in degrees; the units
 command line (docs/design.md).
 """
 
+import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -25,6 +27,7 @@ from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.files import checkpoint_file
+from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.segment import segment as segment_image
 from facerf_cli.raster.camera import pose_to_rotation
@@ -157,6 +160,21 @@ def fit_photo(
     return pipeline.head_of(models, photo, face, sides)
 
 
+@dataclass(frozen=True)
+class _Photo:
+    """A photo [H, W, 3] as a key of a cache; two are one by their values."""
+
+    digest: bytes
+    pixels: np.ndarray = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def _person(models: Models, photo: _Photo, head: Head, kind: RelightKind, network_alone: bool) -> Person:
+    """The person of the last call is kept, so that each further light costs what a light costs."""
+    pixels = photo.pixels.copy()  # the caller may change its own
+    return Person(models, pixels, head, reflectance_of(models, head, kind, network_alone, photo=pixels))
+
+
 def _checked(photo: np.ndarray) -> np.ndarray:
     photo = np.asarray(photo)
     if photo.ndim != 3 or photo.shape[2] != 3:
@@ -209,9 +227,9 @@ def relight(
     photo, rig = _checked(photo), light._rig()
     if not np.allclose(head.fit.crop.apply(photo), head.cropped, rtol=0, atol=_ALIKE * head.cropped.max()):
         raise ValueError("photo is not the one that the head was fitted in; fit it again")
+    pixels = _Photo(hashlib.blake2b(photo).digest(), photo)
     with torch.no_grad():
-        of_head = pipeline.reflectance_of(models, head, reflectance, network_alone, photo=photo)
-        image = pipeline.Person(models, photo, head, of_head).image(rig, target)
+        image = _person(models, pixels, head, reflectance, network_alone).image(rig, target)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])
 
 

@@ -44,7 +44,7 @@ from facerf_cli.relighting.field import (
     shrunk,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.own_light import own_light, photo_quotient
+from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
 
 
@@ -237,7 +237,7 @@ def predict_olat(
 
     `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's.
     """
-    quotient = None if network_alone else photo_quotient(models, head.face)
+    quotient = None if network_alone else own_light(models, head.face).quotient
     turn = None if rotation is None else head.fit.turn_to(rotation)
     return Field(models, head.face, quotient, memory_bytes, bf16).olats(lights, turn)
 

@@ -8,7 +8,7 @@ import numpy as np
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
 from facerf_cli.pipeline import Person, fit
-from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
 
@@ -27,10 +27,14 @@ def photo() -> np.ndarray:
 
 
 @cache
+def face() -> Face:
+    return find_faces(SHIPPED_NETWORKS.parsing, photo(), "astronaut")[0]
+
+
+@cache
 def person() -> Person:
     """The astronaut with her portrait field."""
-    face = find_faces(SHIPPED_NETWORKS.parsing, photo(), "astronaut")[0]
-    return fit(models(), photo(), face, sides=models().sides(TEXTURE))
+    return fit(models(), photo(), face(), sides=models().sides(TEXTURE))
 
 
 def head() -> Head:

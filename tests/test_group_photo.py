@@ -24,9 +24,9 @@ class Plain:
         matte[:, self.columns] = self.share
         return matte
 
-    size_px = SIZE
+    size_px, nbytes = SIZE, 0
 
-    def person(self, relit: float) -> tuple[Band, Band]:
+    def person_and_share(self, relit: float) -> tuple[Band, Band]:
         return np.full((*SIZE, 3), relit).__getitem__, self.matte().__getitem__
 
     def bands(self, relit: float, ev: float, behind: Any) -> dict[str, Layer]:

@@ -7,6 +7,7 @@ import torch
 
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.pipeline import fit_photo
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.own_light import light_of_frames, own_light
@@ -25,7 +26,8 @@ def models() -> Models:
 
 @pytest.fixture(scope="module")
 def face() -> FaceTexture:
-    small = shrunk(astronaut.head().face)
+    head = fit_photo(models, astronaut.photo(), astronaut.face().landmarks_px)
+    small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))
 
 

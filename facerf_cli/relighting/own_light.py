@@ -51,11 +51,6 @@ def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
     return _estimated([_Frame.of(models, face) for face in faces])
 
 
-def photo_quotient(models: Models, face: FaceTexture) -> Quotient:
-    """Compute the quotient image by which the network's field is corrected to its own photo."""
-    return own_light(models, face).quotient
-
-
 @dataclass(frozen=True, eq=False)
 class _Frame:
     """The network's field of a small texture, and its OLATs [L, 3, t, t] under the rig from around."""

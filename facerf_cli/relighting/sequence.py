@@ -18,8 +18,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.face.fit import FaceFit, fit_batch, trust_inside
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.fit import FaceFit, fit_batch, fit_landmarks, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
@@ -231,7 +231,6 @@ def gaps(sightings: Sequence[Sighting | None]) -> Iterator[tuple[int, int]]:
 
 
 _KEYS = 12  # frames whose identities are averaged
-_AT_ONCE = 32  # frames that are fitted together
 
 
 def spread_over(frames: Sequence[int], count: int) -> list[int]:
@@ -246,35 +245,22 @@ def identity_of(
     """The identity [Ki] of one person from landmarks [68, 2] of several frames of shape [H, W]."""
     keys = [landmarks_px[index] for index in spread_over(range(len(landmarks_px)), _KEYS)]
     crops = [from_landmarks(px, crop_px) for px in keys]
-    target, trust = _in_crops(keys, crops, shape)
-    return fit_batch(model, target, crops[0].camera, trust=trust).alpha.mean(0).float()
+    inside = [crop.to_crop(px) for crop, px in zip(crops, keys, strict=True)]
+    trust = [trust_inside(px, crop, *shape) for px, crop in zip(inside, crops, strict=True)]
+    target = torch.from_numpy(np.stack(inside))
+    fits = fit_batch(model, target, crops[0].camera, trust=torch.from_numpy(np.stack(trust)))
+    return fits.alpha.mean(0).float()
 
 
-def fit_frames(
-    model: MorphableModel,
-    alpha: Tensor,
-    landmarks_px: Sequence[np.ndarray],
-    shape: tuple[int, int],
-    crop_px: int,
-) -> Iterator[FaceFit]:
-    """Fit pose and expression of a person alpha [Ki] to each frame's landmarks [68, 2]."""
+def fit_frame(
+    model: MorphableModel, alpha: Tensor, landmarks_px: np.ndarray, shape: tuple[int, int], crop_px: int
+) -> FaceFit:
+    """Fit pose and expression of a person alpha [Ki] to the landmarks [68, 2] of a frame of shape [H, W]."""
+    crop = from_landmarks(landmarks_px, crop_px)
+    inside = crop.to_crop(landmarks_px)
     person = _of_one_person(model, tuple(alpha.tolist()))
-    for first in range(0, len(landmarks_px), _AT_ONCE):
-        some = landmarks_px[first : first + _AT_ONCE]
-        crops = [from_landmarks(px, crop_px) for px in some]
-        target, trust = _in_crops(some, crops, shape)
-        fits = fit_batch(person, target, crops[0].camera, trust=trust)
-        for index, crop in enumerate(crops):
-            yield FaceFit(
-                model=model.name,
-                crop=crop,
-                rotation=fits.rotation[index].float(),
-                translation_m=fits.translation_m[index].float(),
-                alpha=alpha,
-                beta=fits.beta[index].float(),
-                landmarks_px=target[index].float(),
-                error_iod=float(fits.error_iod[index]),
-            )
+    fit = fit_landmarks(person, inside, crop, trust=trust_inside(inside, crop, *shape))
+    return replace(fit, model=model.name, alpha=alpha)
 
 
 @cache
@@ -282,15 +268,6 @@ def _of_one_person(model: MorphableModel, alpha: tuple[float, ...]) -> Morphable
     """The face model with one identity only; kept, since the fit keeps what it derives from a model."""
     mean = model.vertices(torch.tensor([alpha]), torch.zeros(1, len(model.expression)))[0]
     return replace(model, name=f"{model.name}-person", mean=mean, identity=model.identity[:0], head=None)
-
-
-def _in_crops(
-    landmarks_px: Sequence[np.ndarray], crops: Sequence[Crop], shape: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """Landmarks [B, 68, 2] in the pixels of their crops, and their trust [B, 68]."""
-    inside = [crop.to_crop(px) for crop, px in zip(crops, landmarks_px, strict=True)]
-    trust = [trust_inside(px, crop, *shape) for px, crop in zip(inside, crops, strict=True)]
-    return torch.from_numpy(np.stack(inside)), torch.from_numpy(np.stack(trust))
 
 
 KEY_FRAMES = 5  # from which the light is estimated
@@ -373,16 +350,9 @@ class ShotView:
 
     def _fit(self, frame: int) -> FaceFit:
         landmarks_px = self.landmarks_px(frame)
-        shape = self._read(frame).shape
-        return next(
-            fit_frames(
-                self._models.face,
-                self._identity,
-                [landmarks_px],
-                (shape[0], shape[1]),
-                self._sides.crop_px,
-            )
-        )
+        height, width = self._read(frame).shape[:2]
+        size = height, width
+        return fit_frame(self._models.face, self._identity, landmarks_px, size, self._sides.crop_px)
 
     def _around(self, frame: int) -> list[int]:
         """The frame and its neighbours that show the face, without those beyond a frame where it is lost."""
@@ -409,13 +379,8 @@ class ShotView:
 
     def _seen_person(self, frame: int) -> SeenPerson:
         fit, segmentation = self._fit(frame), self.segmentation(frame)
-        return look_at_person(
-            self._models.networks.parsing,
-            self._models.face,
-            self._read(frame),
-            fit,
-            segmentation=segmentation,
-        )
+        parsing, model, photo = self._models.networks.parsing, self._models.face, self._read(frame)
+        return look_at_person(parsing, model, photo, fit, segmentation=segmentation)
 
     def _steady_maps(self, frame: int) -> PortraitMaps:
         """Maps of a frame, averaged with its neighbours' in the square, which follows the head."""

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
-from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -26,7 +26,7 @@ from facerf_cli.image.colour import named_space
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidence_in, face_at, find_faces
+from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidence_in, face_at
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
@@ -122,26 +122,15 @@ def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> Lin
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
-    found = list(_find(item, image, options))
-    names = _names(item, found)
-    for face, name in zip(found, names, strict=True):
-        _say_confidence(name, face)
-    return [
-        FittedFace(tag, face, _fit_one(name, image, face, options))
-        for face, tag, name in zip(found, _tags(len(found), options), names, strict=True)
-    ]
+    models = load_models_once(options)
+    found = _find(item, image, options, options.geometry or models.default_geometry)
+    return [FittedFace(tag, face, _fit_one(name, image, face, options)) for tag, name, face in found]
 
 
 def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
     """Find the faces that the options choose, from left to right, with the tags of their outputs."""
-    if options.landmarks is not None:
-        faces = [_given(item, image, options.landmarks)]
-    else:
-        parsing = load_models_once(options).networks.parsing
-        faces = find_faces(parsing, image.pixels, str(item.input_path), options.face, options.landmarks_from)
-    for face, name in zip(faces, _names(item, faces), strict=True):
-        _say_confidence(name, face)
-    return list(zip(_tags(len(faces), options), faces, strict=True))
+    found = _find(item, image, options, "landmarks")
+    return [(tag, face) for tag, _, face in found if isinstance(face, Face)]
 
 
 def facts_of_found(faces: Sequence[FaceBox], options: PhotoOptions) -> dict[str, Any]:
@@ -159,26 +148,31 @@ def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
     return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
 
-def _names(item: Item, faces: Sequence[FaceBox]) -> list[str]:
-    """Name the faces of a photo for messages: the photo, and of several their index and place."""
-    if len(faces) == 1:
-        return [str(item.input_path)]
-    named = []
-    for number, (left, top, right, bottom) in enumerate(face.box_px for face in faces):
-        x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
-        named.append(f"{item.input_path}: face {number} from the left, at x {x_px}, y {y_px} px")
-    return named
+def _find(
+    item: Item, image: LinearImage, options: PhotoOptions, geometry: Geometry
+) -> list[tuple[str, str, FaceBox]]:
+    """Find the faces that the options choose, and say how sure they are.
 
-
-def _say_confidence(name: str, face: FaceBox) -> None:
-    if face.view is not None:
-        confidence = confidence_in(face.view)
-        why = "" if confidence.word == "sure" else f" ({confidence.reason})"
-        log.info("%s: %s%s", name, confidence.word, why)
-
-
-def _tags(count: int, options: PhotoOptions) -> list[str]:
-    return [f"_face{index}" for index in range(count)] if options.face == "all" else [""]
+    Of each: the tag of its outputs, its name for messages, and what its geometry needs, landmarks or a box.
+    """
+    faces: Sequence[FaceBox]
+    if options.landmarks is not None:
+        faces = [_given(item, image, options.landmarks)]
+    else:
+        parsing, path = load_models_once(options).networks.parsing, str(item.input_path)
+        faces = find_for(parsing, geometry, image.pixels, path, options.face, options.landmarks_from)
+    found = []
+    for number, face in enumerate(faces):
+        name, (left, top, right, bottom) = str(item.input_path), face.box_px
+        if len(faces) > 1:
+            x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
+            name += f": face {number} from the left, at x {x_px}, y {y_px} px"
+        if face.view is not None:
+            confidence = confidence_in(face.view)
+            why = "" if confidence.word == "sure" else f" ({confidence.reason})"
+            log.info("%s: %s%s", name, confidence.word, why)
+        found.append((f"_face{number}" if options.face == "all" else "", name, face))
+    return found
 
 
 def fit_facts(fit: FaceFit) -> dict[str, Any]:
@@ -206,18 +200,6 @@ def stamp(item: Item) -> dict[str, str | int]:
 def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
     """Metadata for the outputs of a photo."""
     return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
-
-
-def _find(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FaceBox]:
-    """Find the faces that the options choose; with their landmarks where the fit needs them."""
-    if options.landmarks is not None:
-        yield _given(item, image, options.landmarks)
-    else:
-        models = load_models_once(options)
-        geometry, parsing = options.geometry or models.default_geometry, models.networks.parsing
-        yield from find_for(
-            parsing, geometry, image.pixels, str(item.input_path), options.face, options.landmarks_from
-        )
 
 
 def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:

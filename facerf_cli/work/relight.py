@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,8 +24,8 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
-from facerf_cli.image.colour import ExposureRule, most_exposure_ev
-from facerf_cli.image.strips import Band, Layer, filled
+from facerf_cli.image.colour import most_exposure_ev
+from facerf_cli.image.strips import Band, filled
 from facerf_cli.light.envmap import backdrop
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import Person, reflectance_of
@@ -71,56 +71,30 @@ _of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this 
 Written = dict[Path, float]  # the EXR of each image, and the exposure of the PNG in its place
 
 
-class Composer(Protocol):
-    """A composer of images: `Composition`, `GroupComposition`; of stacks `PersonStack`, `RenderedStack`."""
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Height and width of the images."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of what is relit by one sum of lights."""
-
-    def relit(self, lights: Lights) -> Iterator[Any]:
-        """What is relit by each sum of lights, as the other methods take it."""
-
-    def bands(self, relit: Any, ev: float, behind: Band | None) -> dict[str, Layer]:
-        """rgb and A of a head as relit, before a background or, where it is kept, the photo's at `ev`."""
-
-    def layers(self, names: Sequence[str], relit: Any) -> dict[str, Layer]:
-        """Layers of the image by the names that they have in a file."""
-
-    def light_layer(self, relit: Any) -> Band:
-        """The person under one of several lights, over black."""
-
-    def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
-        """The exposure in EV of the person, by a rule."""
+Composer = Composition | GroupComposition | PersonStack | RenderedStack
+Behind = Callable[[LightSetup, float], Band | None]  # the image behind a person, for a setup and an exposure
 
 
-class Backdrops:
-    """Draws the chosen background for a photo's camera; what setups share is drawn once."""
+def _backdrop(work: Relight, camera: Camera) -> Behind:
+    """Images [H, W, 3] behind a person, scene-linear; None for the photo's own, or for nothing.
 
-    def __init__(self, choice: BackgroundChoice, blur: float, camera: Camera) -> None:
-        self._choice, self._blur, self._camera = choice, blur, camera
-        self._fixed = _fixed(choice, camera)
+    A file and a colour look as they are at the exposure, in EV. A map is as bright as its light; single
+    lights have a black surrounding.
+    """
+    fixed, size_px = _fixed(work.background, camera), (camera.height_px, camera.width_px)
 
-    def behind(self, setup: LightSetup, ev: float) -> Band | None:
-        """The image behind a person under a setup, scene-linear; None for the photo's own, or for nothing.
-
-        A file and a colour look as they are at an exposure of `ev`. A map is as bright as its light; single
-        lights have a black surrounding.
-        """
-        fixed, gain = self._fixed, np.float32(2.0**-ev)
-        if self._choice.kind != "envmap":
+    def behind(setup: LightSetup, ev: float) -> Band | None:
+        gain = np.float32(2.0**-ev)
+        if work.background.kind != "envmap":
             return None if fixed is None else lambda rows: fixed[rows] * gain
         if setup.envmap is None:
-            width_px = self._camera.width_px
-            return lambda rows: np.zeros((rows.stop - rows.start, width_px, 3), np.float32)
-        with beside_person((self._camera.height_px, self._camera.width_px)):
+            return lambda rows: np.zeros((rows.stop - rows.start, camera.width_px, 3), np.float32)
+        with beside_person(size_px):
             envmap = read_map(setup.envmap)
-        size = self._camera.height_px, self._camera.width_px
-        return backdrop(envmap, size, partial(rays_of_rows, self._camera), setup.rotate_deg, self._blur)
+        rays = partial(rays_of_rows, camera)
+        return backdrop(envmap, size_px, rays, setup.rotate_deg, work.background_blur)
+
+    return behind
 
 
 def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
@@ -155,7 +129,7 @@ class _Scene:
     lights: Lights
     apart: Callable[[LightSetup], Lights]  # each light of a setup
     alpha: np.ndarray | None = None  # of the photo
-    backdrops: Backdrops | None = None
+    behind: Behind | None = None
 
 
 Scenes = Iterator[tuple[str, _Scene]]  # each with the tag of its files
@@ -234,9 +208,8 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
     if work.composite != "photo":
         return _Scene(composer, lights, apart)
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
-    backdrops = Backdrops(work.background, work.background_blur, camera)
     alpha = image.alpha if work.background.kind == "photo" else None
-    return _Scene(composer, lights, apart, alpha, backdrops)
+    return _Scene(composer, lights, apart, alpha, _backdrop(work, camera))
 
 
 def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Composition:
@@ -283,17 +256,17 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
     def lights(setups: tuple[LightSetup, ...]) -> Lights:
         return lights_over_stack(setups, directions, work.sampling)
 
-    of_setups, backdrops = lights(work.setups), None
+    of_setups, behind = lights(work.setups), None
     composer: Composer
     if header.kind == "photo":
-        composer, backdrops, facts = _person_of_stack(item, header, work)
+        composer, behind, facts = _person_of_stack(item, header, work)
     elif work.photo_of_stack is not None:
         raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
     elif header.kind == "image":
         composer, facts = RenderedStack(header, item.input_path), {}
     else:
         composer, facts = _face_of_stack(item, header, work)
-    scene = _Scene(composer, of_setups, lambda setup: lights(each_alone(setup)), backdrops=backdrops)
+    scene = _Scene(composer, of_setups, lambda setup: lights(each_alone(setup)), behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return iter([("", scene)]), dict(metadata), facts
 
@@ -315,7 +288,7 @@ def _check_stack(item: Item, work: Relight) -> None:
 
 def _person_of_stack(
     item: Item, header: StackHeader, work: Relight
-) -> tuple[PersonStack, Backdrops | None, dict[str, Any]]:
+) -> tuple[PersonStack, Behind | None, dict[str, Any]]:
     """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
     with _fit_of(item):
         fit = fit_from_arrays(header.fit)
@@ -332,9 +305,8 @@ def _person_of_stack(
     if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
         raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
     camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
-    backdrops = Backdrops(work.background, work.background_blur, camera)
     on_photo = replace(stack, photo=photo, keeps_background=work.background.kind == "photo")
-    return on_photo, backdrops, fit_facts(fit)
+    return on_photo, _backdrop(work, camera), fit_facts(fit)
 
 
 def _face_of_stack(item: Item, header: StackHeader, work: Relight) -> tuple[Composition, dict[str, Any]]:
@@ -408,7 +380,7 @@ def _rendered(
     A soft view leaves what was photographed, and a given background, as it looks.
     """
     composer, size_px = scene.composer, scene.composer.size_px
-    behind = scene.backdrops.behind(setup, ev) if scene.backdrops else None
+    behind = scene.behind(setup, ev) if scene.behind else None
     arrays = filled(composer.bands(relit, ev, behind), *size_px, empty)
     layers = filled(composer.layers(work.aov, relit), *size_px, empty)
     keeps = "A" not in arrays and work.background.kind != "envmap"
