@@ -14,7 +14,7 @@ from facerf_cli.cli.output_options import OutputOptions, check_stdout, parse_for
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.image import colour
-from facerf_cli.work.outputs import canvas
+from facerf_cli.work.plan import canvas
 from tests.cli.test_relight import PHOTO, given, relight
 from tests.exr_layers import exr_layers
 

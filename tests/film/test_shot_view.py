@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from facerf_cli.film import shot_view
+from facerf_cli.relighting import sequence as shot_view
 
 from facerf_cli.errors import InputError
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
