@@ -118,7 +118,7 @@ def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
 
 def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceView:
     """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
-    top, left, window = _window(vertices_camera, camera)
+    top, left, window = face_window(vertices_camera, camera)
     triangles = grid_triangles()
     size = window.height_px, window.width_px
     uv, coverage, mask = torch.empty(*size, 2), torch.empty(size), torch.empty(size)
@@ -148,7 +148,7 @@ def _rows_of(camera: Camera, rows: slice) -> Camera:
     return Camera(camera.focal_px, camera.width_px, height_px, camera.cx_px, cy_px)
 
 
-def _window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
+def face_window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
     """First row and column of the part of the image around the mesh (and a pixel more), and its camera."""
     in_front = torch.cat([vertices_camera[:, :2], vertices_camera[:, 2:].clamp(max=-_TINY)], 1)
     x, y = project(in_front, camera).T

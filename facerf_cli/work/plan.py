@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.view import face_window, photo_camera
 from facerf_cli.files.atomic import hidden_folder
 from facerf_cli.run import memory
 
@@ -24,6 +27,8 @@ _PERSON_PX = 24  # photo, matte and the view of a face
 _STACK_PX = 130
 _SEGMENTS_PX = _PHOTO_PX + KEPT_OF_SEGMENTS_PX
 _IMAGE_PX = 12
+_FACE_PX, _BESIDE_FACE_PX = 32, 16  # of a face drawn in its photo, and of the photo with its matte around it
+_STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _WEB_PX = 9  # of an image for web viewers: half floats, then bytes
 _RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
 # Layers that are not only written as half floats.
@@ -54,6 +59,15 @@ def batches(count: int, bytes_each: int) -> list[slice]:
     """As many of some sums of lights at a time as fit the memory."""
     at_once = max(1, memory.limit_bytes() // (_RELIT_HELD * bytes_each))
     return [slice(first, first + at_once) for first in range(0, count, at_once)]
+
+
+def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) -> None:
+    """Raise InputError where a face, drawn in its photo [H, W], does not fit."""
+    height, width = size_px
+    window = face_window(fit.vertices_camera(model), photo_camera(fit.crop, height, width))[2]
+    needed = height * width * _BESIDE_FACE_PX + window.height_px * window.width_px * _FACE_PX
+    needed += needed // _BETWEEN + _STRIP_BYTES
+    memory.require(f"a face of {window.width_px} x {window.height_px} pixels", needed, "a smaller photo")
 
 
 def require_web_images(lights: int, size_px: tuple[int, int]) -> None:

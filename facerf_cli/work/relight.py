@@ -61,6 +61,7 @@ from facerf_cli.work.plan import (
     beside_stack,
     image_canvas,
     prediction_bytes,
+    require_face,
 )
 from facerf_cli.work.sequence import seen_frame, view_of
 from facerf_cli.work.stacks import PersonStack, RenderedStack, StackTextures
@@ -217,6 +218,7 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
     models, photo, target = load_models_once(work.photo), image.pixels, _target(item, face, image, work)
     kind, alone = work.reflectance, work.network_alone
     try:
+        require_face(models.face, target.fit or face.fit, photo.shape[:2])
         reflectance = reflectance_of(models, face.head, kind, alone, prediction_bytes(), photo, face.steady)
         return Person(models, photo, face.head, reflectance).composed(target)
     except InputError as error:

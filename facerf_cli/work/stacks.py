@@ -45,7 +45,7 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.plan import prediction_bytes, require_web_images
+from facerf_cli.work.plan import prediction_bytes, require_face, require_web_images
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
@@ -118,6 +118,7 @@ def _of_person(
     """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
+    require_face(models.face, head.fit, photo.shape[:2])
     field = reflectance_of(models, head, "portrait", work.network_alone, prediction_bytes(), photo)
     alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
     composition = Person(models, photo, head, field).composed(Target(alpha=alpha, background="none"))

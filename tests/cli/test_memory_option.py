@@ -36,7 +36,7 @@ def test_a_face_beyond_the_budget_is_refused_by_the_photos_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_display(tmp_path / "me.png", astronaut() / 255.0)
-    monkeypatch.setattr("facerf_cli.face.view._STRIP_BYTES", 1 << 30)
+    monkeypatch.setattr("facerf_cli.work.plan._STRIP_BYTES", 1 << 30)
     line = ["relight", str(tmp_path / "me.png"), "-o", str(tmp_path / "out"), "--light", "40,20"]
     assert main([*line, "--memory", "1"]) == 1
     text = said(capsys)

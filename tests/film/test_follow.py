@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from facerf_cli.film import follow
 
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.portrait.find import Face, face_at
+from facerf_cli.relighting import sequence as follow
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.relighting.sequence import LONGEST_GAP, Follower, Sighting, gaps, path_of
 

@@ -8,9 +8,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
-from facerf_cli.relighting import sequence as shot_view
 
 from facerf_cli.errors import InputError
+from facerf_cli.relighting import sequence as shot_view
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
 from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, ShotView, Sighting
 from tests.film.test_follow import face_of
