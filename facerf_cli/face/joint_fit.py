@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
+from facerf_cli.face.crop import check_landmarks, from_landmarks
 from facerf_cli.face.fit import IOD_M, FaceFit, FitSettings, fit_basis, landmark_noise, trust_inside
 from facerf_cli.face.gauss_newton import (
     FitState,
@@ -178,8 +178,11 @@ def _fit_found(
     noise = landmark_noise(settings) * (IOD_M * scale)[:, None]
     problem = Problem(basis, target, _UNIT_CAMERA, trust.sqrt() / noise, settings.huber)
     # Each camera alone gives a start, in its own space; the one of least cost over all cameras is taken.
+    parts = (alone.rotation, alone.translation_m, alone.coordinates)
+    states = zip(*(part.split(1) for part in parts), strict=True)
     starts = [
-        (_Joint.seen_from(camera, cameras, problem), _row(alone, i)) for i, camera in enumerate(cameras)
+        (_Joint.seen_from(camera, cameras, problem), FitState(*state))
+        for camera, state in zip(cameras, states, strict=True)
     ]
     costs = torch.cat([joint.cost(head, joint.residuals(head)) for joint, head in starts])
     first = int(costs.nan_to_num(nan=torch.inf).argmin())
@@ -208,11 +211,6 @@ def eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
     return -(rotation @ eyes + translation_m)[..., 2]
 
 
-def _row(state: FitState, index: int) -> FitState:
-    row = slice(index, index + 1)
-    return FitState(state.rotation[row], state.translation_m[row], state.coordinates[row])
-
-
 def _trust(camera: PosedCamera, landmarks_px: np.ndarray) -> np.ndarray:
     crop = from_landmarks(landmarks_px, 256)
     return trust_inside(crop.to_crop(landmarks_px), crop, camera.height_px, camera.width_px)
@@ -232,21 +230,22 @@ def fit_in_crop(
     """Pose the head in the fixed camera of its crop from a camera's image; keep identity and expression.
 
     The crop follows the fitted landmarks; `crop_px` None is `CROP_PX`, or less where the camera's image has
-    fewer pixels there, so that nothing is enlarged.
-
-    The pose brings the vertices that face the camera as close as
-    possible to their pixels in the true camera. The second result is the mean distance that remains, over the
-    inter-ocular distance. Without landmarks_px the fit stores the fitted landmarks. Raises InputError where
-    the camera sees the head from behind.
+    fewer pixels there, so that nothing is enlarged. The pose brings the vertices that face the camera as
+    close as possible to their pixels in the true camera. The second result is the mean distance that remains,
+    over the inter-ocular distance. Without landmarks_px the fit stores the fitted landmarks. Raises
+    InputError where the camera sees the head from behind.
     """
     vertices_world = joint.vertices_world(model)
     fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
-    crop = _rounded(from_landmarks(fitted_px, crop_px or CROP_PX))
+    crop = from_landmarks(fitted_px, crop_px or CROP_PX)
+    places = {key: round(getattr(crop, key), DECIMALS) for key in ("x0_px", "y0_px", "side_px")}
+    crop = replace(crop, **places)
     if crop_px is None:
         own_px = int(crop.side_px) // CROP_STEP_PX * CROP_STEP_PX
         crop = replace(crop, size_px=min(crop.size_px, max(own_px, CROP_STEP_PX)))
     in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
-    facing = _facing(in_camera)
+    triangles = grid_triangles()
+    facing = torch.unique(triangles[front_facing(in_camera, triangles)])
     if len(facing) < _LEAST_FACING * len(in_camera):
         raise InputError("a camera sees the head from behind")
     ids = facing[::_CROP_STRIDE]
@@ -267,17 +266,6 @@ def fit_in_crop(
     )
     iod_px = crop.camera.focal_px * IOD_M / eyes_depth_m(rotation, translation_m)
     return fit, float(off_px / iod_px)
-
-
-def _rounded(crop: Crop) -> Crop:
-    x0_px, y0_px, side_px = (round(length, DECIMALS) for length in (crop.x0_px, crop.y0_px, crop.side_px))
-    return Crop(x0_px, y0_px, side_px, crop.size_px)
-
-
-def _facing(vertices_camera: Tensor) -> Tensor:
-    """Ids of the vertices of triangles that face the camera."""
-    triangles = grid_triangles()
-    return torch.unique(triangles[front_facing(vertices_camera, triangles)])
 
 
 def _pose_in_crop(head: Tensor, target_px: Tensor, rotation: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

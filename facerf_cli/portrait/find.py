@@ -198,11 +198,10 @@ def _is_face(seen: SquareView, image: np.ndarray) -> bool:
 
 def _around(face: np.ndarray, sides: float = _FACE_SIDES, more_rad: float = 0.0) -> Square:
     """The square that shows a face with landmarks [68, 2] large and upright, or turned a little more."""
-    x_px, y_px = (face.min(0) + face.max(0)) / 2
     left, right = face[list(OUTER_EYE_CORNERS)]
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    extent_px = float(np.ptp(face, axis=0).max())
-    return Square(float(x_px), float(y_px), sides * max(extent_px, 1.0), turn_rad + more_rad)
+    upright = Square.around(face, sides)
+    return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad + more_rad)
 
 
 def _square(box_px: Box) -> Square:

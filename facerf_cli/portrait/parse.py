@@ -33,6 +33,17 @@ class Square:
     side_px: float
     turn_rad: float = 0.0
 
+    @staticmethod
+    def around(landmarks_px: np.ndarray, sides: float, above: float = 0.0) -> "Square":
+        """An upright square around a face with landmarks [68, 2].
+
+        Its side, and how far its centre lies above theirs, are in extents: the larger side of their bounds.
+        """
+        low, high = landmarks_px.min(0), landmarks_px.max(0)
+        extent_px = float((high - low).max())
+        x_px, y_px = (low + high) / 2
+        return Square(float(x_px), float(y_px) - above * extent_px, sides * extent_px)
+
     def to_photo(self, share: np.ndarray) -> np.ndarray:
         """Convert places [..., 2], in sides of the square from its corner, to the photo's pixels."""
         return (np.asarray(share) - 0.5) @ self._matrix.T + (self.x_px, self.y_px)

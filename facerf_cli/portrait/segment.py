@@ -101,9 +101,9 @@ def seen_classes(
 ) -> Tensor:
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
     height, width = image_srgb.shape[:2]
-    body = _within(_around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
-    chest = _around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
-    near = [_around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
+    body = _within(Square.around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
+    chest = Square.around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
+    near = [Square.around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
     seen = look(parsing, image_srgb, [body, chest, *near])
     (wide, inside), (middle, feather), *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
@@ -118,7 +118,7 @@ def seen_classes(
     places_px = _places(size, image_srgb.shape)
     classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
-    extent_px = max(1.0, _around(landmarks_px, 1, 0).side_px * size[1] / width)
+    extent_px = max(1.0, Square.around(landmarks_px, 1).side_px * size[1] / width)
     classes = with_outline(classes / classes.sum(0).clamp_min(1e-6), small, extent_px)
     # again, since colours may cut off what was joined
     return _decided(_of_one_person(classes, landmarks_px, places_px))
@@ -142,14 +142,6 @@ def small_image(image_srgb: np.ndarray) -> Tensor:
 def _small_size(height: int, width: int) -> tuple[int, int]:
     scale = min(1.0, _SMALL_PX / max(height, width))
     return max(1, round(height * scale)), max(1, round(width * scale))
-
-
-def _around(landmarks_px: np.ndarray, sides: float, above: float) -> Square:
-    """A square around a face; its side and the height of its centre are in extents of the landmarks."""
-    low, high = landmarks_px.min(0), landmarks_px.max(0)
-    extent_px = float((high - low).max())
-    x_px, y_px = (low + high) / 2
-    return Square(float(x_px), float(y_px) - above * extent_px, sides * extent_px)
 
 
 def _within(square: Square, height: int, width: int) -> Square:
@@ -189,7 +181,7 @@ def _of_one_person(classes: Tensor, landmarks_px: np.ndarray, places_px: np.ndar
 
     The pixels [h, w] of the classes lie at places [h, w, 2] in the photo.
     """
-    face = _around(landmarks_px, 1, 0)
+    face = Square.around(landmarks_px, 1)
     extent_px = max(face.side_px, 1e-6)
     away = (places_px - (face.x_px, face.y_px)) / extent_px
     pixel = float(np.ptp(places_px, axis=(0, 1)).max()) / max(1, max(classes.shape[1:]) - 1) / extent_px
