@@ -45,7 +45,7 @@ from facerf_cli.work.photos import (
     read_matte,
     read_photo,
 )
-from facerf_cli.work.sequence import seen_frame, takes_with_face, view_of
+from facerf_cli.work.sequence import frame_with_face, takes_with_face, view_of
 
 TILE_PX = 256
 _LABEL_PX = 20
@@ -116,7 +116,7 @@ def write_shot_light(
     for take in takes_with_face(shot):
         view = view_of(shot, take.start, options.photo)
         number, *others = view.middle_first
-        image, face = seen_frame(shot, number, options.photo, portrait=False)
+        image, face = frame_with_face(shot, number, options.photo, portrait=False)
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
         more = [view.head(frame) for frame in others]
         found = _write(item, image, face, options, width_px, sh_order, more)

@@ -63,7 +63,7 @@ from facerf_cli.work.plan import (
     prediction_bytes,
     require_face,
 )
-from facerf_cli.work.sequence import seen_frame, view_of
+from facerf_cli.work.sequence import frame_with_face, view_of
 from facerf_cli.work.stacks import PersonStack, RenderedStack, StackTextures
 
 log = logging.getLogger(LOGGER_NAME)
@@ -150,17 +150,17 @@ def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
 def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], dict[str, Any]]:
     """All chosen people in one image, or each face alone; metadata of the images, and facts of the faces."""
     lights_over_rig(work.setups, work.rig, work.sampling)  # maps are read before the photo, not beside it
-    image, faces = _seen(item, work)
+    image, faces = _image_and_faces(item, work)
     # of faces alone, the first one's files mark the photo as finished
     parts = [("", faces)] if work.composite == "photo" else [(one.tag, [one]) for one in reversed(faces)]
     scenes = ((tag, _scene(item, image, some, work)) for tag, some in parts)
     return scenes, _metadata(item, work), facts_of(faces, work.photo)
 
 
-def _seen(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
+def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
     """The image of an item and its faces; those of a frame of a shot steadied by the frames around it."""
     if place := shot_of(work.shots, item):
-        image, face = seen_frame(*place, work.photo, work.reflectance == "portrait")
+        image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait")
         return image, [face]
     image = read_photo(item, work.photo)
     return image, fit_faces(item, image, work.photo)
@@ -191,7 +191,7 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     if is_olat_stack(leader.input_path):
         scene = next(_scenes_of_stack(leader, work)[0])[1]
     else:
-        scene = _scene(leader, *_seen(leader, work), work)
+        scene = _scene(leader, *_image_and_faces(leader, work), work)
     parts = batches(len(work.setups), scene.composer.nbytes)
     return _exposures_ev(parts, lambda part: _relit(scene, part), scene, work)
 

@@ -80,7 +80,7 @@ def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:
                 rows.append(row)
                 stream.write(json_line(row) + "\n")
                 stream.flush()
-    _say(shot, rows[1:])
+    _log_cuts_and_gaps(shot, rows[1:])
 
 
 def _followed(
@@ -94,14 +94,14 @@ def _followed(
     frames = ShotFrames(shot, options)
     show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
     finder = CutFinder(len(shot.frames), show)
-    for number in _shown(range(len(rows), len(shot.frames)), shot, settings):
+    for number in _with_progress(range(len(rows), len(shot.frames)), shot, settings):
         cut = shot.cuts and finder.is_cut(number)
         if cut:
             follower = Follower(parsing, options.face, options.landmarks_from)
-        yield _row(number, _see(shot, number, show, follower, options), cut)
+        yield _row(number, _sight(shot, number, show, follower, options), cut)
 
 
-def _see(
+def _sight(
     shot: Shot,
     number: int,
     show: Callable[[int], np.ndarray],
@@ -161,7 +161,7 @@ def _sighting(row: dict[str, Any]) -> Sighting | None:
     return None if given is None else Sighting(np.array(given, np.float64), float(row["expected_error"]))
 
 
-def _shown(numbers: range, shot: Shot, settings: Settings) -> Sequence[int]:
+def _with_progress(numbers: range, shot: Shot, settings: Settings) -> Sequence[int]:
     """The numbers, with a progress bar on a terminal."""
     from rich.progress import track
 
@@ -171,7 +171,7 @@ def _shown(numbers: range, shot: Shot, settings: Settings) -> Sequence[int]:
     return shown
 
 
-def _say(shot: Shot, rows: Sequence[dict[str, Any]]) -> None:
+def _log_cuts_and_gaps(shot: Shot, rows: Sequence[dict[str, Any]]) -> None:
     """Say where a film cuts, and where its face is not seen."""
     sightings, cuts = list(map(_sighting, rows)), _cuts(rows)
     if not any(sightings):
@@ -245,7 +245,7 @@ def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[Lin
     return _opened(shot, options).image(number), face, found
 
 
-def seen_frame(
+def frame_with_face(
     shot: Shot, number: int, options: PhotoOptions, portrait: bool = True
 ) -> tuple[LinearImage, FittedFace]:
     """A frame, and its head with what is steadied by the frames around it; see `ShotView.steady`."""

@@ -86,16 +86,16 @@ def test_an_interrupted_film_goes_on_where_it_was(
 ) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
-    seen_frame = relight_work.seen_frame
+    frame_with_face = relight_work.frame_with_face
 
     def counted(shot: Any, number: int, *rest: Any) -> Any:
         if len(made) == 1:
             made.append("stop")
             raise KeyboardInterrupt
         made.append(number)
-        return seen_frame(shot, number, *rest)
+        return frame_with_face(shot, number, *rest)
 
-    monkeypatch.setattr(relight_work, "seen_frame", counted)
+    monkeypatch.setattr(relight_work, "frame_with_face", counted)
     assert facerf(given, *line) == 130
     assert not out.exists() and made == [0, "stop"]
     assert facerf(given, *line) == 0
