@@ -30,10 +30,10 @@ bench: $(STAMP)
 	set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(VENV)/bin/python $$script; done
 
 man: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.manpages man
+	$(VENV)/bin/python -m facerf_cli.cli.manual man man
 
 completions: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.completions completions
+	$(VENV)/bin/python -m facerf_cli.cli.manual completions completions
 
 # The source distribution, and the wheel from it, as tests/test_distribution.py builds them.
 dist: $(STAMP)

@@ -23,15 +23,12 @@ import typer
 from facerf_cli._version import __version__
 from facerf_cli.batch.settings import DeviceName, Settings
 from facerf_cli.cli import evaluate, face_model
-from facerf_cli.cli.check import check
-from facerf_cli.cli.config import config, read_config
 from facerf_cli.cli.convert_light import convert_light
-from facerf_cli.cli.doctor import doctor
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups, with_machines
-from facerf_cli.cli.photo_options import FITTING, NETWORKS, networks_of
+from facerf_cli.cli.installation import check, config, doctor, read_config
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
 from facerf_cli.cli.predict_olat import predict_olat
 from facerf_cli.cli.prepare_dataset import prepare_dataset
 from facerf_cli.cli.relight import relight
@@ -44,6 +41,7 @@ from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals
+from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
 _PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
 # The verbs by panel of the help, in the order of a user's day.
@@ -191,7 +189,7 @@ def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, .
 for _panel, _verbs in VERBS.items():
     for _verb in _verbs:
         _add = app.command(epilog=EPILOG, context_settings=HELP_NAMES, rich_help_panel=_panel)
-        _add(with_machines(with_groups(_verb)))
+        _add(with_groups(_verb))
 for _name, (_group, _panel) in GROUPS.items():
     app.add_typer(_group, name=_name, rich_help_panel=_panel)
 for _verbs_of in (app, *(group for group, _ in GROUPS.values())):

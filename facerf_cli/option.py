@@ -9,6 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+# Panels of a verb's options in its help, in this order, after those of its own. What must be given, --output
+# and --help have none: they stand first, under Options.
+LIGHT, IMAGE, FACE, METHOD, BATCH = PANELS = ("Light", "Image", "Face", "Method", "Batch")
+
 
 @dataclass(frozen=True)
 class Option:
@@ -21,17 +25,24 @@ class Option:
     shown_default: bool | str = True  # shown in the help: the default, a text in its place, or nothing
     least: float | None = None
     most: float | None = None
-    check: Callable[[Any], Any] | None = None  # returns the value, or raises UsageError
+    parse: Callable[[Any], Any] | None = None  # makes the field's value of what is typed
+    typed: Any = None  # the type of what is typed, if not the field's; str | None with `parse`
+    default_text: Any = None  # with `parse`: what is typed by default
+    required: bool = False  # on the command line, though the dataclass has a default
 
 
 @dataclass(frozen=True)
 class Only:
     """The options of a group that a verb has: `Annotated[Group, Only("face")]`; others keep defaults."""
 
-    names: tuple[str, ...]
+    names: frozenset[str]
 
     def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "names", frozenset(names))
+
+
+class Without(Only):
+    """The options of a group that a verb has not."""
 
 
 def option(default: Any, help: str, metavar: str | None = None, in_recipe: bool = True, **more: Any) -> Any:
@@ -50,8 +61,6 @@ def option(default: Any, help: str, metavar: str | None = None, in_recipe: bool 
     return dataclasses.field(default=default, metadata=metadata)
 
 
-def option_fields(group: Any) -> dict[str, "dataclasses.Field[Any]"]:
-    """The fields of a dataclass that are options, by name; empty for anything else."""
-    if not (isinstance(group, type) and dataclasses.is_dataclass(group)):
-        return {}
-    return {field.name: field for field in dataclasses.fields(group) if "option" in field.metadata}
+def flag(name: str) -> str:
+    """An option as it is typed on the command line."""
+    return f"--{name.replace('_', '-')}"

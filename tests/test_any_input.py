@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from facerf_cli.batch.inputs import NamePattern
 from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
-from facerf_cli.cli.light_entries import lit_images
-from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.icc import space_of_profile
@@ -28,7 +26,10 @@ from facerf_cli.files.light_files import (
     write_numbers,
 )
 from facerf_cli.files.texts import read_rig
+from facerf_cli.light.entries import lit_images, parse_lights
 from facerf_cli.run.logs import escaped, json_line, printable_line
+from facerf_cli.work.output_options import parse_exposure
+from facerf_cli.work.photo_options import parse_pose
 
 # The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.
 DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli import __version__, completions
+from facerf_cli import __version__
+from facerf_cli.cli import manual
 
 ROOT = Path(__file__).parents[1]
 NOT_SOURCE = shutil.ignore_patterns(
@@ -116,7 +117,7 @@ def test_the_installed_wheel_runs_away_from_its_source(built: Path, wheel: zipfi
 
 def test_completion_files_are_in_step_with_typer() -> None:
     held = {path.name: path.read_text() for path in (ROOT / "completions").iterdir()}
-    assert held == completions.scripts(), "run `make completions`"
+    assert held == manual.scripts(), "run `make completions`"
 
 
 def test_zsh_reads_the_command_from_the_first_line() -> None:

@@ -86,7 +86,7 @@ def _table(path: Path) -> None:
 
 
 def _directions(path: Path) -> None:
-    from facerf_cli.cli.values import parse_lights
+    from facerf_cli.light.entries import parse_lights
 
     parse_lights(str(path))
 
@@ -169,7 +169,7 @@ def _pairs(path: Path) -> None:
 
 
 def _rig(path: Path) -> None:
-    from facerf_cli.cli.light_entries import lit_images
+    from facerf_cli.light.entries import lit_images
 
     lit_images([str(path)])
 
@@ -177,7 +177,7 @@ def _rig(path: Path) -> None:
 def _configuration(path: Path) -> None:
     import typer
 
-    from facerf_cli.cli.config import read_config
+    from facerf_cli.cli.installation import read_config
     from facerf_cli.main import app
 
     read_config(path, typer.main.get_command(app))
@@ -237,10 +237,10 @@ def _words(path: Path) -> None:
     """The file's content is the value of an option."""
     from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
     from facerf_cli.batch.settings import Shard
-    from facerf_cli.cli.light_entries import lit_images
-    from facerf_cli.cli.output_options import parse_formats
-    from facerf_cli.cli.values import parse_exposure, parse_lights, parse_pose
     from facerf_cli.errors import FacerfError
+    from facerf_cli.light.entries import lit_images, parse_lights
+    from facerf_cli.work.output_options import parse_exposure, parse_formats
+    from facerf_cli.work.photo_options import parse_pose
 
     word = path.read_bytes().decode("utf-8", "surrogateescape").replace("\0", "")
     refused = None

@@ -71,9 +71,9 @@ class NamePattern:
         return PurePosixPath(result.lstrip("/")).as_posix()
 
 
-def file_pattern(text: str | None) -> NamePattern | None:
-    """Parse the --name of a verb that writes files a photo, where it is given."""
-    return NamePattern.parse(text, "--name", OF_FILES) if text else None
+def file_pattern(text: str) -> NamePattern:
+    """Parse the --name of a verb that writes files a photo."""
+    return NamePattern.parse(text, "--name", OF_FILES)
 
 
 def _fits(name: str, spec: str) -> bool:

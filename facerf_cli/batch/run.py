@@ -7,6 +7,7 @@ faulty item (the run continues); any other `FacerfError` concerns the whole run 
 
 import logging
 import os
+import re
 import sys
 import time
 import traceback
@@ -17,16 +18,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.inputs import Item, NamePattern, file_pattern
 from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, read_row
-from facerf_cli.batch.settings import Overwrite, Settings, Shard, workers_of
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
+from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, json_line, printable_line, unexpected
 from facerf_cli.run.stopping import end_again
-from facerf_cli.run.workers import process_died, spread
+from facerf_cli.run.workers import Workers, process_died, spread
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
 log = logging.getLogger(LOGGER_NAME)
@@ -131,16 +133,92 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
+_FILE_SUFFIX = re.compile(
+    r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
+    r"|mp4|mov|m4v|webm|avi|mkv)",
+    re.IGNORECASE,
+)
+
+
+def folder_not_file(output: Path) -> Path:
+    """The folder that `-o` names; raises UsageError for a file's name, unless such a folder is there."""
+    if _FILE_SUFFIX.fullmatch(output.suffix) and not output.is_dir():
+        raise UsageError(f"-o {output}: is a file's name; give a folder, such as -o {output.with_suffix('')}")
+    return output
+
+
 @dataclass(frozen=True)
 class BatchOptions:
-    """The options of the contract, as the user gave them."""
+    """The options of the contract."""
 
-    output: Path
-    overwrite: Overwrite = "changed"
-    dry_run: bool = False
-    jobs: int = 1  # 0, with `--ray`: as many as there are processors
-    in_a_row: int = 1  # neighbouring items that one of the processes takes
-    print_outputs: bool = True  # on stdout; not those that are to be joined
+    output: Path = option(
+        Path(),
+        "Write the results to this folder.",
+        "DIR",
+        in_recipe=False,
+        flags=("--output", "-o"),
+        shown_default=False,
+        required=True,
+        typed=Path,
+        parse=folder_not_file,
+    )
+    overwrite: Overwrite = option(
+        "changed",
+        "Make again results that exist: never; those that were made from other inputs, options or networks "
+        "(changed); or always.",
+        in_recipe=False,
+        panel=BATCH,
+    )
+    dry_run: bool = option(
+        False,
+        "List what would be read and written; write nothing.",
+        in_recipe=False,
+        flags=("--dry-run",),
+        panel=BATCH,
+    )
+    jobs: int | None = option(
+        None,
+        "Process this many items at a time.",
+        in_recipe=False,
+        flags=("--jobs", "-j"),
+        shown_default="1; with --ray one a processor",
+        least=1,
+        panel=BATCH,
+    )
+    shard: Shard = option(
+        Shard(),
+        "Process every Nth item only, from the Kth on; other machines take the rest.",
+        "K/N",
+        in_recipe=False,
+        shown_default="all items",
+        parse=Shard.parse,
+        panel=BATCH,
+    )
+    ray: str | None = option(
+        None,
+        "Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).",
+        "ADDRESS",
+        in_recipe=False,
+        shown_default=False,
+        panel=BATCH,
+    )
+    name: NamePattern | None = option(
+        None,
+        "Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is "
+        "follows it.",
+        "PATTERN",
+        in_recipe=False,
+        shown_default="{dir}/{stem}.{frame}",
+        parse=file_pattern,
+        panel=BATCH,
+    )
+    in_a_row: int = field(default=1, metadata=NOT_IN_RECIPE)  # neighbouring items that a process takes
+    print_outputs: bool = field(default=True, metadata=NOT_IN_RECIPE)  # on stdout
+
+    def workers(self, settings: Settings) -> Workers:
+        """The workers that `--jobs`, `--ray` and `--device` ask for."""
+        jobs = self.jobs or (1 if self.ray is None else 0)
+        return Workers(jobs, self.ray, int(settings.device == "cuda"), self.in_a_row)
 
 
 def run_items(
@@ -162,8 +240,9 @@ def run_items(
         process: Makes the outputs of an item; picklable, since workers may call it in other processes.
         outputs_of: The files of a finished item. It is finished if they exist and, with `recipes_of`, were
             made from the same input by the same recipe.
-        options: Where outputs go, what is made again, and the number of jobs.
-        settings: The global options; with `--shard` the share, which has a report of its own.
+        options: Where outputs go, what is made again, the number of jobs; the share, which has a report of
+            its own.
+        settings: The global options.
         recipes_of: The recipes of the outputs.
         prepare: Called once before the first item, in a dry run too, but not where everything is finished:
             it loads what `process` needs, so that an error in that is reported once.
@@ -172,16 +251,16 @@ def run_items(
     Raises:
         UsageError: The output folder cannot be used.
     """
-    items = settings.shard.share(items)
+    items = options.shard.share(items)
     is_new = not options.output.exists()
     with ExitStack() as stack:
         if not options.dry_run:
             try:
-                stack.enter_context(alone_in(options.output, _lock_name(settings.shard)))
+                stack.enter_context(alone_in(options.output, _lock_name(options.shard)))
             except OSError as error:
                 raise unusable(options.output, error) from error
         if index is None and recipes_of:
-            index = FolderIndex(options.output, verb, settings.shard, recipes_of)
+            index = FolderIndex(options.output, verb, options.shard, recipes_of)
         states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
         todo = [replace(item, stale=stale) for item, (reason, stale) in states.items() if reason is not None]
         finished = [item for item, (reason, _) in states.items() if reason is None]
@@ -191,7 +270,7 @@ def run_items(
         if options.dry_run:
             _log_made_again(again)
             return _list_what_would_be_done(todo, finished, outputs_of)
-        report = open_report(options.output / report_name(settings.shard), verb, todo, finished, outputs_of)
+        report = open_report(options.output / report_name(options.shard), verb, todo, finished, outputs_of)
         if index and (todo or index.has_news):
             index.open()
         if finished:
@@ -212,7 +291,7 @@ def run_items(
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         elif failures and is_new:
-            lock = options.output / _lock_name(settings.shard)
+            lock = options.output / _lock_name(options.shard)
             _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
         return 1 if failures else 0
 
@@ -228,7 +307,7 @@ def _results(
 ) -> Generator[ItemResult]:
     """Process items by the workers and yield their results in order; raise what concerns the whole run."""
     memory.collect_as_usual()
-    workers = workers_of(settings, options.jobs, options.in_a_row)
+    workers = options.workers(settings)
     at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
     work = _Work(process, indexed, settings.job_bytes(at_once))
     try:
@@ -247,11 +326,10 @@ def all_finished(
     items: Sequence[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
-    settings: Settings,
     index: FolderIndex,
 ) -> bool:
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
-    share = settings.shard.share(items)
+    share = options.shard.share(items)
     return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
 
 
@@ -264,14 +342,13 @@ def sums_up(
     items: Sequence[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
     options: BatchOptions,
-    settings: Settings,
 ) -> bool:
     """True if a verb may now write what depends on all items.
 
     Without `--shard` always. A shard may when the items of all shards are finished, so the last one does; not
     with `--overwrite always`, since an earlier run's outputs look the same.
     """
-    if settings.shard.of == 1:
+    if options.shard.of == 1:
         return True
     always = options.overwrite == "always"
     left = len(items) if always else sum(not _exist(outputs_of(item)) for item in items)

@@ -1,4 +1,4 @@
-"""The settings of a run: global options, the choice of workers, its share of the items."""
+"""The settings of a run: global options, and its share of the items."""
 
 import re
 from collections.abc import Sequence
@@ -8,7 +8,6 @@ from typing import Any, Literal, TypeVar
 
 from facerf_cli.errors import UsageError
 from facerf_cli.run import memory
-from facerf_cli.run.workers import Workers
 
 DeviceName = Literal["auto", "cpu", "cuda", "mps"]
 Overwrite = Literal["never", "changed", "always"]
@@ -25,10 +24,8 @@ class Shard:
     of: int = 1
 
     @staticmethod
-    def parse(text: str | None) -> "Shard":
-        """Parse `K/N`; None takes all items. Raises UsageError for anything else."""
-        if text is None:
-            return Shard()
+    def parse(text: str) -> "Shard":
+        """Parse `K/N`; raises UsageError for anything else."""
         number, slash, of = text.partition("/")
         if not (slash and _SHARE.fullmatch(text) and 1 <= int(number) <= int(of)):
             raise UsageError(f"--shard {text}: not a share; give K/N with K from 1 to N, such as 3/8")
@@ -41,7 +38,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Settings:
-    """The global options and the choice of workers; `ctx.obj` in every verb."""
+    """The global options; `ctx.obj` in every verb."""
 
     verbosity: int = field(default=0, metadata=NOT_IN_RECIPE)  # -1 errors only, 0 notes, 1 everything
     log_json: bool = field(default=False, metadata=NOT_IN_RECIPE)
@@ -50,18 +47,11 @@ class Settings:
     checkpoints_by_default: bool = field(default=False, metadata=NOT_IN_RECIPE)  # of a configuration file
     seed: int = 0
     null_separated: bool = field(default=False, metadata=NOT_IN_RECIPE)  # names on standard input
-    shard: Shard = field(default=Shard(), metadata=NOT_IN_RECIPE)
-    ray: str | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: this machine, without Ray
     memory_bytes: int | None = field(default=None, metadata=NOT_IN_RECIPE)  # of a job; None: a share of all
 
     def job_bytes(self, jobs: int) -> int:
         """The budget of memory of each of so many jobs."""
         return memory.default_limit(jobs) if self.memory_bytes is None else self.memory_bytes
-
-
-def workers_of(settings: Settings, jobs: int, in_a_row: int = 1) -> Workers:
-    """The workers that `--jobs`, `--ray` and `--device` ask for."""
-    return Workers(jobs, settings.ray, int(settings.device == "cuda"), in_a_row)
 
 
 def torch_device(settings: Settings) -> Any:

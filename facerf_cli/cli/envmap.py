@@ -4,38 +4,16 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import LIGHT, DryRunOption, OutputOption, OverwriteOption, settings_of
-from facerf_cli.errors import UsageError
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.cli.options import settings_of
+from facerf_cli.option import Only
+from facerf_cli.work.verbs import DrawnMaps
 
 
 def envmap(
     context: typer.Context,
-    output: OutputOption,
-    count: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Write so many maps.", rich_help_panel=LIGHT)
-    ] = 10,
-    kind: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="KIND",
-            help="Draw from this kind alone (may be repeated): sun, dusk, overcast, windows, hall, studio, "
-            "night, stage.",
-            show_default="all, sun most often",
-            rich_help_panel=LIGHT,
-        ),
-    ] = None,
-    size: Annotated[
-        int,
-        typer.Option(
-            min=16,
-            max=8192,
-            metavar="PX",
-            help="Write maps of this width; the height is half.",
-            rich_help_panel=LIGHT,
-        ),
-    ] = 512,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
+    maps: DrawnMaps,
+    batch: Annotated[BatchOptions, Only("output", "overwrite", "dry_run")],
 ) -> None:
     """Write environment maps drawn from a seed: suns, overcast skies, rooms, studios, streets and stages.
 
@@ -43,8 +21,7 @@ def envmap(
     only on --seed, n and the kinds, so a larger --count adds maps and changes none. envmaps.png shows all of
     them, each beside a white ball under its light; `relight --envmap DIR` reads the maps alone.
     """
-    if size % 2:
-        raise UsageError(f"--size {size}: the height is half of it; give an even number")
+    maps.check()
     from facerf_cli.work.draw_envmaps import write_envmaps
 
-    write_envmaps(output, count, kind, size, settings_of(context).seed, overwrite, dry_run)
+    write_envmaps(batch, maps, settings_of(context).seed)

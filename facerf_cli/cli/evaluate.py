@@ -7,33 +7,16 @@ from typing import Annotated, Literal
 
 import typer
 
-from facerf_cli.cli.light_options import LightOptions, NonNegativeOption, Refine, RefineOption
-from facerf_cli.cli.options import (
-    EPILOG,
-    HELP_NAMES,
-    FaceModelOption,
-    InputColourspaceOption,
-    NetworkAloneOption,
-    refuse_given,
-    settings_of,
-    with_groups,
-    with_machines,
-)
-from facerf_cli.cli.photo_options import (
-    FaceOption,
-    GeometryOption,
-    LandmarksFromOption,
-    LandmarksOption,
-    PhotoOptions,
-)
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.option import Only
+from facerf_cli.option import Only, Without
 from facerf_cli.work.evaluation_settings import DATA, MEASURES, METHODS, EvaluateOptions, SplitOptions
+from facerf_cli.work.photo_options import FieldOptions, LightOptions, PhotoOptions, SolveOptions
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
-_BATCH = ("overwrite", "dry_run", "jobs")
+_BATCH = ("overwrite", "dry_run", "jobs", "shard", "ray")
 _GIVEN_LIGHTS = ("output", "reflectance", "against", "compare", "pictures", "space", "lpips", "vgg_weights")
 _GIVEN_IMAGES = ("output", "space", "lpips", "vgg_weights")  # no model is run
 
@@ -60,11 +43,9 @@ def olat(
     dataset: DatasetArgument,
     *,
     data: SplitOptions,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    network_alone: NetworkAloneOption = False,
-    face_model: FaceModelOption = "builtin",
-    options: EvaluateOptions,
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
+    field: FieldOptions,
+    options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
@@ -78,10 +59,7 @@ def olat(
     """
     _check(options, data)
     _refuse_without_field(context, options, "network_alone")
-    photo = PhotoOptions(
-        settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
-    )
-    _run("olat", [str(dataset)], dataset, options, data, photo, network_alone=network_alone)
+    _run("olat", [str(dataset)], dataset, options, data, photo, field.network_alone)
 
 
 def reconstruction(
@@ -89,15 +67,9 @@ def reconstruction(
     inputs: PhotosOrDatasetArgument,
     *,
     data: SplitOptions,
-    face: FaceOption = "largest",
-    landmarks: LandmarksOption = None,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    input_colourspace: InputColourspaceOption = None,
-    face_model: FaceModelOption = "builtin",
-    non_negative: NonNegativeOption = True,
-    refine: RefineOption = "none",
-    options: EvaluateOptions,
+    photo: Annotated[PhotoOptions, Without("texture_side")],
+    solve: SolveOptions,
+    options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
     """Explain photos by reflectance and light, and render them again (the paper's Table 2).
 
@@ -109,16 +81,7 @@ def reconstruction(
     _check(options, data)
     folder = _only_dataset(inputs)
     _refuse_for_others(context, photos=folder is None)
-    photo = PhotoOptions(
-        settings_of(context),
-        input_colourspace,
-        face_model,
-        face,
-        landmarks,
-        geometry=geometry,
-        landmarks_from=landmarks_from,
-    )
-    _run("reconstruction", inputs, folder, options, data, photo, non_negative=non_negative, refine=refine)
+    _run("reconstruction", inputs, folder, options, data, photo, solve=solve)
 
 
 def transfer(
@@ -146,14 +109,9 @@ def transfer(
         ),
     ] = False,
     data: SplitOptions,
-    landmarks: LandmarksOption = None,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    input_colourspace: InputColourspaceOption = None,
-    face_model: FaceModelOption = "builtin",
-    non_negative: NonNegativeOption = True,
-    refine: RefineOption = "none",
-    options: EvaluateOptions,
+    photo: Annotated[PhotoOptions, Without("texture_side", "face")],
+    solve: SolveOptions,
+    options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
@@ -164,19 +122,11 @@ def transfer(
     _check(options, data)
     _refuse_for_others(context, photos)
     _refuse_without_field(context, options, "held_to_photo")
-    photo = PhotoOptions(
-        settings_of(context),
-        input_colourspace,
-        face_model,
-        landmarks=landmarks,
-        geometry=geometry,
-        landmarks_from=landmarks_from,
-    )
     folder = None if photos else _only_dataset(inputs)
     if not photos and folder is None:
         raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
     alone = not held_to_photo
-    _run("transfer", inputs, folder, options, data, photo, alone, non_negative=non_negative, refine=refine)
+    _run("transfer", inputs, folder, options, data, photo, alone, solve)
 
 
 def geometry(
@@ -194,13 +144,8 @@ def geometry(
         ),
     ] = None,
     data: Annotated[SplitOptions, Only("split", "every")],
-    face: FaceOption = "largest",
-    landmarks: LandmarksOption = None,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    input_colourspace: InputColourspaceOption = None,
-    face_model: FaceModelOption = "builtin",
-    options: EvaluateOptions,
+    photo: Annotated[PhotoOptions, Without("texture_side")],
+    options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
@@ -214,15 +159,6 @@ def geometry(
     folder = _only_dataset(inputs)
     _refuse_for_others(context, photos=folder is None)
     _refuse_without_field(context, options, "mean_checkpoint")
-    photo = PhotoOptions(
-        settings_of(context),
-        input_colourspace,
-        face_model,
-        face,
-        landmarks,
-        geometry=geometry,
-        landmarks_from=landmarks_from,
-    )
     _run("geometry", inputs, folder, options, data, photo, mean_checkpoint=mean_checkpoint)
 
 
@@ -269,10 +205,8 @@ def yale_b(
             rich_help_panel=DATA,
         ),
     ] = 0.0,
-    geometry: GeometryOption = None,
-    landmarks_from: LandmarksFromOption = "facerf",
-    network_alone: NetworkAloneOption = False,
-    face_model: FaceModelOption = "builtin",
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
+    field: FieldOptions,
     options: Annotated[EvaluateOptions, Only(*_GIVEN_LIGHTS, *_BATCH)],
 ) -> None:
     """Relight real people to real point lights and compare with their photos under these.
@@ -290,10 +224,7 @@ def yale_b(
         options = replace(options, reflectance=["portrait"])
     from facerf_cli.work.evaluate_images import run_yale_b
 
-    photo = PhotoOptions(
-        settings_of(context), face_model=face_model, geometry=geometry, landmarks_from=landmarks_from
-    )
-    raise typer.Exit(run_yale_b(folder, options, photo, shifts, subjects or [], network_alone, room))
+    raise typer.Exit(run_yale_b(folder, options, photo, shifts, subjects or [], field.network_alone, room))
 
 
 def pairs(
@@ -363,7 +294,7 @@ def pairs(
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
-    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_machines(with_groups(_protocol)))
+    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_groups(_protocol))
 
 
 def _check(options: EvaluateOptions, data: SplitOptions) -> None:
@@ -393,7 +324,7 @@ def _refuse_for_others(context: typer.Context, photos: bool) -> None:
     if photos:
         refuse_given(context, ("split", "every", "joint_fit"), "is for a prepared dataset; leave it out here")
     else:
-        refuse_given(context, ("face", "landmarks", "input_colourspace"), "is for photos; leave it out here")
+        refuse_given(context, ("face", "landmarks", "colourspace"), "is for photos; leave it out here")
 
 
 def _refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
@@ -410,8 +341,7 @@ def _run(
     data: SplitOptions,
     photo: PhotoOptions,
     network_alone: bool = True,
-    non_negative: bool = True,
-    refine: Refine = "none",
+    solve: SolveOptions | None = None,
     mean_checkpoint: Path | None = None,
 ) -> None:
     """Run a protocol on a dataset's folder, or without one on photos, and exit.
@@ -424,15 +354,15 @@ def _run(
         data: The split of the dataset.
         photo: How faces are found and fitted.
         network_alone: True to leave the photo's correction out of the field.
-        non_negative: True to estimate lights from 0 up.
-        refine: The refinement of the estimated light.
+        solve: How lights are estimated.
         mean_checkpoint: The networks of the mean face.
     """
     photo.check()
-    LightOptions(photo, non_negative=non_negative, refine=refine).check()
+    solve = solve or SolveOptions()
+    LightOptions(photo=photo, non_negative=solve.non_negative, refine=solve.refine).check()
     from facerf_cli.work.evaluate_faces import FaceSettings, run_on_people, run_on_photos
 
     settings = FaceSettings(
-        protocol, options, photo, data, network_alone, non_negative, refine, mean_checkpoint
+        protocol, options, photo, data, network_alone, solve.non_negative, solve.refine, mean_checkpoint
     )
     raise typer.Exit(run_on_photos(settings, inputs) if folder is None else run_on_people(settings, folder))

@@ -1,21 +1,17 @@
 """`facerf prepare-dataset`: a light stage's capture as crops, fits, OLAT stacks and splits."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.capture.settings import CAPTURE, ChartSettings, CheckSettings, ReadSettings
-from facerf_cli.cli.options import (
-    DryRunOption,
-    FaceModelOption,
-    JobsOption,
-    OverwriteOption,
-    refuse_given,
-    settings_of,
-)
+from facerf_cli.cli.options import refuse_given, settings_of
 from facerf_cli.dataset.settings import DatasetSettings
 from facerf_cli.errors import UsageError
+from facerf_cli.option import Without
 
 _DESCRIBES = ("capture", "output", "describe", "pattern", "dry_run")  # parameters that --describe uses
 
@@ -34,6 +30,7 @@ def prepare_dataset(
     chart: ChartSettings,
     checking: CheckSettings,
     content: DatasetSettings,
+    batch: Annotated[BatchOptions, Without("output", "name")],
     output: Annotated[
         Path | None,
         typer.Option(
@@ -63,10 +60,6 @@ def prepare_dataset(
             rich_help_panel=CAPTURE,
         ),
     ] = "",
-    face_model: FaceModelOption = "builtin",
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: JobsOption = 1,
 ) -> None:
     """Prepare a light stage's capture for training: crops, fits, OLAT stacks, splits.
 
@@ -79,20 +72,19 @@ def prepare_dataset(
     lacks most frames, or in which no face is found, is left out, too; dataset.json lists both. A subject with
     less than half of the lights, or fewer than 10, fails. findings.jsonl has the findings of the checks.
     """
-    from facerf_cli.batch.run import BatchOptions
     from facerf_cli.work.prepare import describe_capture, prepare_capture
 
     if describe:
         others = [name for name in context.params if name not in _DESCRIBES]
         refuse_given(context, others, "is for preparing; leave it out with --describe")
-        describe_capture(capture, pattern, output, dry_run)
+        describe_capture(capture, pattern, output, batch.dry_run)
         return
     refuse_given(context, ["pattern"], "is for --describe; leave it out, stage.json has the pattern")
     if output is None:
         raise UsageError(
             "-o: is missing; give -o DATASET, a folder (or --describe, for a draft of stage.json)"
         )
-    batch = BatchOptions(output, overwrite, dry_run, jobs)
+    batch = replace(batch, output=output)
     settings = settings_of(context)
-    code = prepare_capture(capture, reading, chart, checking, content, face_model, batch, settings)
+    code = prepare_capture(capture, reading, chart, checking, content, batch, settings)
     raise typer.Exit(code)

@@ -1,12 +1,15 @@
 """`facerf relight-dataset`: relight a prepared dataset under environment maps, into pairs to train on."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import BATCH, DryRunOption, OverwriteOption, settings_of
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.cli.options import settings_of
 from facerf_cli.dataset.settings import PairSettings
+from facerf_cli.option import Without
 
 
 def relight_dataset(
@@ -16,14 +19,7 @@ def relight_dataset(
         typer.Argument(metavar="DATASET", help="Folder of `facerf prepare-dataset`.", show_default=False),
     ],
     pairs: PairSettings,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "--jobs", "-j", min=1, help="Relight this many subjects at a time.", rich_help_panel=BATCH
-        ),
-    ] = 1,
+    batch: Annotated[BatchOptions, Without("output", "name")],
 ) -> None:
     """Relight a prepared dataset under environment maps, into the pairs of `facerf train --dataset`.
 
@@ -37,9 +33,8 @@ def relight_dataset(
     the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
     and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
     """
-    from facerf_cli.batch.run import BatchOptions
     from facerf_cli.dataset.pairs import RELIT
     from facerf_cli.work.prepare import relight_subjects
 
-    batch = BatchOptions(dataset / RELIT, overwrite, dry_run, jobs)
+    batch = replace(batch, output=dataset / RELIT)
     raise typer.Exit(relight_subjects(dataset, pairs, batch, settings_of(context)))

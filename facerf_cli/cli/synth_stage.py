@@ -6,22 +6,14 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.run import BatchOptions
-from facerf_cli.cli.options import (
-    BATCH,
-    IMAGE,
-    DryRunOption,
-    OutputOption,
-    OverwriteOption,
-    settings_of,
-)
+from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import UsageError
+from facerf_cli.option import IMAGE, Without
 from facerf_cli.synth.stage_settings import StageSettings
 
 
 def synth_stage(
     context: typer.Context,
-    output: OutputOption,
-    *,
     subjects: Annotated[
         int,
         typer.Option(
@@ -32,6 +24,7 @@ def synth_stage(
             rich_help_panel="People and stage",
         ),
     ] = 10,
+    *,
     stage: StageSettings,
     transport: Annotated[
         bool,
@@ -41,14 +34,7 @@ def synth_stage(
             rich_help_panel=IMAGE,
         ),
     ] = False,
-    overwrite: OverwriteOption = "changed",
-    dry_run: DryRunOption = False,
-    jobs: Annotated[
-        int,
-        typer.Option(
-            "--jobs", "-j", min=1, help="Photograph this many people at a time.", rich_help_panel=BATCH
-        ),
-    ] = 1,
+    batch: Annotated[BatchOptions, Without("name")],
 ) -> None:
     """Photograph synthetic people in a light stage: one light at a time, eight cameras, one exposure.
 
@@ -61,7 +47,6 @@ def synth_stage(
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
     from facerf_cli.work.synth_subjects import photograph_people
 
-    batch = BatchOptions(output, overwrite, dry_run, jobs)
     settings = settings_of(context)
     stage = replace(stage, seed=settings.seed)
     raise typer.Exit(photograph_people(subjects, stage, transport, batch, settings))

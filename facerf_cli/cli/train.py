@@ -1,19 +1,14 @@
 """`facerf train`: train the networks on synthetic heads or on a prepared dataset."""
 
-import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, get_args
+from dataclasses import replace
 
 import typer
 
-from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.options import flag, settings_of, was_given
-from facerf_cli.cli.photo_options import Geometry
+from facerf_cli.cli.options import is_default, was_given
 from facerf_cli.errors import UsageError
-from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
+from facerf_cli.option import flag
+from facerf_cli.training.settings import Stage
+from facerf_cli.work.train_options import PaceOptions, TrainOptions
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
 _PEOPLE_STAGES = ("parsing", "portrait")  # which draw whole synthetic people
@@ -36,233 +31,9 @@ _STAGES = {  # the stages that an option applies to
     "heads": _HEAD_STAGES,
     "bank": _HEAD_STAGES,
 }
-_UNITS_S = {"s": 1, "m": 60, "h": 3600}
-_DEFAULT_TIME = "2h"
-
-_run = partial(typer.Option, rich_help_panel="The run")
-_data = partial(typer.Option, rich_help_panel="Data")
-_length = partial(typer.Option, rich_help_panel="Length")
-_loss = partial(typer.Option, rich_help_panel="Losses and ablations")
-_speed = partial(typer.Option, rich_help_panel="Speed")
 
 
-def _by_preset(value: Callable[[TrainSettings], Any]) -> str:
-    """Defaults of an option in all presets, for the help."""
-    default, paper, tiny = (value(PRESETS[name]) for name in ("default", "paper", "tiny"))
-    return f"{default}; paper {paper}, tiny {tiny}"
-
-
-@dataclass(frozen=True)
-class TrainOptions:
-    """The options of a run, checked; settings only."""
-
-    output: Path
-    preset: Preset
-    form: str
-    stage: Stage
-    training: TrainSettings
-    resume: bool
-    start_from: Path | None
-    dataset: Path | None
-    heads_from: str
-    fit_with: str
-    heads: int | None
-    views: int | None
-    bank: Path | None
-    texture_size: int | None
-    photos: Path | None
-    vgg_weights: str | None
-    appearance_features: Path | None
-    light_features: Path | None
-    without_normals: bool
-    mean_face: bool
-    geometry: Geometry
-    jobs: int
-    workers: int | None  # None: by the device
-    settings: Settings
-
-
-def train(
-    context: typer.Context,
-    output: Annotated[Path, _run("--output", "-o", metavar="DIR", help="Write the run to this folder.")],
-    preset: Annotated[
-        Preset,
-        _run(
-            help="Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or "
-            "small ones for trials (tiny)."
-        ),
-    ] = "default",
-    form: Annotated[
-        str | None,
-        _run(
-            metavar="NAME",
-            help="Train this form of the Reflectance Network: default, paper, or a form of your own "
-            "(docs/design.md).",
-            show_default="paper with --preset paper, else default",
-        ),
-    ] = None,
-    stage: Annotated[
-        Stage | None,
-        _run(
-            metavar="STAGE",
-            help=f"Train the networks of a stage: {', '.join(get_args(Stage))}.",
-            show_default="joint with --preset paper, else reflectance",
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        _run("--resume", help="Continue the run in DIR from its last save; give the same options."),
-    ] = False,
-    start_from: Annotated[
-        Path | None,
-        _run(
-            metavar="FILE",
-            help="Start from a checkpoint; networks that the stage does not train are copied.",
-            show_default="none",
-        ),
-    ] = None,
-    dataset: Annotated[
-        Path | None,
-        _data(
-            metavar="DIR",
-            help="Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.",
-            show_default="synthetic heads",
-        ),
-    ] = None,
-    texture_size: Annotated[
-        int | None,
-        _data(
-            min=32,
-            max=1024,
-            metavar="PX",
-            help="Unwrap a dataset to textures of this side; the stages joint and appearance-features read "
-            "its crops at this side, too.",
-            show_default="128, joint 256; with --preset paper 512",
-        ),
-    ] = None,
-    photos: Annotated[
-        Path | None,
-        _data(
-            metavar="DIR",
-            help="Train on photos of faces, too, in a fifth of the batches of the stage joint.",
-            show_default="none",
-        ),
-    ] = None,
-    heads_from: Annotated[
-        str,
-        _data(
-            metavar="NAME|PATH",
-            help="Draw synthetic heads from this face model; of whole people, from several with commas.",
-        ),
-    ] = "builtin",
-    fit_with: Annotated[
-        str,
-        _data(metavar="NAME|PATH", help="Fit this face model to the heads; a dataset's own model."),
-    ] = "builtin",
-    heads: Annotated[
-        int | None, _data(min=2, help="Bake so many synthetic heads.", show_default="240; tiny 16")
-    ] = None,
-    views: Annotated[
-        int | None, _data(min=1, help="Fit so many views of each head.", show_default="8; tiny 2")
-    ] = None,
-    bank: Annotated[
-        Path | None, _data(metavar="DIR", help="Keep baked heads in this folder.", show_default="DIR/bank")
-    ] = None,
-    jobs: Annotated[int, _data("--jobs", "-j", min=1, help="Bake or unwrap in so many processes.")] = 2,
-    steps: Annotated[
-        int | None, _length(min=1, help="Stop after so many steps.", show_default="no limit")
-    ] = None,
-    max_time: Annotated[
-        str | None,
-        _length(
-            metavar="TIME",
-            help="Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.",
-            show_default=f"{_DEFAULT_TIME}; no limit with --steps",
-        ),
-    ] = None,
-    validate_every: Annotated[
-        int | None,
-        _length(
-            min=1,
-            metavar="STEPS",
-            help="Validate on held-out people, and save, every so many steps.",
-            show_default=_by_preset(lambda settings: settings.validate_every),
-        ),
-    ] = None,
-    vgg_weights: Annotated[
-        str | None,
-        _loss(
-            metavar="imagenet|PATH",
-            help="Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a "
-            "file.",
-            show_default="without this loss",
-        ),
-    ] = None,
-    appearance_features: Annotated[
-        Path | None,
-        _loss(
-            metavar="FILE",
-            help="Use a checkpoint of the stage appearance-features in place of --vgg-weights.",
-            show_default="without this loss",
-        ),
-    ] = None,
-    light_features: Annotated[
-        Path | None,
-        _loss(
-            metavar="FILE",
-            help="Add the feature loss on textures, with a checkpoint of the stage light-features.",
-            show_default="without this loss",
-        ),
-    ] = None,
-    without_normals: Annotated[
-        bool, _loss("--without-normals", help="Train the Reflectance Network without normal maps (ablation).")
-    ] = False,
-    mean_face: Annotated[
-        bool, _loss("--mean-face", help="Fit poses alone, with the mean face for everyone (ablation).")
-    ] = False,
-    geometry: Annotated[
-        Geometry,
-        _loss(
-            help="Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train "
-            "the Reflectance Network alone."
-        ),
-    ] = "network",
-    learning_rate: Annotated[
-        float | None,
-        _run(
-            min=1e-9,
-            help="Set the highest learning rate.",
-            show_default=_by_preset(lambda settings: settings.optimizer.learning_rate),
-        ),
-    ] = None,
-    batch: Annotated[
-        int | None,
-        _speed(
-            min=1,
-            help="Use so many samples a step, of all processes together.",
-            show_default=_by_preset(lambda settings: settings.batch),
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        _speed(
-            min=0,
-            help="Draw samples ahead in so many processes.",
-            show_default="1 on a CPU of more than one core, 4 on a GPU",
-        ),
-    ] = None,
-    bf16: Annotated[
-        bool | None,
-        _speed(
-            "--bf16/--no-bf16",
-            help="Train in mixed precision (bfloat16), where the device has instructions for it.",
-            show_default="on; presets paper and tiny, and --form paper, off",
-        ),
-    ] = None,
-    compile_model: Annotated[
-        bool, _speed("--compile", help="Compile the networks with torch; the first steps take minutes.")
-    ] = False,
-) -> None:
+def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> None:
     """Train the networks on synthetic heads, without a light stage, or on a prepared dataset.
 
     Stages: reflectance, the Reflectance Network on textures; geometry, the Geometry Network on rendered
@@ -281,55 +52,15 @@ def train(
 
     Several processes, one a GPU: torchrun --nproc-per-node N -m facerf_cli train ...
     """
-    stage = stage or ("joint" if preset == "paper" else "reflectance")
-    _refuse_conflicts(context, stage)
-    settings = settings_of(context)
-    if max_time is None and steps is None:
-        max_time = _DEFAULT_TIME
-    training = preset_of(preset, stage)
-    optimizer = training.optimizer
-    form = form or ("paper" if preset == "paper" else "default")
-    training = replace(
-        training,
-        steps=steps,
-        max_seconds=_seconds(max_time) if max_time else None,
-        seed=settings.seed,
-        compile=compile_model,
-        optimizer=replace(optimizer, learning_rate=learning_rate or optimizer.learning_rate),
-        batch=batch or training.batch,
-        validate_every=validate_every or training.validate_every,
-        bf16=training.bf16 and form != "paper" if bf16 is None else bf16,  # its gradients overflow
-    )
+    if options.preset == "paper":
+        joint, paper = is_default(context, "stage"), is_default(context, "form")
+        options = replace(
+            options, stage="joint" if joint else options.stage, form="paper" if paper else options.form
+        )
+    _refuse_conflicts(context, options.stage)
     from facerf_cli.work.train import run_training
 
-    run_training(
-        TrainOptions(
-            output=output,
-            preset=preset,
-            form=form,
-            stage=stage,
-            training=training,
-            resume=resume,
-            start_from=start_from,
-            dataset=dataset,
-            heads_from=heads_from,
-            fit_with=fit_with,
-            heads=heads,
-            views=views,
-            bank=bank,
-            texture_size=texture_size,
-            photos=photos,
-            vgg_weights=vgg_weights,
-            appearance_features=appearance_features,
-            light_features=light_features,
-            without_normals=without_normals,
-            mean_face=mean_face,
-            geometry=geometry,
-            jobs=jobs,
-            workers=workers,
-            settings=settings,
-        )
-    )
+    run_training(replace(options, training=pace.of_run(options)))
 
 
 def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
@@ -360,10 +91,3 @@ def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
         raise UsageError("--form: --start-from fixes the form; give one of them")
     if {"without_normals", "start_from"} <= given:
         raise UsageError("--without-normals: --start-from fixes the networks' inputs; give one of them")
-
-
-def _seconds(text: str) -> float:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
-    if not match or not float(match[1]):
-        raise UsageError(f"--max-time {text}: not a time; write a number and s, m or h, such as 45m")
-    return float(match[1]) * _UNITS_S[match[2]]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from facerf_cli.option import option
+from facerf_cli.option import FACE, option
 
 _DATASET, _PAIRS = "Dataset", "Pairs"  # panels of the help
 
@@ -24,6 +24,12 @@ class DatasetSettings:
         "PX",
         shown_default="256, or less where the face has fewer pixels",
         panel=_DATASET,
+    )
+    face_model: str = option(
+        "builtin",
+        "Fit this morphable model: builtin, or a .npz of `face-model import`.",
+        "NAME|PATH",
+        panel=FACE,
     )
 
 

@@ -16,7 +16,8 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.settings import Settings, workers_of
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, stopping
@@ -37,24 +38,24 @@ Row = Mapping[str, Any]  # of `Finding.row`
 
 
 def check_all(
-    work: "CheckOnly", items: Sequence[Item], output: Path, jobs: int, strict: bool, settings: Settings
+    work: "CheckOnly", items: Sequence[Item], batch: BatchOptions, strict: bool, settings: Settings
 ) -> int:
     """Check all subjects, print the table and write findings.jsonl; return 1 if a subject would be stopped.
 
     UsageError with `--shard`, because the file covers all subjects.
     """
-    if settings.shard.of > 1:
+    if batch.shard.of > 1:
         raise UsageError("--shard: --checks only checks all subjects; omit it, and give --jobs or --ray")
     shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    results = spread(work, items, workers_of(settings, jobs), _died)
+    results = spread(work, items, batch.workers(settings), _died)
     bar = track(results, "checks", len(items), console=STDERR, transient=True, disable=not shown)
     findings = [found for of_subject in bar for found in of_subject]
     rows = [found.row() for found in findings]
-    _write_rows(output / FINDINGS_FILE, rows)
+    _write_rows(batch.output / FINDINGS_FILE, rows)
     show_findings(rows, strict)
     if not rows:
         log.info("checked: %s, nothing found", counted(len(items), "subject"))
-    print(output / FINDINGS_FILE)
+    print(batch.output / FINDINGS_FILE)
     return 1 if stopping(findings, strict) else 0
 
 

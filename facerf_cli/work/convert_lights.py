@@ -9,7 +9,6 @@ from torch import Tensor
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.convert_light import Axes, ConvertLight, Form
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.light_files import (
     Harmonics,
@@ -32,6 +31,7 @@ from facerf_cli.light.forms import (
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photos import directions_of
+from facerf_cli.work.verbs import Axes, ConvertLight, Form
 
 Attributes = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)

@@ -11,7 +11,6 @@ import platformdirs
 import torch
 
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.cli.doctor import MISSING
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.dlib_landmarks import (
     DETECTOR_LICENCE,
@@ -23,6 +22,7 @@ from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.relighting.models import described_file
+from facerf_cli.work.installed import MISSING
 
 
 def examine(settings: Settings) -> dict[str, dict[str, Any]]:

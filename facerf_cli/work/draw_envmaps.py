@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from facerf_cli._version import __version__
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import sweep_leftovers
@@ -19,50 +20,43 @@ from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import ball, mean_radiance
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of
+from facerf_cli.work.verbs import DrawnMaps
 
 SHEET = "envmaps.png"
 Facts = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
 
 
-def write_envmaps(
-    output: Path,
-    count: int,
-    kind: list[str] | None,
-    width_px: int,
-    seed: int,
-    overwrite: Overwrite,
-    dry_run: bool,
-) -> None:
-    """Draw and write maps of some kinds (None: the usual mix), and print their paths; skip finished ones.
+def write_envmaps(batch: BatchOptions, wanted: DrawnMaps, seed: int) -> None:
+    """Draw and write maps, and print their paths; skip finished ones.
 
     A map is finished if it was drawn from the same seed at the same width. At the end the contact sheet of
     all of them is written, unless there is one since the last map.
     """
-    kinds = tuple(dict.fromkeys(kind)) if kind else MIX
+    kinds = tuple(dict.fromkeys(wanted.kind)) if wanted.kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:
         raise UsageError(f"--kind {unknown[0]}: no such kind; give one of {', '.join(KINDS)}")
     maps: dict[Path, Facts] = {}
-    for index in range(count):
+    for index in range(wanted.count):
         name = kind_of(index, seed, kinds)
-        path = output / f"{index:05d}_{name}.exr"
+        path = batch.output / f"{index:05d}_{name}.exr"
         maps[path] = {"facerf:kind": name, "facerf:seed": seed, "facerf:index": index}
-    if not dry_run:
-        sweep_leftovers(output)
-    new = {path for path in maps if _is_to_be_made(path, maps[path], width_px, overwrite)}
+    if not batch.dry_run:
+        sweep_leftovers(batch.output)
+    new = {path for path in maps if _is_to_be_made(path, maps[path], wanted.size_px, batch.overwrite)}
     for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
             log.info("%s: already exists (--overwrite always makes it again)", path)
             continue
-        if not dry_run:
-            pixels, _ = draw_sky(index, seed, width_px, kinds)
+        if not batch.dry_run:
+            pixels, _ = draw_sky(index, seed, wanted.size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
         print(path, flush=True)
-    sheet = output / SHEET
+    sheet = batch.output / SHEET
     if new or _is_older(sheet, maps):
-        if not dry_run:
+        if not batch.dry_run:
             write_sheet(list(maps), sheet)
-            log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
+            log.info("%s: shows %d of %d maps", sheet, min(wanted.count, MOST_MAPS), wanted.count)
         print(sheet, flush=True)
 
 

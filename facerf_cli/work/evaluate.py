@@ -16,9 +16,8 @@ from PIL import Image
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.batch.run import Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Comparison, Measures, Row, measure
 from facerf_cli.evaluation.pairs import read_predictions
@@ -42,6 +41,7 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import checkpoint_file, serving_files
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
 from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.work.photo_options import PhotoOptions, networks_of
 from facerf_cli.work.photos import face_model
 
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
@@ -82,9 +82,7 @@ def run_protocol(
         raise UsageError(f"evaluate {protocol.name}: nothing to evaluate; give other inputs")
     verb = f"evaluate {protocol.name}"
     work = _Measure(protocol.metrics[0], compare, options, settings, photo)
-    batch = BatchOptions(
-        options.output, options.overwrite, options.dry_run, options.jobs, print_outputs=False
-    )
+    batch = replace(options, print_outputs=False)
 
     def recipes(digest_of: DigestOf) -> list[Recipe]:
         names = {"measuring": _MEASURING, "protocol": protocol.name, "methods": list(options.methods)}
@@ -105,9 +103,9 @@ def run_protocol(
     code = run_items(verb, items, work, work.outputs_of, batch, settings, recipes, begin)
     if code:
         log.error("no summary is written while images are missing; finished items are kept, so run it again")
-    elif not options.dry_run and sums_up(items, work.outputs_of, batch, settings):
+    elif not options.dry_run and sums_up(items, work.outputs_of, options):
         _remove_summary(options.output)
-        if settings.shard.of > 1 and (other := _made_otherwise(items, work, verb, recipes)):
+        if options.shard.of > 1 and (other := _made_otherwise(items, work, verb, recipes)):
             log.info("%d items of other shards are of an earlier run, so there is no summary", len(other))
         else:
             _finish(protocol, items, work)
@@ -118,7 +116,7 @@ def _made_otherwise(
     items: Sequence[Item], work: "_Measure", verb: str, recipes: Callable[[DigestOf], list[Recipe]]
 ) -> list[Item]:
     """The finished items that were made from other inputs or by another recipe: one table has one way."""
-    index = FolderIndex(work.options.output, verb, work.settings.shard, recipes)
+    index = FolderIndex(work.options.output, verb, work.options.shard, recipes)
     finished = [item for item in items if work.path_of(item).exists()]
     return [
         item for item in finished if index.why_again(item.input_path, [work.path_of(item)])[0] is not None

@@ -11,8 +11,6 @@ from typing import Literal, TypeVar
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
 from facerf_cli.batch.settings import NOT_IN_RECIPE
-from facerf_cli.cli.light_options import LightOptions, Refine
-from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import UsageError
@@ -36,6 +34,7 @@ from facerf_cli.relighting.models import load_models
 from facerf_cli.work.evaluate import run_protocol
 from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
 from facerf_cli.work.light_of_photo import feature_network
+from facerf_cli.work.photo_options import LightOptions, PhotoOptions, Refine, networks_of
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
 
 T = TypeVar("T")
@@ -201,9 +200,8 @@ def methods_of(
     """
     models = load_models_once(photo)
     non_negative, refined, vgg_weights = estimating
-    estimator = Estimator(
-        non_negative, feature_network(LightOptions(photo, vgg_weights=vgg_weights))[0] if refined else None
-    )
+    how = LightOptions(photo=photo, vgg_weights=vgg_weights)
+    estimator = Estimator(non_negative, feature_network(how)[0] if refined else None)
     others = [
         (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device))
         for path in checkpoints

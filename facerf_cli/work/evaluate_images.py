@@ -9,7 +9,6 @@ from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
-from facerf_cli.cli.photo_options import PhotoOptions, networks_of
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Comparison
@@ -19,6 +18,7 @@ from facerf_cli.evaluation.yale_b import compare_sitter, layout
 from facerf_cli.work.evaluate import run_protocol
 from facerf_cli.work.evaluate_faces import methods_of
 from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.work.photo_options import PhotoOptions, networks_of
 from facerf_cli.work.photos import load_models_once, prepare_photos
 
 _ITEMS_AT_MOST = 64

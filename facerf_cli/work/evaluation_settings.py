@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from facerf_cli.baselines import RelightKind
-from facerf_cli.batch.settings import Overwrite
-from facerf_cli.cli.options import BATCH, folder_not_file
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.option import option
@@ -34,18 +33,9 @@ class SplitOptions:
 
 
 @dataclass(frozen=True)
-class EvaluateOptions:
+class EvaluateOptions(BatchOptions):
     """Settings of what is measured, by which methods, and where it goes, for other processes too."""
 
-    output: Path = option(
-        ...,
-        "Write the results to this folder.",
-        "DIR",
-        in_recipe=False,
-        flags=("--output", "-o"),
-        shown_default=False,
-        check=folder_not_file,
-    )
     reflectance: list[str] | None = option(  # typer has no lists of choices; None: field
         None,
         "Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and the "
@@ -98,27 +88,6 @@ class EvaluateOptions:
     )
     preset: Literal["paper"] | None = option(
         None, "Measure as many images as the paper did.", shown_default="none", panel=MEASURES
-    )
-    overwrite: Overwrite = option(
-        "changed",
-        "Make again results that exist: never; those that were made from other inputs, options or networks "
-        "(changed); or always.",
-        in_recipe=False,
-        panel=BATCH,
-    )
-    dry_run: bool = option(
-        False,
-        "List what would be read and written; write nothing.",
-        in_recipe=False,
-        panel=BATCH,
-    )
-    jobs: int = option(
-        1,
-        "Process this many items at a time.",
-        in_recipe=False,
-        flags=("--jobs", "-j"),
-        least=1,
-        panel=BATCH,
     )
 
     @property

@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.light_options import LightOptions
-from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
@@ -34,6 +32,7 @@ from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
@@ -46,6 +45,7 @@ from facerf_cli.work.photos import (
     read_photo,
 )
 from facerf_cli.work.sequence import frame_with_face, takes_with_face, view_of
+from facerf_cli.work.shots import Shot
 
 TILE_PX = 256
 _LABEL_PX = 20

@@ -10,8 +10,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from facerf_cli.cli.lights import DrawnMap, LightSetup, PhotoLight, Sampling
-from facerf_cli.cli.output_options import OutputOptions
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.envmap import ball, rotated_weights
@@ -20,6 +18,8 @@ from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.light_of_photo import light_of_photo
+from facerf_cli.work.light_setups import DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
 from facerf_cli.work.photos import directions_of, face_model
 

@@ -9,11 +9,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from facerf_cli.cli.output_options import SUFFIXES, Format, OutputOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.output_options import SUFFIXES, Format, OutputOptions
 
 Exposure = float | Literal["auto"]
 log = logging.getLogger(LOGGER_NAME)

@@ -13,8 +13,6 @@ import torch
 
 from facerf_cli.batch.inputs import OF_PHOTOS, PHOTO_SUFFIXES, Item, NamePattern
 from facerf_cli.batch.settings import torch_device
-from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.values import parse_lights, parse_pose
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
 from facerf_cli.face.fit import FaceFit, Geometry
@@ -23,6 +21,7 @@ from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.image.colour import named_space
+from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
@@ -31,6 +30,7 @@ from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 from facerf_cli.work.plan import KEPT_PX, beside_photo
 
 

@@ -12,7 +12,7 @@ from rich.progress import track
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
-from facerf_cli.batch.settings import Settings, workers_of
+from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.capture import Capture, ChartCorrection
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
@@ -21,7 +21,6 @@ from facerf_cli.capture.draft import as_text, draft_stage
 from facerf_cli.capture.findings import Selection, frames_left_out, has_new_frames, select_frames
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
 from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
-from facerf_cli.cli.lights import MAP_SUFFIXES
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,
@@ -61,6 +60,7 @@ from facerf_cli.work.capture_findings import (
     show_findings,
     write_findings,
 )
+from facerf_cli.work.light_setups import MAP_SUFFIXES
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -94,7 +94,6 @@ def prepare_capture(
     chart: ChartSettings,
     checking: CheckSettings,
     content: DatasetSettings,
-    face_model: str,
     batch: BatchOptions,
     settings: Settings,
 ) -> int:
@@ -107,17 +106,17 @@ def prepare_capture(
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(CheckOnly(source.opened), items, output, batch.jobs, checking.strict, settings)
-    model_sha256 = _model_digest(face_model)
+        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
+    model_sha256 = _model_digest(content.face_model)
     key = preparation_key(capture, model_sha256, content.crop)
     _check_earlier(capture, output, key, overwrite)
-    work = Prepare(source, checking, face_model, content.crop, output, key)
+    work = Prepare(source, checking, content.face_model, content.crop, output, key)
     if overwrite and not batch.dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
     elif not batch.dry_run:
         _forget_completed(capture, output)
     code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
-    if not batch.dry_run and sums_up(items, work.outputs_of, batch, settings):
+    if not batch.dry_run and sums_up(items, work.outputs_of, batch):
         _write_dataset(work, capture, split, settings.seed, model_sha256)
     return code
 
@@ -291,7 +290,7 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
     if not batch.dry_run:
-        write_pairs(dataset, pairs, overwrite, _Spread(batch.jobs, settings))
+        write_pairs(dataset, pairs, overwrite, _Spread(batch, settings))
     if wanted.lazy:
         print(pairs_path(dataset))
         return 0
@@ -332,15 +331,15 @@ class _Relight:
 class _Spread:
     """`map` over envmaps by the workers of --jobs or --ray, with a progress bar."""
 
-    jobs: int
+    batch: BatchOptions
     settings: Settings
 
     def __call__(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
-        if self.settings.shard.of > 1:  # shards would write the same pairs at the same time
+        if self.batch.shard.of > 1:  # shards would write the same pairs at the same time
             raise UsageError(
                 "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
             )
-        results = spread(work, items, workers_of(self.settings, self.jobs), _died)
+        results = spread(work, items, self.batch.workers(self.settings), _died)
         shown = STDERR.is_terminal and self.settings.verbosity >= 0 and not self.settings.log_json
         return iter(track(results, "maps", len(items), console=STDERR, transient=True, disable=not shown))
 

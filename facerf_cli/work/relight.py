@@ -13,10 +13,6 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
-from facerf_cli.cli.backgrounds import BackgroundChoice
-from facerf_cli.cli.lights import LightSetup
-from facerf_cli.cli.relight_work import Relight
-from facerf_cli.cli.shots import shot_of
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import FaceTexture, Head
@@ -32,6 +28,7 @@ from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Target
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
+from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
     each_alone,
     lights_over_rig,
@@ -63,7 +60,9 @@ from facerf_cli.work.plan import (
     prediction_bytes,
     require_face,
 )
+from facerf_cli.work.relight_options import BackgroundChoice, Relight
 from facerf_cli.work.sequence import frame_with_face, view_of
+from facerf_cli.work.shots import shot_of
 from facerf_cli.work.stacks import PersonStack, RenderedStack, StackTextures
 
 log = logging.getLogger(LOGGER_NAME)

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.shots import Shot, shot_of
 from facerf_cli.face.fit import save_fit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
@@ -25,6 +23,7 @@ from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
@@ -40,6 +39,7 @@ from facerf_cli.work.photos import (
 )
 from facerf_cli.work.plan import KEPT_OF_SEGMENTS_PX, segments_canvas
 from facerf_cli.work.sequence import segmented_frame
+from facerf_cli.work.shots import Shot, shot_of
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
 _OVERLAY_PX = 1600  # largest side of the overlay

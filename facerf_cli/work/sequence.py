@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.photo_options import PhotoOptions
-from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
@@ -23,7 +21,9 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, ShotView, Sighting, gaps, takes
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import LANDMARK_SUFFIXES, FittedFace, companion, load_models_once, read_photo
+from facerf_cli.work.shots import Shot
 
 _DECODED = 12  # frames of a film that are kept as they were decoded
 _AHEAD = 8  # frames that are kept while cuts are looked for
@@ -59,6 +59,12 @@ class ShotFrames:
     @cached_property
     def _shape(self) -> tuple[int, ...]:
         return self.image(0).pixels.shape
+
+
+def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
+    """Follow the face through each shot; what was followed before is kept."""
+    for shot in () if dry_run else shots:
+        follow_shot(shot, photo, photo.settings)
 
 
 def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.predict_olat import PredictOlat
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit, fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
@@ -46,6 +45,7 @@ from facerf_cli.work.photos import (
     rotation_of,
 )
 from facerf_cli.work.plan import prediction_bytes, require_face, require_web_images
+from facerf_cli.work.verbs import PredictOlat
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most

@@ -26,7 +26,7 @@ def photograph_people(
     if not batch.dry_run:
         open_capture(batch.output, stage)
     code = run_items("synth-stage", items, photograph, photograph.outputs_of, batch, settings)
-    if not batch.dry_run and sums_up(items, photograph.outputs_of, batch, settings):
+    if not batch.dry_run and sums_up(items, photograph.outputs_of, batch):
         close_capture(batch.output, stage)
     return code
 

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.cli.train import TrainOptions
 from facerf_cli.dataset.crops import Photos, mean_translation_m, open_photos
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.portraits import open_dataset_portraits
@@ -62,6 +61,7 @@ from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSet
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Preset, Stage
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
+from facerf_cli.work.train_options import TrainOptions
 
 _MAPS, _HEAPS = 60, 240  # backgrounds: surroundings, each seen from several sides, and heaps of shapes
 _TINY_U_WIDTHS, _TINY_BLOCKS = (8, 8, 12, 16), (0, 1, 1, 1)

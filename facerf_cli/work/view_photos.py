@@ -4,7 +4,7 @@ import shlex
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -34,10 +34,8 @@ from facerf_cli.viewer.page import (
     strip_jpeg,
     strip_of,
 )
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import FittedFace, face_model, facts_of, fit_faces, load_models_once, read_photo
-
-if TYPE_CHECKING:
-    from facerf_cli.cli.view import MakePage
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
 _HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
@@ -45,20 +43,20 @@ _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(item: Item, work: "MakePage") -> tuple[list[Path], dict[str, Any]]:
+def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[Path], dict[str, Any]]:
     """Write a page for each chosen face of a photo, or for a stack; their paths, and facts for the report."""
     if is_olat_stack(item.input_path):
-        (path,) = work.outputs_of(item)
-        return [path], write_page_of_stack(path, item, work)
-    image = read_photo(item, work.photo)
-    faces = fit_faces(item, image, work.photo)
-    models = load_models_once(work.photo)
+        path = item.output(options.first_tag + ".html")
+        return [path], write_page_of_stack(path, item, options, size_px)
+    image = read_photo(item, options)
+    faces = fit_faces(item, image, options)
+    models = load_models_once(options)
     paths = []
     for face in reversed(faces):  # the first one's page marks the photo as finished
         path = item.output(face.tag + ".html")
-        write_page(path, item, models, image.pixels, face, work.size_px)
+        write_page(path, item, models, image.pixels, face, size_px)
         paths.append(path)
-    return paths[::-1], facts_of(faces, work.photo)
+    return paths[::-1], facts_of(faces, options)
 
 
 def write_page(
@@ -81,16 +79,14 @@ def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plat
     return basis, Plate(photo, matte, background)
 
 
-def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, Any]:
+def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
     """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
     header = read_olat_header(item.input_path)
-    basis = basis_of_stack(
-        header.directions, lambda: stream_olats(item.input_path), header.seen, work.size_px
-    )
+    basis = basis_of_stack(header.directions, lambda: stream_olats(item.input_path), header.seen, size_px)
     size = basis.guide.shape[:2]
     head = (0.5, 0.5, 0.5)
     if header.kind == "photo":
-        head, face = _face_of_stack(item, header, work)
+        head, face = _face_of_stack(item, header, options)
         basis = basis.anchored(header.source, face * header.seen, header.seen)
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
     _write(path, item, "", basis, plate, head)
@@ -98,14 +94,14 @@ def write_page_of_stack(path: Path, item: Item, work: "MakePage") -> dict[str, A
 
 
 def _face_of_stack(
-    item: Item, header: StackHeader, work: "MakePage"
+    item: Item, header: StackHeader, options: PhotoOptions
 ) -> tuple[tuple[float, float, float], np.ndarray]:
     """The place of the head of a photo's stack, and the face's share [H, W] of it."""
     try:
         fit = fit_from_arrays(header.fit)
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
-    vertices = fit.vertices_camera(face_model(work.photo))
+    vertices = fit.vertices_camera(face_model(options))
     view = view_face(vertices, photo_camera(fit.crop, *header.seen.shape), fit.crop.side_px)
     return head_place(fit.crop, header.seen), view.full(view.mask)
 
@@ -126,13 +122,13 @@ def _write(
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_index(path: Path, items: Sequence[Item], work: "MakePage") -> None:
+def write_index(path: Path, items: Sequence[Item], options: PhotoOptions) -> None:
     """Write the list of all pages that exist, and print its path."""
     entries = []
     for item in items:
         for made in sorted(item.output_base.parent.glob(f"{_escaped(item.output_base.name)}*.html")):
             tag = made.stem.removeprefix(item.output_base.name)
-            if tag == "" if work.photo.face != "all" else tag.startswith("_face"):
+            if tag == "" if options.face != "all" else tag.startswith("_face"):
                 address = made.relative_to(path.parent).as_posix()
                 strip = strip_of(made.read_text(encoding="utf-8"))
                 entries.append(IndexEntry(item.name + tag.replace("_", " "), address, strip))

@@ -169,7 +169,7 @@ from pathlib import Path
 from facerf_cli.batch.inputs import collect_items
 from facerf_cli.batch.run import BatchOptions, run_items
 from facerf_cli.batch.run import Outcome
-from facerf_cli.cli.options import Settings
+from facerf_cli.batch.settings import Settings
 from facerf_cli.batch.made_from import Recipe
 from facerf_cli.files.atomic import atomic_path
 

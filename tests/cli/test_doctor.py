@@ -9,10 +9,10 @@ import pytest
 from safetensors.numpy import save_file
 
 from facerf_cli._version import __version__
-from facerf_cli.cli.doctor import EXTRAS, MISSING
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.work import doctor_facts as doctor
+from facerf_cli.work.installed import EXTRAS, MISSING
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,12 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.cli.lights import collect_setups
 from facerf_cli.files.atomic import _machine
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.draw_envmaps import write_sheet
+from facerf_cli.work.light_setups import LightSources, collect_setups
 
 
 def test_writes_seeded_maps_and_skips_finished_ones(
@@ -97,7 +97,7 @@ def test_a_tile_shows_the_ball_lit_from_where_the_map_is_bright(tmp_path: Path) 
 def test_a_folder_of_maps_is_read_without_its_sheet(tmp_path: Path) -> None:
     maps = tmp_path / "maps"
     assert main(["envmap", "-o", str(maps), "--count", "2", "--size", "32"]) == 0
-    setups = collect_setups([str(maps)], None, [], tmp_path / "out", 0, ())
+    setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out", 0)
     assert [setup.envmap for setup in setups] == sorted(maps.glob("*.exr")) and len(setups) == 2
 
 

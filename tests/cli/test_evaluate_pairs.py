@@ -118,8 +118,11 @@ def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said)
 
 
 def test_reflectance_models_are_named_and_files_are_there() -> None:
-    options = EvaluateOptions(Path("out"), ["prt", "field"])
+    options = EvaluateOptions(Path("out"), reflectance=["prt", "field"])
     assert options.kinds == ("prt", "field") and options.has_field
-    assert EvaluateOptions(Path("out")).kinds == ("field",) and not EvaluateOptions(Path("out"), []).kinds
+    assert (
+        EvaluateOptions(Path("out")).kinds == ("field",)
+        and not EvaluateOptions(Path("out"), reflectance=[]).kinds
+    )
     with pytest.raises(UsageError, match="no such file"):
         EvaluateOptions(Path("out"), against=[Path("none.safetensors")]).check()

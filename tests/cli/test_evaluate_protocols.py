@@ -16,7 +16,6 @@ from PIL import Image
 from facerf_cli import pipeline
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation import people
@@ -30,6 +29,7 @@ from facerf_cli.relighting.models import Models
 from facerf_cli.work import evaluate_faces
 from facerf_cli.work.evaluate_faces import FaceSettings, faces_of, load_methods
 from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double

@@ -11,11 +11,11 @@ import pytest
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.yale_b import Flash, read_yale_b
-from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.evaluation import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
 from facerf_cli.work import evaluate_images
+from facerf_cli.work.photo_options import PhotoOptions
 from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
 from tests.evaluation.method_doubles import FaceModelOnly
 from tests.evaluation.toy_sitters import Lambert, someone

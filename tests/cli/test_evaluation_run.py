@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
@@ -18,6 +17,7 @@ from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
 from facerf_cli.work import evaluate as evaluation_run
 from facerf_cli.work.evaluate import keep_images
 from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.work.photo_options import PhotoOptions
 from tests.evaluation.toy_protocol import (
     HEIGHT,
     LAYOUT,
@@ -98,7 +98,7 @@ def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path) -> None:
         for note in notes.iterdir():
             note.unlink()
         work = Toy(notes=notes)
-        options = EvaluateOptions(out, [], compare=[theirs])
+        options = EvaluateOptions(out, reflectance=[], compare=[theirs])
         assert evaluation_run.run_protocol(LAYOUT, inputs, work, options, Settings()) == 0
         return sorted(note.stem for note in notes.iterdir())
 

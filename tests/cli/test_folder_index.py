@@ -11,11 +11,11 @@ from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.made_from import differences, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
-from facerf_cli.cli.output_options import OutputOptions
-from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
+from facerf_cli.work.output_options import OutputOptions
+from facerf_cli.work.photo_options import PhotoOptions
 from tests.cli.test_batch import copy, outputs_of, rows, run
 
 
@@ -182,7 +182,7 @@ def test_shards_know_what_the_others_made(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     for number in (1, 2):
-        settings, options = Settings(shard=Shard(number, 2)), BatchOptions(tmp_path / "out")
+        settings, options = Settings(), BatchOptions(tmp_path / "out", shard=Shard(number, 2))
         items = collect_items([str(photos)], tmp_path / "out")
         run_items("copy", items, copy, outputs_of, options, settings, lambda digest_of: [{}])
     assert made(capsys) == ["a", "b"]
@@ -225,7 +225,7 @@ def test_relight_reads_its_index_once(tmp_path: Path, monkeypatch: pytest.Monkey
         init(self, folder)
 
     monkeypatch.setattr(folder_index._Rows, "__init__", counted)
-    monkeypatch.setattr("facerf_cli.cli.relight_work.Relight.readable", lambda self, dry_run: self)
+    monkeypatch.setattr("facerf_cli.work.relight_options.Relight.readable", lambda self, dry_run: self)
     line = ["relight", str(tmp_path / "a.png"), "--light", "9,9", "--dry-run"]
     assert main([*line, "-o", str(tmp_path / "out")]) == 0
     assert read == [tmp_path / "out"]

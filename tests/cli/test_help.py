@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import typer.main
 
-from facerf_cli import manpages
+from facerf_cli.cli import manual
 from facerf_cli.main import app, main
 
 # Options whose value is a small language, which their help explains.
@@ -59,10 +59,10 @@ def test_paragraphs_fill_the_width() -> None:
 
 
 def test_man_pages_have_the_panels_as_subsections() -> None:
-    page = manpages.pages()["facerf-estimate-light.1"]
+    page = manual.pages()["facerf-estimate-light.1"]
     panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
     assert panels == ["Light", "Method", "Face", "Image", "Batch"]
-    top = manpages.pages()["facerf.1"]
+    top = manual.pages()["facerf.1"]
     assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
 
 

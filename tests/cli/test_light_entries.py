@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.light_entries import lit_images, preset_names
-from facerf_cli.cli.lights import collect_setups
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
+from facerf_cli.light.entries import lit_images, preset_names
 from facerf_cli.light.studio import StudioLight
+from facerf_cli.work.light_setups import LightSources, collect_setups
 from facerf_cli.work.lights import lights_over_rig
 
 
@@ -45,19 +45,19 @@ def test_lights_with_names_share_an_image_whatever_their_form() -> None:
 
 
 def test_a_sweep_numbers_its_frames_and_leaves_out_its_end() -> None:
-    setups = collect_setups([], None, ["az=-90:90:3;el=20"], Path("out"))
+    setups = collect_setups(LightSources(light=["az=-90:90:3;el=20"]), Path("out"))
     assert [setup.frame for setup in setups] == [".0000", ".0001", ".0002"]
     assert {setup.name for setup in setups} == {"light_az_-90_90_3_el_20"}  # and so of one exposure
     assert [setup.lights[0].azel_deg for setup in setups] == [(-90, 20), (-30, 20), (30, 20)]
     item = Item(Path("a.jpg"), Path("out/a"), "a")
     assert setups[1].output(item, "", ".exr") == Path("out/a_light_az_-90_90_3_el_20.0001.exr")
-    both = collect_setups([], None, ["az=0:20:2;el=0:90:2;stops=1"], Path("out"))
+    both = collect_setups(LightSources(light=["az=0:20:2;el=0:90:2;stops=1"]), Path("out"))
     assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
-    assert collect_setups([], None, ["az=0:20:1"], Path("out"))[0].frame == ".0000"
+    assert collect_setups(LightSources(light=["az=0:20:1"]), Path("out"))[0].frame == ".0000"
 
 
 def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
-    setups = collect_setups([], None, ["name=key;az=0:90:3", "fill=-40,0"], Path("out"))
+    setups = collect_setups(LightSources(light=["name=key;az=0:90:3", "fill=-40,0"]), Path("out"))
     assert [[light.azel_deg for light in setup.lights] for setup in setups] == [
         [(0, 0), (-40, 0)],
         [(30, 0), (-40, 0)],
@@ -106,7 +106,7 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
 )
 def test_faults_say_what_to_give(entry: str, said: str) -> None:
     with pytest.raises(UsageError) as caught:
-        collect_setups([], None, [entry], Path("out"))
+        collect_setups(LightSources(light=[entry]), Path("out"))
     assert said in str(caught.value) and str(caught.value).startswith("--light")
     assert "\n" not in str(caught.value)
 
@@ -115,7 +115,7 @@ def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> 
     (tmp_path / "studio.toml").write_text(
         "[key]\nat = [0.5, 0.3, 1]\nsize = 0.4\nkelvin = 3200\n[rim]\naz = '150:170:2'\nel = 10\nstops = -1\n"
     )
-    setups = collect_setups([], None, [str(tmp_path / "studio.toml"), "key=1,2"], tmp_path / "out")
+    setups = collect_setups(LightSources(light=[str(tmp_path / "studio.toml"), "key=1,2"]), tmp_path / "out")
     assert [setup.name + setup.frame for setup in setups] == ["studio.0000", "studio.0001", "light_key"]
     assert setups[0].names == ("key", "rim")
     assert setups[1].lights == (
@@ -144,14 +144,14 @@ def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, s
 
 def test_every_preset_is_a_rig() -> None:
     assert preset_names() == ("beauty", "butterfly", "loop", "rembrandt", "rim", "split")
-    setups = collect_setups([], None, preset_names(), Path("out"))
+    setups = collect_setups(LightSources(light=preset_names()), Path("out"))
     assert [setup.name for setup in setups] == list(preset_names())
     assert all(setup.lights and len(setup.names) == len(setup.lights) for setup in setups)
 
 
 def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
     entries = ["name=a;at=0,0,1;stops=1", "b=30,0", "at=0,0,1;rgb=1,0,0", "at=0,0,2"]
-    setups = collect_setups([], None, entries, Path("out"))  # the image of names comes last
+    setups = collect_setups(LightSources(light=entries), Path("out"))  # the image of names comes last
     lights = lights_over_rig(setups, "150", "cell")
     assert [light.at_m for light in lights.near] == [(0, 0, 1), (0, 0, 2)]
     assert lights.near_weights is not None and lights.near_weights.tolist() == [
@@ -168,7 +168,7 @@ def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
 def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
     write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
     entries = ["0,0,3,3,3", "180,0", "at=0,0,1;stops=1", "from=around"]
-    setups = collect_setups([str(tmp_path / "even.exr")], None, entries, Path("out"))
+    setups = collect_setups(LightSources(envmap=[str(tmp_path / "even.exr")], light=entries), Path("out"))
     assert lights_over_rig(setups, "150", "cell").strengths() == pytest.approx(
         [2, 3, 1, 2, 4], rel=1e-3
     )  # an even map of 0.5 first

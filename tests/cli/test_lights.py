@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.lights import LightSetup, collect_setups, parse_rotations
-from facerf_cli.cli.output_options import OutputOptions
-from facerf_cli.cli.values import parse_lights
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
+from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
 from facerf_cli.work.lights import lights_over_rig, lights_over_stack, readable, write_balls
+from facerf_cli.work.output_options import OutputOptions
 
 HEIGHT_PX = 16
 
@@ -37,7 +37,7 @@ def test_maps_may_be_files_folders_and_patterns(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         write_map(tmp_path / f"{name}.exr")
     for given in ([str(tmp_path)], [str(tmp_path / "*.exr")], [str(tmp_path / f"{n}.exr") for n in "cab"]):
-        setups = collect_setups(given, None, [], tmp_path / "out")
+        setups = collect_setups(LightSources(envmap=given), tmp_path / "out")
         assert [setup.name for setup in setups] == ["a", "b", "c"]
 
 
@@ -50,20 +50,20 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=harmonics))
     (tmp_path / "c.json").write_text("{}")
     given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
-    setups = readable(collect_setups(given, "90", [], tmp_path / "out"))
+    setups = readable(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
     assert [setup.name for setup in setups] == ["a_light_rot90", "b_rot90"]
     assert "c.json has no 'format'; give a file that facerf wrote" in caplog.text
-    (setup,) = collect_setups(given[:1], None, [], tmp_path / "out")
-    found = lights_over_stack((setup,), rig, "cell")[0]
+    (setup,) = collect_setups(LightSources(envmap=given[:1]), tmp_path / "out")
+    found = lights_over_stack((setup,), rig, "cell").weights[0]
     assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
     with pytest.raises(UsageError, match="no inputs"):  # a folder is walked for maps alone
-        collect_setups([str(tmp_path)], None, [], tmp_path / "out")
+        collect_setups(LightSources(envmap=[str(tmp_path)]), tmp_path / "out")
 
 
 def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
     for place in ("day/sky.exr", "night/sky.exr", "night/moon.exr"):
         write_map(tmp_path / place)
-    setups = collect_setups([str(tmp_path)], None, [], tmp_path / "out")
+    setups = collect_setups(LightSources(envmap=[str(tmp_path)]), tmp_path / "out")
     assert [setup.name for setup in setups] == ["day_sky", "moon", "night_sky"]
 
 
@@ -103,12 +103,12 @@ def test_wrong_rotations(text: str) -> None:
 @pytest.mark.parametrize("text", ["", ";", "1", "1,2,3", "a,b", "1,2,3,4,5,6", "1,inf", "0,91", "0,0,1,-1,0"])
 def test_wrong_lamps(text: str) -> None:
     with pytest.raises(UsageError, match="--light"):
-        collect_setups([], None, [text], Path("out"))
+        collect_setups(LightSources(light=[text]), Path("out"))
 
 
 def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,R,G,B, numbers separated by commas"):
-        collect_setups([], None, ["60"], Path("out"))
+        collect_setups(LightSources(light=["60"]), Path("out"))
     with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
         parse_rotations("left")
     (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
@@ -118,9 +118,9 @@ def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
 
 def test_no_light_and_the_same_light_twice() -> None:
     with pytest.raises(UsageError, match="add --envmap, --light"):
-        collect_setups([], None, [], Path("out"))
+        collect_setups(LightSources(), Path("out"))
     with pytest.raises(UsageError, match="once"):
-        collect_setups([], None, ["1,2", "1.0,2"], Path("out"))
+        collect_setups(LightSources(light=["1,2", "1.0,2"]), Path("out"))
 
 
 def test_frame_numbers_stay_at_the_end() -> None:
@@ -137,7 +137,9 @@ def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.
     write_exr(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
     (tmp_path / "text.exr").write_text("not a picture")
     given = [str(tmp_path), str(tmp_path / "missing.exr")]
-    setups = readable(collect_setups(given, "0:360:2", ["0,0"], tmp_path / "out"))
+    setups = readable(
+        collect_setups(LightSources(envmap=given, light=["0,0"], rotate="0:360:2"), tmp_path / "out")
+    )
     assert [setup.name + setup.frame for setup in setups] == ["good.0000", "good.0001", "light_0_0"]
 
 
@@ -149,7 +151,9 @@ def test_a_lamp_and_a_one_texel_map_agree(tmp_path: Path, azimuth_deg: float) ->
     envmap = write_map(tmp_path / "one.exr", (u, 0.5 - elevation_deg / 180))
     texel_deg = 360 / (2 * HEIGHT_PX)
     centre_deg = 180 - (math.floor(u * 2 * HEIGHT_PX) + 0.5) * texel_deg
-    setups = collect_setups([str(envmap)], None, [f"{centre_deg},{elevation_deg}"], tmp_path / "out")
+    setups = collect_setups(
+        LightSources(envmap=[str(envmap)], light=[f"{centre_deg},{elevation_deg}"]), tmp_path / "out"
+    )
     lights = lights_over_rig(setups, "600", "cell")
     directions, weights = lights.directions, lights.weights
     mean = torch.einsum("lc,ld->cd", weights[0], directions)
@@ -161,7 +165,7 @@ def test_a_lamp_and_a_one_texel_map_agree(tmp_path: Path, azimuth_deg: float) ->
 
 def test_rotation_adds_to_the_azimuth(tmp_path: Path) -> None:
     envmap = write_map(tmp_path / "one.exr", (0.5, 0.49))
-    setups = collect_setups([str(envmap)], "40", [], tmp_path / "out")
+    setups = collect_setups(LightSources(envmap=[str(envmap)], rotate="40"), tmp_path / "out")
     lights = lights_over_rig(setups, "600", "cell")
     directions, weights = lights.directions, lights.weights
     azimuth = torch.atan2(*(weights[0, :, 0] @ directions)[[0, 2]].split(1))
@@ -169,7 +173,7 @@ def test_rotation_adds_to_the_azimuth(tmp_path: Path) -> None:
 
 
 def test_lamps_shine_together_with_their_colours() -> None:
-    setups = collect_setups([], None, ["90,0,1,0,0;-90,0,0,0,2", "0,0"], Path("out"))
+    setups = collect_setups(LightSources(light=["90,0,1,0,0;-90,0,0,0,2", "0,0"]), Path("out"))
     lights = lights_over_rig(setups, "150", "cell")
     directions, weights = lights.directions, lights.weights
     assert directions.shape == (3, 3)  # the rig is not needed
@@ -180,7 +184,7 @@ def test_lamps_shine_together_with_their_colours() -> None:
 
 def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
     directions = rig_directions(50)
-    setups = collect_setups([], None, ["30,20,1,2,3"], Path("out"))
+    setups = collect_setups(LightSources(light=["30,20,1,2,3"]), Path("out"))
     weights = lights_over_stack(setups, directions, "cell").weights
     nearest = int((directions - azel_to_direction(30.0, 20.0)).norm(dim=-1).argmin())
     torch.testing.assert_close(weights[0, nearest], torch.tensor([1.0, 2, 3]))
@@ -196,7 +200,7 @@ def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None)
 
 def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
     envmap = write_map(tmp_path / "one.exr", (0.25, 0.49))
-    setups = collect_setups([str(envmap)], None, ["0,0"], tmp_path / "out")
+    setups = collect_setups(LightSources(envmap=[str(envmap)], light=["0,0"]), tmp_path / "out")
     balls(setups, tmp_path / "out", None)
     ball = read_image(tmp_path / "out/balls/one.exr").pixels
     diffuse = ball[:, ball.shape[1] // 2 :, 0]
@@ -211,7 +215,7 @@ def test_the_ball_of_an_estimated_light_names_its_face_model(tmp_path: Path) -> 
     light = LightRecord(rig_directions()[:3], torch.ones(3, 3), "three", None, marks)
     write_light(tmp_path / "b.json", light)
     setups = collect_setups(
-        [str(tmp_path / name) for name in ("a.exr", "b.json")], None, [], tmp_path / "out"
+        LightSources(envmap=[str(tmp_path / name) for name in ("a.exr", "b.json")]), tmp_path / "out"
     )
     balls(setups, tmp_path / "out", 0.0)
     for name in ("a.exr", "b.exr"):
@@ -220,8 +224,8 @@ def test_the_ball_of_an_estimated_light_names_its_face_model(tmp_path: Path) -> 
 
 def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
-    files = collect_setups([str(tmp_path)], "0:360:2", [], tmp_path / "out")
-    drawn = collect_setups(["procedural:2"], "0:360:2", [], tmp_path / "out", seed=3)
+    files = collect_setups(LightSources(envmap=[str(tmp_path)], rotate="0:360:2"), tmp_path / "out")
+    drawn = collect_setups(LightSources(envmap=["procedural:2"], rotate="0:360:2"), tmp_path / "out", seed=3)
     assert [(setup.name, setup.frame) for setup in drawn] == [(setup.name, setup.frame) for setup in files]
     assert readable(drawn) == drawn
     rigs = [lights_over_rig(setups, "12", "cell").weights for setups in (files, drawn)]
@@ -233,4 +237,4 @@ def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("word", ["procedural:", "procedural:x", "procedural:10000"])
 def test_a_bad_number_of_procedural_maps_is_refused(word: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="procedural"):
-        collect_setups([word], None, [], tmp_path)
+        collect_setups(LightSources(envmap=[word]), tmp_path)

@@ -13,9 +13,10 @@ from facerf_cli import main
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, sums_up
 from facerf_cli.batch.settings import Settings, Shard
-from facerf_cli.cli.options import JobsOption, settings_of, with_machines
+from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import configure_logging
+from facerf_cli.run.workers import Workers
 from tests.cli.toy_batch import outputs_of, run
 
 FOLDER_VERBS = {
@@ -23,7 +24,7 @@ FOLDER_VERBS = {
     "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
     "evaluate geometry", "evaluate yale-b", "evaluate pairs", "segment", "view",
 }  # fmt: skip
-Call = Callable[..., tuple[int, Settings]]
+Call = Callable[..., BatchOptions]
 
 
 def test_every_verb_that_walks_folders_has_both() -> None:
@@ -39,27 +40,26 @@ def test_every_verb_that_walks_folders_has_both() -> None:
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch) -> Call:
-    """Runs a line of a verb that walks nothing; gives its jobs and settings."""
-    seen: list[tuple[int, Settings]] = []
+def call() -> Call:
+    """Runs a line of a verb that walks nothing; gives the options of its batch."""
+    got: list[BatchOptions] = []
 
-    def walk(context: typer.Context, jobs: JobsOption = 1, dry_run: bool = False) -> None:
-        seen.append((jobs, settings_of(context)))
+    def walk(batch: BatchOptions) -> None:
+        got.append(batch)
 
     app = typer.Typer()
     app.callback()(main._global_options)
-    app.command()(with_machines(walk))
-    return lambda *line: (app(args=["walk", *line], standalone_mode=False), seen.pop())[1]
+    app.command()(with_groups(walk))
+    return lambda *line: (app(args=["walk", "-o", "out", *line], standalone_mode=False), got.pop())[1]
 
 
-GIVEN = Settings(checkpoints_by_default=True)  # without --checkpoint
-
-
-def test_they_reach_the_settings(call: Call) -> None:
-    assert call() == (1, GIVEN)
-    assert call("--shard", "3/8", "--jobs", "2") == (2, replace(GIVEN, shard=Shard(3, 8)))
-    assert call("--ray", "local", "--jobs", "1") == (1, replace(GIVEN, ray="local"))
-    assert call("--ray", "head:6379") == (0, replace(GIVEN, ray="head:6379"))
+def test_they_reach_the_options(call: Call) -> None:
+    plain = BatchOptions(Path("out"))
+    assert call() == plain
+    assert call("--shard", "3/8", "--jobs", "2") == replace(plain, shard=Shard(3, 8), jobs=2)
+    for line, jobs in ((["--jobs", "1"], 1), ([], 0)):
+        assert call("--ray", "local", *line).workers(Settings()) == Workers(jobs, "local", 0, 1)
+    assert call().workers(Settings()) == Workers(1, None, 0, 1)
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
@@ -121,11 +121,12 @@ def test_dry_run_of_a_shard(photos: Path, tmp_path: Path, capsys: pytest.Capture
 def test_the_last_shard_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     configure_logging()
     items = [Item(tmp_path / name, tmp_path / name, name) for name in "abc"]
-    shard, options = Settings(shard=Shard(2, 2)), BatchOptions(tmp_path)
-    assert sums_up(items, outputs_of, options, Settings())
+    options = BatchOptions(tmp_path)
+    shard = replace(options, shard=Shard(2, 2))
+    assert sums_up(items, outputs_of, options)
     for item in items:
-        assert not sums_up(items, outputs_of, options, shard)
+        assert not sums_up(items, outputs_of, shard)
         outputs_of(item)[0].write_bytes(b"x")
     assert "there is no summary" in capsys.readouterr().err
-    assert sums_up(items, outputs_of, options, shard)
-    assert not sums_up(items, outputs_of, BatchOptions(tmp_path, overwrite="always"), shard)
+    assert sums_up(items, outputs_of, shard)
+    assert not sums_up(items, outputs_of, replace(shard, overwrite="always"))

@@ -10,10 +10,10 @@ import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from facerf_cli.cli.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.image import colour
+from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
 from tests.cli.test_relight import PHOTO, given, relight
 from tests.exr_layers import exr_layers

@@ -1,6 +1,7 @@
 """Verbs that end with something of all items: shards leave what one run leaves; the last writes the sum."""
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,8 +33,8 @@ def test_evaluate(tmp_path: Path) -> None:
     options = EvaluateOptions(tmp_path / "shards", reflectance=[])
     for number in (2, 1):
         assert not (options.output / "summary.json").exists()
-        settings = Settings(shard=Shard(number, 2))
-        assert run_protocol(LAYOUT, items(options.output), Toy(), options, settings) == 0
+        shard = replace(options, shard=Shard(number, 2))
+        assert run_protocol(LAYOUT, items(options.output), Toy(), shard, Settings()) == 0
     assert tree(options.output) == tree(tmp_path / "whole")
     assert (options.output / "report.html").exists()
 

@@ -6,7 +6,6 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from facerf_cli.cli.train import TrainOptions
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.files.texts import file_sha256
@@ -19,6 +18,7 @@ from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
 from facerf_cli.work import train as train_work
+from facerf_cli.work.train_options import TrainOptions
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 

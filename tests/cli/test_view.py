@@ -8,10 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from facerf_cli.cli.values import parse_exposure
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
+from facerf_cli.work.output_options import parse_exposure
 
 
 @pytest.fixture

@@ -66,10 +66,11 @@ def run(
     photos: Path, output: Path, shard: Shard | None = None, ray: str | None = None, **options: object
 ) -> int:
     """Copy PHOTOS to OUTPUT; notes go to the folder above."""
-    settings = Settings(shard=shard or Shard(), ray=ray)
-    batch = BatchOptions(output, **options)  # type: ignore[arg-type]
+    batch = BatchOptions(output, shard=shard or Shard(), ray=ray, **options)  # type: ignore[arg-type]
     items = collect_items([str(photos)], output)
-    return run_items("copy", items, Copy(output.parent), outputs_of, batch, settings, lambda digest_of: [{}])
+    return run_items(
+        "copy", items, Copy(output.parent), outputs_of, batch, Settings(), lambda digest_of: [{}]
+    )
 
 
 if __name__ == "__main__":

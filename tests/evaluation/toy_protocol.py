@@ -8,13 +8,13 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
-from facerf_cli.cli.photo_options import PhotoOptions
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.olat import TABLE_1
 from facerf_cli.evaluation.summary import Layout
 from facerf_cli.work.evaluate import run_protocol
 from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.work.photo_options import PhotoOptions
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(

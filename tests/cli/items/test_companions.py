@@ -5,8 +5,8 @@ from pathlib import Path, PurePosixPath
 import pytest
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.cli.photo_options import check_companion
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.work.photo_options import check_companion
 from facerf_cli.work.photos import companion
 
 ENDINGS = (".pts", ".json")

@@ -1,47 +1,25 @@
 """A film as the output of `relight`: its frames are written as images beside it, then joined and removed."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Protocol, Self
-
-import typer
+from typing import Any, Protocol, Self
 
 from facerf_cli.batch.inputs import FILM_SUFFIXES, Item
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, RecipesOf
-from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, run_items
+from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, folder_not_file, run_items
 from facerf_cli.batch.settings import Overwrite, Settings
-from facerf_cli.cli.options import IMAGE, folder_not_file
-from facerf_cli.cli.output_options import Format
-from facerf_cli.cli.shots import Shot
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.output_options import Format
+from facerf_cli.work.shots import Shot
 
 _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
 _RATE = Fraction(24)
 _MOST_RATE = 1000
-FilmOrFolderOption = Annotated[
-    Path,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="DIR|FILE.mp4",
-        help="Write the results to this folder, or one film as .mp4 (H.264) or .mov (ProRes).",
-        show_default=False,
-    ),
-]
-FpsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--fps",
-        metavar="RATE",
-        help="Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.",
-        show_default="24",
-        rich_help_panel=IMAGE,
-    ),
-]
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -127,9 +105,6 @@ class FrameWork(Protocol):
     def readable(self, dry_run: bool) -> Self:
         """The work with its models loaded."""
 
-    def __call__(self, item: Item) -> Outcome:
-        """Make them."""
-
 
 def run_to_film(
     film: FilmOutput,
@@ -138,6 +113,7 @@ def run_to_film(
     work: FrameWork,
     options: BatchOptions,
     settings: Settings,
+    process: Callable[[Any, Item], Outcome],
 ) -> int:
     """Make the frames of a film, and join them where all are made; return the exit code."""
     images = [path for item in items for path in work.outputs_of(item)]
@@ -149,10 +125,11 @@ def run_to_film(
     if film.is_finished(key, options.overwrite):
         log.info("%s: already finished", film.path)
         return 0
-    index = FolderIndex(options.output, "relight", settings.shard, work.recipes_of)
-    if not all_finished(items, work.outputs_of, options, settings, index):
+    index = FolderIndex(options.output, "relight", options.shard, work.recipes_of)
+    if not all_finished(items, work.outputs_of, options, index):
         work = work.readable(dry_run=False)
-    code = run_items("relight", items, work, work.outputs_of, options, settings, work.recipes_of)
+    relit, recipes = partial(process, work), work.recipes_of
+    code = run_items("relight", items, relit, work.outputs_of, options, settings, recipes)
     if code or not all(path.exists() for path in images):
         log.error("%s: not written, since frames failed; the others stay in %s", film.path, film.folder)
         return 1

@@ -7,15 +7,51 @@ from pathlib import Path
 from typing import Literal
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
-from facerf_cli.cli.light_entries import lit_images
-from facerf_cli.cli.light_options import LightOptions
-from facerf_cli.cli.values import MOST_FRAMES, is_sweep, numbers, sweep
 from facerf_cli.errors import UsageError
+from facerf_cli.light.entries import MOST_FRAMES, is_sweep, lit_images, numbers, sweep
 from facerf_cli.light.studio import StudioLight
+from facerf_cli.option import LIGHT, option
+from facerf_cli.work.photo_options import LightOptions
 
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
+
+
+@dataclass(frozen=True)
+class LightSources:
+    """The lights, as the command line names them."""
+
+    envmap: list[str] | None = option(
+        None,
+        "Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of estimate-light "
+        "(.json), or procedural:N, maps of facerf envmap. Repeatable.",
+        "MAP|DIR",
+        shown_default=False,
+        panel=LIGHT,
+    )
+    light: list[str] | None = option(
+        None,
+        "Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig file or "
+        "a preset (rembrandt); docs/lights.md. Repeatable.",
+        "LIGHT",
+        shown_default=False,
+        panel=LIGHT,
+    )
+    light_from: list[str] | None = option(
+        None,
+        "Relight under the light of another photo, as estimate-light finds it. Repeatable.",
+        "PHOTO|DIR",
+        shown_default=False,
+        panel=LIGHT,
+    )
+    rotate: str | None = option(
+        None,
+        "Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.",
+        "DEG|FROM:TO:N",
+        shown_default="as they are",
+        panel=LIGHT,
+    )
 
 
 @dataclass(frozen=True)
@@ -60,14 +96,18 @@ class LightSetup:
 
 
 def collect_setups(
-    envmaps: Sequence[str],
-    rotate: str | None,
-    lights: Sequence[str],
-    output: Path,
-    seed: int = 0,
-    lit: Sequence[PhotoLight] = (),
+    sources: LightSources, output: Path, seed: int = 0, how: LightOptions | None = None
 ) -> tuple[LightSetup, ...]:
-    """List the light setups that the options name; maps are read, drawn or estimated later."""
+    """List the light setups that the options name; maps are read, drawn or estimated later.
+
+    Args:
+        sources: The options.
+        output: The output folder, which is not searched for maps.
+        seed: The seed of drawn maps.
+        how: How the lights of photos are estimated.
+    """
+    envmaps, rotate = sources.envmap or (), sources.rotate
+    lit = photo_lights(sources.light_from, output, how) if sources.light_from and how else []
     rotations = parse_rotations(rotate)
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
     paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
@@ -88,7 +128,7 @@ def collect_setups(
         for photo in lit
         for turn, number, degrees in rotations
     ]
-    for image in lit_images(lights):
+    for image in lit_images(sources.light or ()):
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
             setups.append(LightSetup(image.name, frame, lights=shining, names=image.names))

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Annotated
-
-import typer
 
 from facerf_cli.batch.inputs import (
     FILM_SUFFIXES,
@@ -19,36 +16,26 @@ from facerf_cli.batch.inputs import (
     split_frame,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe
-from facerf_cli.batch.settings import Settings
-from facerf_cli.cli.options import BATCH
-from facerf_cli.cli.photo_options import PhotoOptions
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.errors import UsageError
+from facerf_cli.option import BATCH, option
+from facerf_cli.work.photo_options import PhotoOptions
 
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
 _DIGITS = 4  # of a film's frame numbers, or more
-PhotosArgument = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="PHOTO|FILM...",
-        help="Images, films (.mp4, .mov, .webm), folders of images (walked recursively), frames "
-        "(plate.%04d.exr), or - to read a list of paths.",
-        show_default=False,
-    ),
-]
-SequenceOption = Annotated[
-    bool,
-    typer.Option(
-        "--sequence",
-        help="Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.",
-        rich_help_panel=BATCH,
-    ),
-]
 
 
-NoCutsOption = Annotated[
-    bool,
-    typer.Option("--no-cuts", help="Take a film that cuts as one shot.", rich_help_panel=BATCH),
-]
+@dataclass(frozen=True)
+class ShotOptions:
+    """Which inputs are the frames of one shot."""
+
+    sequence: bool = option(
+        False,
+        "Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.",
+        flags=("--sequence",),
+        panel=BATCH,
+    )
+    no_cuts: bool = option(False, "Take a film that cuts as one shot.", flags=("--no-cuts",), panel=BATCH)
 
 
 @dataclass(frozen=True, eq=False)  # as a key of caches by identity: it has thousands of frames
@@ -72,27 +59,25 @@ class Shot:
 
 
 def collect_frames(
-    inputs: Sequence[str],
-    output: Path,
-    settings: Settings,
-    sequence: bool = False,
-    pattern: NamePattern | None = None,
-    cuts: bool = True,
+    inputs: Sequence[str], wanted: ShotOptions, batch: BatchOptions, photo: PhotoOptions
 ) -> tuple[list[Item], tuple[Shot, ...]]:
     """List photos and the frames of films, in order, and the shots that they make; see `collect_items`.
 
-    A film is named itself: in folders only images are looked for.
+    A film is named itself: in folders only images are looked for. Raises UsageError for options that a shot
+    cannot have.
     """
-    found = collect_items(inputs, output, PHOTO_SUFFIXES, pattern, settings.null_separated)
+    pattern = batch.name
+    found = collect_items(inputs, batch.output, PHOTO_SUFFIXES, pattern, photo.settings.null_separated)
     films = [item for item in found if item.input_path.suffix.lower() in FILM_SUFFIXES]
     photos = [item for item in found if item not in films]
     shots = [_of_film(item, pattern) for item in films if item.input_path.exists()]
     missing = [item for item in films if not item.input_path.exists()]  # reported as photos are
-    if sequence:
+    if wanted.sequence:
         shots += _of_images(photos)
         photos = []
-    shots = [replace(shot, cuts=cuts) for shot in shots]
-    if shots and settings.shard.of > 1:
+    shots = [replace(shot, cuts=not wanted.no_cuts) for shot in shots]
+    _check_shots(shots, photo)
+    if shots and batch.shard.of > 1:
         raise UsageError("--shard: the frames of a shot belong together; use --jobs, or a shard of photos")
     return [*photos, *missing, *(item for shot in shots for item in shot.frames)], tuple(shots)
 
@@ -152,16 +137,7 @@ def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
     return {**found, "sequence": "sha256:" + hashlib.sha256(digests.encode()).hexdigest()}
 
 
-def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
-    """Follow the face through each shot; what was followed before is kept."""
-    if shots and not dry_run:
-        from facerf_cli.work.sequence import follow_shot
-
-        for shot in shots:
-            follow_shot(shot, photo, photo.settings)
-
-
-def check_shots(shots: Sequence[Shot], photo: PhotoOptions) -> None:
+def _check_shots(shots: Sequence[Shot], photo: PhotoOptions) -> None:
     """Raise UsageError for options that a shot cannot have."""
     if not shots:
         return

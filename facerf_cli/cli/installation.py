@@ -1,0 +1,228 @@
+"""The installation (`doctor`), an output folder (`check`), and defaults of options (`config`)."""
+
+import logging
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from facerf_cli.batch.made_from import check_outputs
+from facerf_cli.batch.run import print_path
+from facerf_cli.cli.options import settings_of
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.texts import read_toml
+from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.work.installed import MISSING, Facts, installation
+
+GLOBAL = "global"  # the table of options before the verb
+_LIMIT_BYTES = 1 << 20
+_NO_BREAK = "\N{NO-BREAK SPACE}"
+_WIDTH, _HEAD = 100, 13  # columns of the screen, and of a section's or part's name
+log = logging.getLogger(LOGGER_NAME)
+
+
+def check(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Output folder of a verb.", show_default=False)
+    ],
+) -> None:
+    """Read all outputs of a folder again, and list those that are not as they were written.
+
+    Prints a line for each output that is missing, empty or changed; exits 1 if there is one. Changed files
+    may be damaged, or edited by hand. Run the verb again to make missing and empty ones, and with
+    --overwrite always the others.
+    """
+    counts: Counter[str] = Counter()
+    for path, state in check_outputs(folder):
+        counts[state] += 1
+        if state != "whole":
+            print_path(f"{path}: {state}")
+    if not counts:
+        raise UsageError(f"{folder}: no index of outputs; give the output folder of a verb that reads photos")
+    log.info("%s", ", ".join(f"{count} {state}" for state, count in sorted(counts.items())))
+    raise typer.Exit(int(counts["whole"] < counts.total()))
+
+
+def doctor(
+    context: typer.Context,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead.")] = False,
+) -> None:
+    """Show what is installed, with licences, what is missing, and the command that adds it.
+
+    The exit code is 1 if a part that facerf needs is missing. The extras are optional.
+    """
+    facts = installation()
+    if MISSING not in facts["packages"].values():  # the rest needs all packages
+        from facerf_cli.work.doctor_facts import examine
+
+        facts |= examine(settings_of(context))
+    print(json_line(facts) if as_json else as_screen(facts))
+    raise typer.Exit(1 if MISSING in json_line(facts) else 0)
+
+
+def as_screen(facts: Facts) -> str:
+    """The facts as aligned text; sizes and nested provenance are left to --json."""
+    lines: list[str] = []
+    for section, part, text in _rows(facts):
+        head = f"{section:<{_HEAD}}{part + ' ':<{_HEAD}}" if part else f"{section:<{_HEAD}}"
+        lines += textwrap.wrap(
+            text, _WIDTH, initial_indent=head, subsequent_indent=" " * len(head), break_on_hyphens=False
+        )
+    return "\n".join(lines).replace(_NO_BREAK, " ")
+
+
+def _rows(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield section, part and text of each row; a section's name stands in its first row only."""
+    own = facts["facerf"]
+    yield "facerf", "", f"{own['version']}, Python {own['python']}, {own['system']}"
+    yield "packages", "", "  ".join(_whole(f"{name} {found}") for name, found in facts["packages"].items())
+    for command in facts["add"]:
+        yield "", "", f"to add what is missing: {_whole(command)}"
+    for row, (name, extra) in enumerate(facts["extras"].items()):
+        if extra["add"]:
+            text = f"not installed; {_whole(extra['add'])} adds {extra['for']}"
+        else:
+            found = ", ".join(f"{package} {version}" for package, version in extra["packages"].items())
+            text = f"{found}, for {extra['for']}"
+        yield "extras" if row == 0 else "", name, text
+    if "device" not in facts:
+        return
+    device = facts["device"]
+    yield "device", "", f"{device['uses']}, {device['threads']} threads, {device['memory']} of memory"
+    models: dict[str, list[str]] = {}
+    for name, asset in facts["assets"].items():
+        models.setdefault(_model(name, asset), []).append(name)
+    for row, (text, names) in enumerate(models.items()):
+        yield "models" if row == 0 else "", ", ".join(names), text
+    yield "networks", "", "  ".join(_served(facts["networks"]))
+    yield "colour", "", f"OCIO configuration {facts['colour']['OCIO']}, {facts['colour']['spaces']} spaces"
+    yield "cache", "", facts["cache"]["folder"]
+
+
+def _served(networks: Facts) -> Iterator[str]:
+    """The file that serves each network, with the first digits of its SHA-256."""
+    for name, file in networks.items():
+        if name == MISSING:
+            yield f"{MISSING}: {file['file']}"
+        else:
+            stem, digits = Path(file["file"]).stem, file["sha256"][:8]
+            yield _whole(f"{name} {digits}" if stem == name else f"{name} {stem} {digits}")
+
+
+def _whole(text: str) -> str:
+    """Text that stays on one line, such as a command to copy."""
+    return text.replace(" ", _NO_BREAK)
+
+
+def _model(label: str, asset: Facts) -> str:
+    """An asset's name, licences and the heads it was trained on; what they share is said once."""
+    said = [str(asset[key]) for key in ("licence", "recognition", "heads") if asset.get(key)]
+    name = asset.get("name", label)
+    text = "; ".join(dict.fromkeys("; ".join(said).split("; ")))
+    return ": ".join(filter(None, (name if name != label else "", text)))
+
+
+def read_config(path: Path, group: Any) -> dict[str, Any]:
+    """Read defaults by verb: `[relight]`, `[evaluate.yale-b]`, `[global]`; names as they are typed.
+
+    Raises UsageError for a file that is no TOML, and for verbs and options that do not exist.
+    """
+    too_long = f"larger than {_LIMIT_BYTES >> 20} MiB; give a TOML file"
+    try:
+        tables = read_toml(path, _LIMIT_BYTES, too_long, "mend it")
+    except InputError as error:
+        raise UsageError(f"--config {error}") from None
+    own = tables.pop(GLOBAL, {})
+    return _checked(path, GLOBAL, own, group) | _by_verb(path, "", tables, group)
+
+
+def _by_verb(path: Path, above: str, tables: Mapping[str, Any], group: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, table in tables.items():
+        command = group.commands.get(name)
+        if command is None:
+            known = ", ".join(sorted([*group.commands, *(() if above else (GLOBAL,))]))
+            raise UsageError(f"--config {path}: [{above}{name}] is no verb; give one of {known}")
+        if not isinstance(table, Mapping):
+            raise UsageError(f"--config {path}: {above}{name} is no table; write [{above}{name}]")
+        is_group = hasattr(command, "commands")
+        found[name] = (
+            _by_verb(path, f"{name}.", table, command)
+            if is_group
+            else _checked(path, f"{above}{name}", table, command)
+        )
+    return found
+
+
+def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
+    """The options of a table by the names of their parameters."""
+    if not isinstance(table, Mapping):
+        raise UsageError(f"--config {path}: {verb} is no table; write [{verb}]")
+    names = {
+        option.lstrip("-").replace("-", "_"): parameter.name
+        for parameter in _options(command)
+        for option in parameter.opts
+        if parameter.name not in ("help", "version", "config")
+    }
+    values = {}
+    for key, value in table.items():
+        name = key.replace("-", "_")
+        if name not in names:
+            of_verb = "" if verb == GLOBAL else f"{verb} ".replace(".", " ")
+            raise UsageError(f"--config {path}: [{verb}] {key}: no such option; see `facerf {of_verb}--help`")
+        values[names[name]] = value
+    return values
+
+
+def _options(command: Any) -> Iterator[Any]:
+    return (parameter for parameter in command.params if parameter.param_type_name == "option")
+
+
+def config(
+    context: typer.Context,
+    verb: Annotated[
+        str | None,
+        typer.Argument(metavar="[VERB]", help="Show all options of this verb.", show_default=False),
+    ] = None,
+) -> None:
+    """Show the defaults in force, and where each comes from: a configuration file, or facerf itself.
+
+    Without VERB: those that the file of --config (or FACERF_CONFIG) sets. With VERB the others follow, each
+    after a #. The file is TOML with a table for
+    each verb ([relight], [evaluate.yale-b]) and one for global options ([global]); options have the names of
+    the command line, without dashes in front. What the command line gives comes first.
+    """
+    root = context.find_root()
+    given, source = root.default_map or {}, root.params.get("config")
+    if verb is None:
+        if source is None:
+            print("no configuration file; give one with --config FILE or FACERF_CONFIG")
+        _print_given(given, str(source), "")
+        return
+    command: Any = root.command
+    for name in verb.split("."):
+        command, given = getattr(command, "commands", {}).get(name), given.get(name, {})
+        if command is None:
+            raise UsageError(f"config {verb}: no such verb; see `facerf --help`")
+    defaults = []
+    for parameter in _options(command):
+        if parameter.name in given:
+            print(f"{parameter.opts[0]} = {_shown(given[parameter.name])}  ({source})")
+        elif parameter.name != "help" and not parameter.required:
+            defaults.append(f"# {parameter.opts[0]} = {_shown(parameter.get_default(context))}")
+    print("\n".join(["# not set, and so by default:", *defaults]))
+
+
+def _print_given(tables: Mapping[str, Any], source: str, above: str) -> None:
+    for name, value in tables.items():
+        if isinstance(value, Mapping):
+            _print_given(value, source, f"{above}{name} ")
+        else:
+            print(f"{above}--{name.strip('_').replace('_', '-')} = {_shown(value)}  ({source})")
+
+
+def _shown(value: Any) -> str:
+    return "not set" if value is None or value == () else str(value)

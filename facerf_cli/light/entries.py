@@ -1,0 +1,301 @@
+"""Lights as the command line and files give them: numbers, directions, keys, rig files and presets.
+
+Wrong ones raise UsageError. Light to import, since the help does without numpy.
+"""
+
+import math
+import os.path
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.texts import read_rig
+from facerf_cli.light.studio import StudioLight
+
+MOST_LIGHTS = 4096
+MOST_FRAMES = 9999
+_LIGHTS_FILE_LIMIT_BYTES = 1 << 20
+_DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
+_MOST_DIGITS = 9  # of a count; Python refuses to read thousands
+_FORMS = ("AZ,EL", "AZ,EL,R,G,B")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+_RIGS = Path(__file__).parents[1] / "assets" / "rigs"
+_AROUND = "around"  # as a direction: from all of them
+KEYS = ("at", "from", "az", "el", "rgb", "kelvin", "stops", "size", "size_deg", "spot")
+# Limits of values.
+_KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
+_SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
+
+
+def numbers(text: str, forms: tuple[str, ...], option: str) -> list[float]:
+    """Parse finite numbers separated by commas, as many as one of `forms` ("AZ,EL") has names."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) not in [form.count(",") + 1 for form in forms] or not all(map(math.isfinite, values)):
+        kind = "numbers separated by commas" if "," in forms[0] else "a number"
+        raise UsageError(f"{option} {text!r}: give {' or '.join(forms)}, {kind}")
+    return values
+
+
+def azel(text: str, forms: tuple[str, ...], option: str) -> list[float]:
+    """Parse numbers that begin with azimuth and elevation in degrees; colours, if any, follow."""
+    values = numbers(text, forms, option)
+    if abs(values[1]) > 90:
+        raise UsageError(f"{option} {text!r}: the elevation is out of range; give -90 (below) to 90 (above)")
+    if min(values[2:], default=0) < 0:
+        raise UsageError(f"{option} {text!r}: the colour is negative; give values from 0")
+    return values
+
+
+def is_sweep(text: str) -> bool:
+    """True for `FROM:TO:N`, a value for each of N frames."""
+    return ":" in text
+
+
+def sweep(text: str, option: str) -> list[float]:
+    """Parse degrees `FROM:TO:N`: N equal steps from FROM on, without TO, so that turns join."""
+    try:
+        start, end, count = numbers(text.replace(":", ","), ("FROM,TO,N",), option)
+    except UsageError:
+        count = 0.0
+    if not (count.is_integer() and 1 <= count <= MOST_FRAMES):
+        raise UsageError(f"{option} {text!r}: give degrees, or FROM:TO:N with N frames, as in 0:360:24")
+    return [start + (end - start) * frame / count for frame in range(int(count))]
+
+
+def parse_lights(text: str) -> int | list[tuple[float, float]]:
+    """Parse `--lights`: the number of a uniform rig, or (azimuth, elevation) in degrees of each light.
+
+    The text is a number, 'az,el;az,el', or a file of such lines.
+    """
+    if text.isdecimal():
+        if not (len(text) <= _MOST_DIGITS and 1 <= int(text) <= MOST_LIGHTS):
+            raise UsageError(f"--lights {text}: not a number of lights; give 1 to {MOST_LIGHTS}")
+        return int(text)
+    is_file = os.path.isfile(text)  # Path's own raises where a long list is no possible name
+    pairs = _lines(Path(text)) if is_file else [part for part in text.split(";") if part.strip()]
+    if not pairs or "," not in pairs[0]:
+        raise UsageError(f"--lights {text!r}: {_DIRECTIONS_HELP}")
+    if len(pairs) > MOST_LIGHTS:
+        raise UsageError(f"--lights: {len(pairs)} lights; give {MOST_LIGHTS} at most")
+    option = f"--lights {text}:" if is_file else "--lights"
+    return [(values[0], values[1]) for values in (azel(pair, ("AZ,EL",), option) for pair in pairs)]
+
+
+def _lines(path: Path) -> list[str]:
+    """Read the lines of a text file that are neither empty nor comments."""
+    try:
+        with path.open(encoding="utf-8") as stream:
+            text = stream.read(_LIGHTS_FILE_LIMIT_BYTES)
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"--lights {path}: cannot be read as text ({error}); give a text file") from None
+    lines = (line.partition("#")[0].strip() for line in text.splitlines())
+    return [",".join(line.replace(",", " ").split()) for line in lines if line]
+
+
+@dataclass(frozen=True)
+class GivenLight:
+    """A light that an entry gives: one, or in a sweep one for each frame. A light with a name is a layer."""
+
+    name: str | None
+    frames: tuple[StudioLight, ...]
+    sweeps: bool = False
+
+
+def read_keys(text: str) -> dict[str, str] | None:
+    """Read the settings of `key=value;...`; None where no part has one of `KEYS`."""
+    pairs = [part.partition("=") for part in text.split(";") if part.strip()]
+    keys = [key.strip() for key, _, _ in pairs]
+    if not set(keys) & {"name", *KEYS}:
+        return None
+    if any("=" in value for _, _, value in pairs):
+        raise UsageError(f"--light {text!r}: give ; between keys, as in 'az=60;el=10'")
+    if twice := {key for key in keys if keys.count(key) > 1}:
+        raise UsageError(
+            f"--light {text!r}: {min(twice)} is given twice; a light has one, give --light again"
+        )
+    return {key: value.strip() for key, (_, _, value) in zip(keys, pairs, strict=True)}
+
+
+def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> GivenLight:
+    """Check the settings of a light and make it; raises UsageError that begins with `where`."""
+    if wrong := [key for key in given if key not in KEYS]:
+        raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
+    is_far = bool(given.keys() & {"from", "az", "el"})
+    if is_far == ("at" in given) or ("from" in given and given.keys() & {"az", "el"}):
+        raise UsageError(f"{where} {_shown(given)}: give one of at=X,Y,Z, from=AZ,EL, or az and el")
+    if "size_deg" in given and given.get("from") == _AROUND:
+        raise UsageError(f"{where} {_shown(given)}: a light from all around has no size; leave size_deg out")
+    if wrong := sorted(given.keys() & ({"size", "spot"} if is_far else {"size_deg"})):
+        right = "is of near lights (at=); a far one has size_deg" if is_far else "is of far lights; give size"
+        raise UsageError(f"{where} {_shown(given)}: {wrong[0]} {right}")
+
+    def number(key: str, form: str, limits: tuple[float, float]) -> float | None:
+        return _numbers(given[key], form, limits, f"{where} {key}")[0] if key in given else None
+
+    rgb = _numbers(given.get("rgb", "1,1,1"), "R,G,B", _RGB, f"{where} rgb")
+    common = StudioLight(
+        rgb=(rgb[0], rgb[1], rgb[2]),
+        kelvin=number("kelvin", "KELVIN", _KELVIN),
+        stops=number("stops", "STOPS", _STOPS) or 0.0,
+        size_m=number("size", "METRES", _SIZE_M) or 0.0,
+        size_deg=number("size_deg", "DEG", _SIZE_DEG) or 0.0,
+        spot_deg=number("spot", "DEG", _SPOT_DEG),
+    )
+    if is_far:
+        sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
+        frames = tuple(replace(common, azel_deg=azel_deg) for azel_deg in _directions(given, where))
+        return GivenLight(name, frames, sweeps)
+    return GivenLight(name, (replace(common, at_m=_place(given["at"], where)),))
+
+
+def _shown(given: Mapping[str, str]) -> str:
+    return repr(";".join(f"{key}={value}" for key, value in given.items()))
+
+
+def _numbers(text: str, form: str, limits: tuple[float, float], option: str) -> list[float]:
+    values = numbers(text, (form,), option)
+    if not all(limits[0] <= value <= limits[1] for value in values):
+        raise UsageError(f"{option} {text!r}: out of range; give {limits[0]:g} to {limits[1]:g}")
+    return values
+
+
+def _place(text: str, where: str) -> tuple[float, float, float]:
+    x, y, z = numbers(text, ("X,Y,Z",), f"{where} at")
+    if not _DISTANCE_M[0] <= (x * x + y * y + z * z) ** 0.5 <= _DISTANCE_M[1]:
+        raise UsageError(
+            f"{where} at {text!r}: the distance from the face is out of range; give {_DISTANCE_M[0]:g} to "
+            f"{_DISTANCE_M[1]:g} metres"
+        )
+    return x, y, z
+
+
+def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float] | None]:
+    """Azimuth and elevation, of each frame where they sweep; None is from all around."""
+    if given.get("from") == _AROUND:
+        return [None]
+    if "from" in given:
+        azimuth, elevation = azel(given["from"], (f"AZ,EL or {_AROUND}",), f"{where} from")
+        return [(azimuth, elevation)]
+    azimuths, elevations = (_angles(given.get(key, "0"), f"{where} {key}") for key in ("az", "el"))
+    count = max(len(azimuths), len(elevations))
+    if min(len(azimuths), len(elevations)) not in (1, count):
+        raise UsageError(f"{where} {_shown(given)}: az and el sweep in another number of frames; give one N")
+    pairs = [(azimuths[k % len(azimuths)], elevations[k % len(elevations)]) for k in range(count)]
+    for pair in pairs:
+        azel(f"{pair[0]},{pair[1]}", ("AZ,EL",), where)
+    return [*pairs]
+
+
+def _angles(text: str, option: str) -> list[float]:
+    """Parse `DEG`, or `FROM:TO:N` to N angles."""
+    return sweep(text, option) if is_sweep(text) else numbers(text, ("DEG or FROM:TO:N",), option)
+
+
+@dataclass(frozen=True)
+class LitImage:
+    """Lights that shine together in one image, or in each of numbered frames; names are those of layers."""
+
+    name: str
+    frames: tuple[tuple[StudioLight, ...], ...]
+    is_numbered: bool
+    names: tuple[str, ...]
+
+
+def lit_images(entries: Sequence[str]) -> list[LitImage]:
+    """Parse all `--light` entries; lights with names share one image, the last."""
+    images: list[LitImage] = []
+    named: list[GivenLight] = []
+    for text in entries:
+        if (path := _rig_path(text)) is not None:
+            images.append(_rig(path))
+        elif (settings := read_keys(text)) is not None:
+            name = settings.pop("name", None)
+            light = light_by_keys(settings, "--light", name)
+            if light.name is None:
+                images.append(_together(_file_name(text), [light], "--light"))
+            else:
+                named.append(light)
+        elif "=" in text:
+            named += [_short_named(part) for part in text.split(";")]
+        else:
+            images.append(_short(text))
+    if named:
+        all_names = "+".join(light.name or "" for light in named)
+        images.append(_together(f"light_{all_names}", named, "--light"))
+    return images
+
+
+@cache
+def preset_names() -> tuple[str, ...]:
+    """The names of the rigs that facerf ships."""
+    return tuple(sorted(path.stem for path in _RIGS.glob("*.toml")))
+
+
+def _rig_path(text: str) -> Path | None:
+    """The file of a rig or preset; None for directions."""
+    if text.endswith(".toml"):
+        if not Path(text).is_file():
+            raise UsageError(f"--light {text}: no such rig file; give one that exists")
+        return Path(text)
+    if text in preset_names():
+        return _RIGS / f"{text}.toml"
+    if _NAME.fullmatch(text):
+        known = ", ".join(preset_names())
+        raise UsageError(f"--light {text}: no such preset; give AZ,EL, a rig file (.toml) or one of {known}")
+    return None
+
+
+def _rig(path: Path) -> LitImage:
+    """The lights of a rig file, whose image has its name."""
+    tables = read_rig(path)
+    try:
+        lights = [light_by_keys(table, f"{path}: {name}:", name) for name, table in tables.items()]
+        return _together(path.stem, lights, f"{path}:")
+    except UsageError as error:  # of a value: the file is at fault, not the command line
+        raise InputError(str(error)) from None
+
+
+def _together(image: str, lights: Sequence[GivenLight], where: str) -> LitImage:
+    """Lights in one image; those that do not sweep shine in every frame of those that do."""
+    names = tuple(light.name for light in lights if light.name is not None)
+    for name in names:
+        if not _NAME.fullmatch(name) or names.count(name) > 1:
+            raise UsageError(f"{where} {name!r}: give each light a name of its own, letters and digits")
+    counts = {len(light.frames) for light in lights if light.sweeps} or {1}
+    if len(counts) > 1:
+        raise UsageError(f"{where} sweeps of {min(counts)} and {max(counts)} frames; give one N")
+    frames = tuple(
+        tuple(light.frames[number if light.sweeps else 0] for light in lights)
+        for number in range(max(counts))
+    )
+    return LitImage(image, frames, any(light.sweeps for light in lights), names)
+
+
+def _short(text: str) -> LitImage:
+    """Parse `az,el[,r,g,b][;...]`: lights that shine together."""
+    parts = [part for part in text.split(";") if part.strip()] or [""]
+    given = [azel(part, _FORMS, "--light") for part in parts]
+    name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
+    return _together(f"light_{name}", [GivenLight(None, (_far(values),)) for values in given], "--light")
+
+
+def _short_named(part: str) -> GivenLight:
+    """Parse `NAME=az,el[,r,g,b]`."""
+    name, _, text = part.partition("=")
+    return GivenLight(name.strip(), (_far(azel(text, _FORMS, "--light")),))
+
+
+def _far(values: Sequence[float]) -> StudioLight:
+    red, green, blue = values[2:] or (1.0, 1.0, 1.0)
+    return StudioLight(azel_deg=(values[0], values[1]), rgb=(red, green, blue))
+
+
+def _file_name(text: str) -> str:
+    """An image's name from the settings of its light."""
+    return "light_" + re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")

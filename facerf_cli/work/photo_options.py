@@ -1,0 +1,232 @@
+"""Options of every verb that reads photos: face, landmarks, face model, texture; how light is estimated.
+
+Light to import: the help reads them without torch and numpy.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from facerf_cli.baselines import Kind
+from facerf_cli.batch.inputs import OF_PHOTOS, NamePattern
+from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import UsageError
+from facerf_cli.light.entries import numbers, parse_lights
+from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, option
+
+MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
+_TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
+_TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
+FITTING = frozenset({"parsing", "geometry"})  # networks that find and fit faces
+# Networks of the reflectance models.
+NETWORKS = {
+    "field": frozenset({"reflectance"}),
+    "portrait": frozenset({"reflectance", "portrait"}),
+    "diffuse-sh": frozenset({"diffuse_sh"}),
+}
+LandmarksFrom = Literal["facerf", "dlib"]
+Geometry = Literal["landmarks", "network"]
+Refine = Literal["none", "features"]
+PoseDeg = tuple[float, float, float]
+
+
+def network_alone_option() -> Any:
+    """Make the field of `--network-alone`."""
+    return option(
+        False,
+        "Use the network's own field, without the correction by the photo's quotient.",
+        flags=("--network-alone",),
+        panel=METHOD,
+    )
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """How the field of a photo is made."""
+
+    network_alone: bool = network_alone_option()
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """Settings of reading and fitting photos, which can be sent to other processes."""
+
+    settings: Settings
+    colourspace: str | None = option(
+        None,
+        "Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or any name of "
+        "the OCIO configuration.",
+        "NAME",
+        flags=("--input-colourspace",),
+        shown_default="the file's",
+        panel=IMAGE,
+    )
+    face_model: str = option(
+        "builtin",
+        "Fit this morphable model: builtin, or a .npz of `face-model import`.",
+        "NAME|PATH",
+        panel=FACE,
+    )
+    face: str = option(
+        "largest",
+        "Choose the face of a photo with several; INDEX counts from the left, from 0.",
+        "largest|all|INDEX",
+        panel=FACE,
+    )
+    landmarks: Path | None = option(
+        None,
+        "Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a pattern "
+        "(points/{stem}.pts).",
+        "FILE|DIR|PATTERN",
+        shown_default="detect them",
+        panel=FACE,
+    )
+    geometry: Geometry | None = option(
+        None,
+        "Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
+        shown_default="as the checkpoint was trained",
+        panel=FACE,
+    )
+    texture_side: int | None = option(
+        None,
+        "Side of the UV texture; a multiple of 256.",
+        "T",
+        flags=("--texture-size",),
+        shown_default="the checkpoint's; 256 for the shipped one",
+        panel=METHOD,
+    )
+    landmarks_from: LandmarksFrom = option(
+        "facerf",
+        "Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence excludes "
+        "commercial use).",
+        panel=FACE,
+    )
+    ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
+
+    def check(self) -> None:
+        """Raise UsageError for an option that would fail every photo; nothing heavy is loaded."""
+        if self.face not in ("largest", "all") and not self.face.isdecimal():
+            raise UsageError(f"--face {self.face!r}: not a face; give largest, all or a number from 0")
+        side = self.texture_side
+        if side is not None and (side % _TEXTURE_STEP or not 0 < side <= _TEXTURE_MOST):
+            raise UsageError(
+                f"--texture-size {self.texture_side}: give a multiple of 256 up to {_TEXTURE_MOST}"
+            )
+        if self.landmarks is not None and self.geometry == "network":
+            raise UsageError("--landmarks: --geometry network uses none; leave one out")
+        check_companion(self.landmarks, "--landmarks")
+
+    @property
+    def first_tag(self) -> str:
+        """The tag of a photo's first face in the names of its outputs; faces are written last to first.
+
+        The number of faces that `--face all` finds is not known beforehand. So the first one's outputs are
+        written last and mark the photo as finished.
+        """
+        return "_face0" if self.face == "all" else ""
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How the light is solved for."""
+
+    non_negative: bool = option(
+        True,
+        "Solve for weights from 0 up, robust to hair and glasses; or for the paper's least squares, with "
+        "negative ones.",
+        flags=("--non-negative/--signed",),
+        panel=METHOD,
+    )
+    refine: Refine = option(
+        "none", "Refine the least squares by comparing features of the texture.", panel=METHOD
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LightOptions(SolveOptions):
+    """Settings of estimating the light of a photo, which can be sent to other processes."""
+
+    photo: PhotoOptions
+    reflectance: Kind = option(
+        "field", "Choose the reflectance model; each baseline estimates its own light.", panel=METHOD
+    )
+    rig: str = option(
+        "150",
+        "Solve for the light of a rig of N lights, or of a file of directions.",
+        "N|FILE",
+        flags=("--lights",),
+        panel=LIGHT,
+    )
+    vgg_weights: str | None = option(
+        None,
+        "Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.",
+        "imagenet|PATH",
+        shown_default="S_f, the shipped network trained to find the light",
+        panel=METHOD,
+    )
+    keep_eyes: bool = option(
+        False, "Use the eyes, too (the paper leaves them out).", flags=("--keep-eyes",), panel=FACE
+    )
+    matte: Path | None = option(
+        None,
+        "Use only what a grey image, or its alpha, of the photo's size shows, such as skin alone.",
+        "FILE|DIR|PATTERN",
+        shown_default="the photo's alpha",
+        panel=FACE,
+    )
+
+    @property
+    def networks(self) -> frozenset[str]:
+        """Names of the networks that these options use."""
+        features = self.refine == "features" and self.vgg_weights is None
+        return networks_of([self.reflectance]) | (frozenset({"light_features"}) if features else frozenset())
+
+    def check(self) -> None:
+        """Raise UsageError for options that do not go together or would fail every photo."""
+        if self.reflectance != "field" and (
+            self.refine != "none" or self.rig != "150" or not self.non_negative
+        ):
+            raise UsageError(
+                f"--reflectance {self.reflectance}: estimates its own light; "
+                "leave out --lights, --signed and --refine"
+            )
+        if self.vgg_weights is not None and self.refine == "none":
+            raise UsageError("--vgg-weights: used by --refine features only; give both")
+        lights = parse_lights(self.rig)
+        if (lights if isinstance(lights, int) else len(lights)) > MOST_ESTIMATED:
+            raise UsageError(
+                f"--lights {self.rig}: too many lights to estimate; give {MOST_ESTIMATED} at most"
+            )
+        check_companion(self.matte, "--matte")
+
+
+def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
+    """Options for photos of which only the light is used: those of the inputs that describe one file go."""
+    folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
+    return replace(photo, colourspace=None, face="largest", landmarks=folder)
+
+
+def networks_of(kinds: Iterable[str]) -> frozenset[str]:
+    """Names of the networks that reading photos by some reflectance models uses."""
+    return FITTING.union(*(NETWORKS.get(kind, ()) for kind in kinds))
+
+
+def check_companion(given: Path | None, option: str) -> None:
+    """Raise UsageError for a file or folder that does not exist; a pattern is filled in for each photo."""
+    if given is not None and not given.exists():
+        if "{" not in str(given):
+            raise UsageError(f"{option} {given}: no such file or folder; give one that exists")
+        NamePattern.parse(given.as_posix().lstrip("/"), option, OF_PHOTOS)
+
+
+def parse_pose(text: str | None) -> PoseDeg | None:
+    """Parse `YAW,PITCH,ROLL` in degrees; None stays None (the photo's own pose)."""
+    if text is None:
+        return None
+    yaw_deg, pitch_deg, roll_deg = numbers(text, ("YAW,PITCH,ROLL",), "--pose")
+    if max(abs(yaw_deg), abs(pitch_deg)) > _TURNED_AWAY_DEG or abs(roll_deg) > _MOST_ROLL_DEG:
+        raise UsageError(
+            f"--pose {text!r}: turns the face away; give yaw and pitch of -90 to 90, roll of -180 to 180"
+        )
+    return yaw_deg, pitch_deg, roll_deg

@@ -1,0 +1,451 @@
+"""`facerf relight`: its options, what each image is made by, and where it goes. Light to import."""
+
+import itertools
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from facerf_cli.baselines import Kind, RelightKind
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
+from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
+from facerf_cli.batch.settings import NOT_IN_RECIPE
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.light.entries import is_sweep, numbers, parse_lights
+from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
+from facerf_cli.work.film_output import FilmOutput, run_to_film
+from facerf_cli.work.light_setups import LightSetup, LightSources, PhotoLight, Sampling, collect_setups
+from facerf_cli.work.output_options import STDOUT, Exposure, OutputOptions, check_stdout, parse_exposure
+from facerf_cli.work.photo_options import (
+    LightOptions,
+    PhotoOptions,
+    check_companion,
+    for_other_photos,
+    network_alone_option,
+    networks_of,
+    parse_pose,
+)
+from facerf_cli.work.shots import (
+    FRAMES_IN_A_ROW,
+    Shot,
+    ShotOptions,
+    collect_frames,
+    recipe_of_shots,
+)
+
+Composite = Literal["photo", "face"]
+ExposureGroup = Literal["photo", "folder", "sequence"]
+BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
+_LAYERS = (
+    "albedo",
+    "normal",
+    "position",
+    "depth",
+    "shadow",
+    "specular",
+    "classes",
+    "face",
+    "uv",
+)
+_FORMS = "photo, envmap, none, an image file, #RRGGBB or R,G,B"
+
+
+@dataclass(frozen=True)
+class BackgroundChoice:
+    """A choice of background; `colour` is scene-linear Rec.709."""
+
+    kind: BackgroundKind
+    path: Path | None = None
+    colour: tuple[float, float, float] | None = None
+
+
+def parse_background(text: str) -> BackgroundChoice:
+    """Parse `--background`; raises UsageError where it names none."""
+    if text in ("photo", "envmap", "none"):
+        return BackgroundChoice(text)  # type: ignore[arg-type]
+    if text.startswith("#"):
+        return BackgroundChoice("colour", colour=_hex(text))
+    if Path(text).is_file():
+        return BackgroundChoice("file", Path(text))
+    if "," in text:
+        red, green, blue = numbers(text, ("R,G,B",), "--background")
+        if min(red, green, blue) < 0:
+            raise UsageError(f"--background {text!r}: the colour is negative; give values from 0")
+        return BackgroundChoice("colour", colour=(red, green, blue))
+    raise UsageError(f"--background {text!r}: no such file; give {_FORMS}")
+
+
+def parse_aov(text: str) -> tuple[str, ...]:
+    """Parse `--aov`, names with commas; the matte may be named, too."""
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
+    if unknown := [name for name in names if name not in (*_LAYERS, "matte")]:
+        raise UsageError(f"--aov {unknown[0]!r}: no such layer; give some of matte, {', '.join(_LAYERS)}")
+    return tuple(name for name in names if name != "matte")
+
+
+def _hex(text: str) -> tuple[float, float, float]:
+    digits = text.removeprefix("#")
+    if len(digits) != 6 or any(digit not in "0123456789abcdefABCDEF" for digit in digits):
+        raise UsageError(f"--background {text!r}: not a colour; give #RRGGBB, as in #202830")
+    red, green, blue = (_linear(int(digits[k : k + 2], 16) / 255) for k in (0, 2, 4))
+    return red, green, blue
+
+
+def _linear(encoded: float) -> float:
+    """Decode sRGB; without numpy, which --help does without."""
+    return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
+
+
+def image_pattern(text: str) -> NamePattern:
+    """Parse the --name of images."""
+    return NamePattern.parse(text, "--name")
+
+
+def _share_of_percent(percent: float) -> float:
+    return percent / 100
+
+
+@dataclass(frozen=True)
+class Relight:
+    """Relights one item under every light setup; the options that its images share."""
+
+    photo: PhotoOptions
+    setups: tuple[LightSetup, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # each in that of its images
+    rig: str = option(
+        "150",
+        "Approximate maps by a rig of N lights, or by a file of directions.",
+        "N|FILE",
+        flags=("--lights",),
+        panel=LIGHT,
+    )
+    sampling: Sampling | None = option(
+        None,
+        "Give each light the map's integral over its cell; share it smoothly among lights; or, as in the "
+        "paper, one pixel.",
+        flags=("--envmap-sampling",),
+        shown_default="cell; smooth for --rotate FROM:TO:N",
+        panel=LIGHT,
+    )
+    pose: str | None = option(
+        None,
+        "Turn the head to a pose, in degrees; shows the face alone.",
+        "YAW,PITCH,ROLL",
+        shown_default="the photo's",
+        panel=IMAGE,
+    )
+    reflectance: RelightKind = option(
+        "portrait",
+        "Relight the whole portrait, or the face by the paper's field; or by a baseline: diffuse-sh, "
+        "specular-sh, prt.",
+        "KIND",
+        panel=METHOD,
+    )
+    exposure: Exposure = option(
+        "auto",
+        "Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.",
+        "auto|face|EV",
+        default_text="auto",
+        parse=parse_exposure,
+        panel=IMAGE,
+    )
+    exposure_group: ExposureGroup = option(
+        "photo",
+        "Share an exposure: of each photo, or the first one's by folder or sequence of frames.",
+        "KIND",
+        panel=IMAGE,
+    )
+    output: OutputOptions = field(default_factory=OutputOptions)
+    composite: Composite | None = option(
+        None,
+        "Show the photo with its face relit, or the rendered face alone, with alpha.",
+        shown_default="photo; face with --pose",
+        panel=IMAGE,
+    )
+    background: BackgroundChoice = option(
+        BackgroundChoice("photo"),
+        "Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which keep their "
+        "look; the envmap; or none (alpha).",
+        "KIND|FILE|COLOUR",
+        default_text="photo",
+        parse=parse_background,
+        panel=IMAGE,
+    )
+    background_blur: float = option(
+        0.01,
+        "Blur the map behind the person as a lens does, in percent of the longer side.",
+        "PERCENT",
+        least=0.0,
+        most=50.0,
+        default_text=1.0,
+        typed=float,
+        parse=_share_of_percent,
+        panel=IMAGE,
+    )
+    aov: tuple[str, ...] = option(
+        (),
+        "Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the face "
+        "alone face and uv.",
+        "NAME,...",
+        shown_default="none",
+        default_text="",
+        parse=parse_aov,
+        panel=IMAGE,
+    )
+    matte: Path | None = option(
+        None,
+        "Change only what a grey image shows (mattes/{stem}.png: of each its own).",
+        "FILE|DIR|PATTERN",
+        shown_default=False,
+        panel=IMAGE,
+    )
+    photo_of_stack: Path | None = option(
+        None,
+        "Put an OLAT stack back on its photo, at the photo's resolution.",
+        "FILE|DIR|PATTERN",
+        flags=("--photo",),
+        shown_default=False,
+        panel=IMAGE,
+    )
+    ball: bool = option(
+        False,
+        "Write a mirror ball and a diffuse ball under each map, too.",
+        in_recipe=False,
+        flags=("--ball",),
+        panel=IMAGE,
+    )
+    network_alone: bool = network_alone_option()
+    fps: str | None = option(
+        None,
+        "Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.",
+        "RATE",
+        in_recipe=False,
+        shown_default="24",
+        panel=IMAGE,
+    )
+    name: NamePattern | None = option(
+        None,
+        "Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.",
+        "PATTERN",
+        in_recipe=False,
+        shown_default="{dir}/{stem}_{light}",
+        parse=image_pattern,
+        panel=BATCH,
+    )
+    asked_for_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --composite photo
+    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
+    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
+
+    def run(
+        self,
+        inputs: Sequence[str],
+        sources: LightSources,
+        wanted: ShotOptions,
+        batch: BatchOptions,
+        film: FilmOutput | None,
+        process: "Process",
+    ) -> int:
+        """Relight the inputs under the sources; return the exit code.
+
+        Args:
+            inputs: Photos, films and stacks, as the command line names them.
+            sources: The lights, as the command line names them.
+            wanted: Which inputs are one shot.
+            batch: Where the images go, and how; `STDOUT` for one image.
+            film: The film to which they are joined.
+            process: Relights one item.
+        """
+        work = self._checked(sources, batch, film)
+        if batch.output == STDOUT:
+            _write_to_stdout(inputs, work, process)
+            return 0
+        if work.ball and not work.maps:
+            raise UsageError("--ball: shows maps; give --envmap, or leave it out")
+        items, shots = collect_frames(inputs, wanted, batch, work.photo)
+        if work.photo_of_stack is not None and not _holds_a_stack(items):
+            raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
+        in_a_row = FRAMES_IN_A_ROW if shots else 1
+        batch = replace(batch, in_a_row=in_a_row, print_outputs=film is None)
+        work = replace(work.with_leaders(items), shots=shots)
+        work.refuse_meeting(items)
+        settings = work.photo.settings
+        if film is not None:
+            return run_to_film(film, items, shots, work, batch, settings, process)
+        index = FolderIndex(batch.output, "relight", batch.shard, work.recipes_of)
+        usable, finished = work, all_finished(items, work.outputs_of, batch, index)
+        index.edited.clear()  # they are judged again
+        if not finished:
+            usable = work.readable(batch.dry_run)
+            index.want(usable.recipes_of)
+        recipes = usable.recipes_of
+        code = run_items(
+            "relight",
+            items,
+            partial(process, usable),
+            usable.outputs_of,
+            batch,
+            settings,
+            recipes,
+            index=index,
+        )
+        if work.ball and not batch.dry_run and batch.shard.number == 1:
+            _write_balls(usable, batch)
+        return max(code, int(len(usable.setups) < len(work.setups)))
+
+    def _checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> "Relight":
+        """These options with the setups, and with what depends on other options; raises UsageError."""
+        alone = self.composite == "face" or self.pose is not None
+        if self.pose is not None and self.composite == "photo":
+            raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
+        parse_pose(self.pose)
+        parse_lights(self.rig)
+        if self.network_alone and self.reflectance not in ("field", "portrait"):
+            raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
+        photo = replace(self.photo, ocio_config=self.output.config)
+        photo.check()
+        if self.background.kind != "photo" and alone:
+            raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+        if film and (self.background.kind == "none" or alone):
+            raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
+        check_companion(self.matte, "--matte")
+        check_companion(self.photo_of_stack, "--photo")
+        of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance
+        how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
+        sweeps = sources.rotate is not None and is_sweep(sources.rotate)
+        return replace(
+            self,
+            photo=photo,
+            setups=collect_setups(sources, batch.output, photo.settings.seed, how),
+            sampling=self.sampling or ("smooth" if sweeps else "cell"),
+            composite="face" if alone else "photo",
+            asked_for_photo=self.composite == "photo",
+            reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
+        )
+
+    @property
+    def maps(self) -> list[LightSetup]:
+        """The setups that are maps."""
+        return [setup for setup in self.setups if setup.envmap is not None]
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """A file of each format for each setup."""
+        tag = "" if self.composite == "photo" else self.photo.first_tag
+        suffixes = self.output.suffixes
+        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in suffixes]
+
+    def for_stale(self, item: Item) -> "Relight":
+        """These settings with the lights of the item's stale images; a light has all of its frames."""
+        tag = "" if self.composite == "photo" else self.photo.first_tag
+        stale = {
+            setup.name
+            for setup in self.setups
+            for suffix in self.output.suffixes
+            if not item.stale or setup.output(item, tag, suffix, self.name) in item.stale
+        }
+        return replace(self, setups=tuple(setup for setup in self.setups if setup.name in stale))
+
+    def with_leaders(self, items: Sequence[Item]) -> "Relight":
+        """These settings with the first photo of each group of --exposure-group."""
+        groups = {self._group(item): item for item in reversed(items)}
+        return replace(self, leaders=tuple(groups.values())) if self.exposure_group != "photo" else self
+
+    def leader_of(self, item: Item) -> Item | None:
+        """The photo whose exposure an item shares; None without groups."""
+        own = self._group(item)
+        return next((leader for leader in self.leaders if self._group(leader) == own), None)
+
+    def _group(self, item: Item) -> Path:
+        if self.exposure_group == "folder":
+            return item.output_base.parent
+        return item.output_base.with_name(split_frame(item.output_base.name)[0])
+
+    def refuse_meeting(self, items: Sequence[Item]) -> None:
+        """Raise UsageError where two images would have one path, as a --name may make them."""
+        seen: set[Path] = set()
+        for item in items:
+            for path in self.outputs_of(item):
+                if path in seen:
+                    raise UsageError(
+                        f"{item.input_path}: {path} would be the name of two images; give --name more fields"
+                    )
+                seen.add(path)
+
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        """The recipe of every output, which holds the light of its own setup alone."""
+        shared = recipe_of(self, digest_of)
+        if self.leaders:
+            shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
+        shared |= recipe_of_shots(self.shots, digest_of)
+        lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
+        return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
+
+    @property
+    def _networks(self) -> frozenset[str]:
+        """Names of the networks that these options use."""
+        lights = [setup.envmap.options for setup in self.setups if isinstance(setup.envmap, PhotoLight)]
+        return networks_of([self.reflectance]).union(*(light.networks for light in lights))
+
+    def readable(self, dry_run: bool) -> "Relight":
+        """Load the models, and keep the setups whose maps can be read.
+
+        A dry run loads no networks, and so estimates no light of a photo.
+        """
+        from facerf_cli.work.lights import readable
+        from facerf_cli.work.outputs import check_output
+        from facerf_cli.work.photos import prepare_photos
+        from facerf_cli.work.sequence import follow_all
+
+        check_output(self.output)
+        prepare_photos(self.photo, self._networks, with_networks=not dry_run)
+        follow_all(self.shots, self.photo, dry_run)
+        if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
+            return self
+        setups = readable(self.setups)
+        if not setups:
+            raise FacerfError("no map can be read; give others")
+        return replace(self, setups=setups)
+
+
+Process = Callable[[Relight, Item], Outcome]  # the work on one item, which the verb's file imports
+
+
+def _holds_a_stack(items: Sequence[Item]) -> bool:
+    from facerf_cli.files.olat_stack import is_olat_stack
+
+    return any(is_olat_stack(item.input_path) for item in items)
+
+
+def _write_to_stdout(inputs: Sequence[str], work: Relight, process: "Process") -> None:
+    """Write the one image of one photo as bytes; raises UsageError where there are several."""
+    with tempfile.TemporaryDirectory() as folder:
+        items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
+        images = len(items) * len(work.setups)
+        check_stdout(images if work.photo.face != "all" else 2 * images, work.output.formats)
+        (path,) = process(work.readable(False), items[0]).outputs
+        sys.stdout.buffer.write(path.read_bytes())
+        sys.stdout.buffer.flush()
+
+
+def _write_balls(work: Relight, options: BatchOptions) -> None:
+    """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
+
+    def path_of(setup: LightSetup) -> Path:
+        return options.output / "balls" / f"{setup.name}{setup.frame}.exr"
+
+    missing = [
+        setup
+        for setup in work.maps
+        if options.overwrite == "always"
+        or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
+    ]
+    if missing:
+        from facerf_cli.work.lights import readable, write_balls
+
+        drawn = readable(missing)
+        paths = [path_of(setup) for setup in drawn]
+        write_balls(drawn, paths, work.exposure, work.output)
+        for path, suffix in itertools.product(paths, work.output.suffixes):
+            print_path(path.with_suffix(suffix))

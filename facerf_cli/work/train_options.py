@@ -1,0 +1,245 @@
+"""The options of `facerf train`. Light to import."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import UsageError
+from facerf_cli.option import option
+from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
+from facerf_cli.work.photo_options import Geometry
+
+_RUN, _DATA, _LENGTH, _LOSSES, _SPEED = "The run", "Data", "Length", "Losses and ablations", "Speed"
+_UNITS_S = {"s": 1, "m": 60, "h": 3600}
+_DEFAULT_TIME = "2h"
+
+
+def _by_preset(value: Callable[[TrainSettings], Any]) -> str:
+    """Defaults of an option in all presets, for the help."""
+    default, paper, tiny = (value(PRESETS[name]) for name in ("default", "paper", "tiny"))
+    return f"{default}; paper {paper}, tiny {tiny}"
+
+
+def _seconds(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
+    if not match or not float(match[1]):
+        raise UsageError(f"--max-time {text}: not a time; write a number and s, m or h, such as 45m")
+    return float(match[1]) * _UNITS_S[match[2]]
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What is trained, on what, by which losses."""
+
+    settings: Settings
+    output: Path = option(
+        Path(),
+        "Write the run to this folder.",
+        "DIR",
+        flags=("--output", "-o"),
+        panel=_RUN,
+        required=True,
+    )
+    preset: Preset = option(
+        "default",
+        "Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or small ones "
+        "for trials (tiny).",
+        panel=_RUN,
+    )
+    form: str = option(
+        "default",
+        "Train this form of the Reflectance Network: default, paper, or a form of your own (docs/design.md).",
+        "NAME",
+        shown_default="paper with --preset paper, else default",
+        typed=str | None,
+        panel=_RUN,
+    )
+    stage: Stage = option(
+        "reflectance",
+        f"Train the networks of a stage: {', '.join(get_args(Stage))}.",
+        "STAGE",
+        shown_default="joint with --preset paper, else reflectance",
+        typed=Stage | None,
+        panel=_RUN,
+    )
+    resume: bool = option(
+        False,
+        "Continue the run in DIR from its last save; give the same options.",
+        flags=("--resume",),
+        panel=_RUN,
+    )
+    start_from: Path | None = option(
+        None,
+        "Start from a checkpoint; networks that the stage does not train are copied.",
+        "FILE",
+        shown_default="none",
+        panel=_RUN,
+    )
+    dataset: Path | None = option(
+        None,
+        "Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.",
+        "DIR",
+        shown_default="synthetic heads",
+        panel=_DATA,
+    )
+    texture_size: int | None = option(
+        None,
+        "Unwrap a dataset to textures of this side; the stages joint and appearance-features read its crops "
+        "at this side, too.",
+        "PX",
+        shown_default="128, joint 256; with --preset paper 512",
+        least=32,
+        most=1024,
+        panel=_DATA,
+    )
+    photos: Path | None = option(
+        None,
+        "Train on photos of faces, too, in a fifth of the batches of the stage joint.",
+        "DIR",
+        shown_default="none",
+        panel=_DATA,
+    )
+    heads_from: str = option(
+        "builtin",
+        "Draw synthetic heads from this face model; of whole people, from several with commas.",
+        "NAME|PATH",
+        panel=_DATA,
+    )
+    fit_with: str = option(
+        "builtin",
+        "Fit this face model to the heads; a dataset's own model.",
+        "NAME|PATH",
+        panel=_DATA,
+    )
+    heads: int | None = option(
+        None, "Bake so many synthetic heads.", shown_default="240; tiny 16", least=2, panel=_DATA
+    )
+    views: int | None = option(
+        None, "Fit so many views of each head.", shown_default="8; tiny 2", least=1, panel=_DATA
+    )
+    bank: Path | None = option(
+        None, "Keep baked heads in this folder.", "DIR", shown_default="DIR/bank", panel=_DATA
+    )
+    jobs: int = option(
+        2, "Bake or unwrap in so many processes.", flags=("--jobs", "-j"), least=1, panel=_DATA
+    )
+    vgg_weights: str | None = option(
+        None,
+        "Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a file.",
+        "imagenet|PATH",
+        shown_default="without this loss",
+        panel=_LOSSES,
+    )
+    appearance_features: Path | None = option(
+        None,
+        "Use a checkpoint of the stage appearance-features in place of --vgg-weights.",
+        "FILE",
+        shown_default="without this loss",
+        panel=_LOSSES,
+    )
+    light_features: Path | None = option(
+        None,
+        "Add the feature loss on textures, with a checkpoint of the stage light-features.",
+        "FILE",
+        shown_default="without this loss",
+        panel=_LOSSES,
+    )
+    without_normals: bool = option(
+        False,
+        "Train the Reflectance Network without normal maps (ablation).",
+        flags=("--without-normals",),
+        panel=_LOSSES,
+    )
+    mean_face: bool = option(
+        False,
+        "Fit poses alone, with the mean face for everyone (ablation).",
+        flags=("--mean-face",),
+        panel=_LOSSES,
+    )
+    geometry: Geometry = option(
+        "network",
+        "Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train the "
+        "Reflectance Network alone.",
+        panel=_LOSSES,
+    )
+    workers: int | None = option(
+        None,
+        "Draw samples ahead in so many processes.",
+        shown_default="1 on a CPU of more than one core, 4 on a GPU",
+        least=0,
+        panel=_SPEED,
+    )
+    training: TrainSettings = field(default_factory=TrainSettings)
+
+
+@dataclass(frozen=True)
+class PaceOptions:
+    """How long and how fast a run trains; None is the preset's."""
+
+    learning_rate: float | None = option(
+        None,
+        "Set the highest learning rate.",
+        shown_default=_by_preset(lambda settings: settings.optimizer.learning_rate),
+        least=1e-9,
+        panel=_RUN,
+    )
+    steps: int | None = option(
+        None, "Stop after so many steps.", shown_default="no limit", least=1, panel=_LENGTH
+    )
+    max_time: float | None = option(
+        None,
+        "Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.",
+        "TIME",
+        shown_default=f"{_DEFAULT_TIME}; no limit with --steps",
+        parse=_seconds,
+        panel=_LENGTH,
+    )
+    validate_every: int | None = option(
+        None,
+        "Validate on held-out people, and save, every so many steps.",
+        "STEPS",
+        shown_default=_by_preset(lambda settings: settings.validate_every),
+        least=1,
+        panel=_LENGTH,
+    )
+    batch: int | None = option(
+        None,
+        "Use so many samples a step, of all processes together.",
+        shown_default=_by_preset(lambda settings: settings.batch),
+        least=1,
+        panel=_SPEED,
+    )
+    bf16: bool | None = option(
+        None,
+        "Train in mixed precision (bfloat16), where the device has instructions for it.",
+        flags=("--bf16/--no-bf16",),
+        shown_default="on; presets paper and tiny, and --form paper, off",
+        panel=_SPEED,
+    )
+    compile: bool = option(
+        False,
+        "Compile the networks with torch; the first steps take minutes.",
+        flags=("--compile",),
+        panel=_SPEED,
+    )
+
+    def of_run(self, options: TrainOptions) -> TrainSettings:
+        """The preset's settings with these."""
+        training = preset_of(options.preset, options.stage)
+        optimizer = training.optimizer
+        max_seconds = _seconds(_DEFAULT_TIME) if self.max_time is self.steps is None else self.max_time
+        return replace(
+            training,
+            steps=self.steps,
+            max_seconds=max_seconds,
+            seed=options.settings.seed,
+            compile=self.compile,
+            optimizer=replace(optimizer, learning_rate=self.learning_rate or optimizer.learning_rate),
+            batch=self.batch or training.batch,
+            validate_every=self.validate_every or training.validate_every,
+            # the gradients of the form paper overflow
+            bf16=training.bf16 and options.form != "paper" if self.bf16 is None else self.bf16,
+        )
