@@ -32,6 +32,7 @@ from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding
 from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
 from facerf_cli.files.images import read_image
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults
 _PLACE = 3  # of the faulty light among those in front
@@ -106,7 +107,7 @@ class Copy:
     def findings(self) -> list[Finding]:
         """Check the copy."""
         self.save()
-        return check_subject(read_capture(self.folder), self.subject)
+        return check_subject(read_capture(self.folder), self.subject, SHIPPED_NETWORKS)
 
 
 Plant = Callable[[Copy], Sequence[str]]

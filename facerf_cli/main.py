@@ -67,6 +67,8 @@ USES: dict[str, frozenset[str]] = {
     "segment": frozenset({"parsing"}),
     "fit-geometry": FITTING,
     "evaluate": _ALL,
+    "prepare-dataset": frozenset({"parsing"}),  # which finds faces
+    "train": frozenset({"parsing"}),
 }
 
 # Global options, which are moved before the verb wherever they stand.

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.batch.settings import Shard
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256, is_regular, parse_json, regular_size, require_regular
 from facerf_cli.run.logs import json_line
@@ -33,6 +33,8 @@ _OPTIONS = {
     "colour": "the colour of --background",
     "colourspace": "--input-colourspace",
     "config": "--ocio",
+    "data": "the data",
+    "dataset_format": "facerf's version of datasets",
     "kind": "--background",
     "leaders": "the first photo of --exposure-group",
     "names": "the layers of --light",
@@ -41,10 +43,14 @@ _OPTIONS = {
     "path": "the image of --background",
     "photo_of_stack": "--photo",
     "results": "facerf's version of results",
+    "pattern": "the pattern of the capture",
     "rig": "--lights",
     "rotate_deg": "--rotate",
     "sampling": "--envmap-sampling",
     "size_px": "--size",
+    "stage_cameras": "the cameras of the capture",
+    "stage_lights": "the lights of the capture",
+    "stage_values": "the intensities, colours or --colour-chart of the capture",
     "texture_side": "--texture-size",
     "width_px": "--width",
 }
@@ -201,6 +207,29 @@ class _Rows:
                 self.outputs[name] = row
         elif "sha256" in row:
             self.files[str(row.get("file"))] = row
+
+
+def require_same(before: Recipe, now: Recipe, said: str, advice: str) -> None:
+    """Raise UsageError, `SAID: --option is ..., was ...; ADVICE`, where two recipes differ."""
+    if before != now:
+        raise UsageError(f"{said}: {differences(before, now)}; {advice}")
+
+
+def text_of_state(path: Path) -> str:
+    """Text that changes when a file is written again."""
+    state = path.stat()
+    return f"{state.st_size}-{state.st_mtime_ns}"
+
+
+def is_made_from(path: Path, text: str) -> bool:
+    """Tell whether a safetensors file is there that has the text as its metadata `of`."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return bool((file.metadata() or {}).get("of") == text)
+    except (SafetensorError, OSError):
+        return False
 
 
 def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:

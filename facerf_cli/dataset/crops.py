@@ -34,7 +34,7 @@ from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, resize
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import in_shards
 
@@ -274,7 +274,9 @@ class Photos:
         return PhotoCrops(move.image(crop, self.side_px), self.side_px * points[None])
 
 
-def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1) -> Photos:
+def open_photos(
+    paths: Iterable[Path], cache: Path, networks: Networks, side_px: int, jobs: int = 1
+) -> Photos:
     """Open the faces of photos; detect those that are not in `cache`, with a warning for a photo without one.
 
     Raises InputError where no photo has a face.
@@ -283,7 +285,7 @@ def open_photos(paths: Iterable[Path], cache: Path, side_px: int, jobs: int = 1)
     missing = [path for path, record in known.items() if not record.is_file()]
     if missing:
         log.info("%s: detecting faces in %d photos (done once)", cache, len(missing))
-        work = partial(_detect, cache)
+        work = partial(_detect, cache, networks)
         if jobs > 1 and len(missing) > 1:
             in_shards(work, missing, jobs)
         else:
@@ -304,7 +306,7 @@ def _record_path(photo: Path, cache: Path) -> Path:
     return cache / f"{digest(f'{photo.absolute()} {facts.st_size} {facts.st_mtime_ns}'.encode())}.json"
 
 
-def _detect(cache: Path, photos: list[Path]) -> None:
+def _detect(cache: Path, networks: Networks, photos: list[Path]) -> None:
     """Write the crop and the record of each photo."""
     cache.mkdir(parents=True, exist_ok=True)
     for photo in photos:
@@ -312,7 +314,7 @@ def _detect(cache: Path, photos: list[Path]) -> None:
         landmarks_px = None
         try:
             pixels = read_image(photo).pixels
-            face = find_faces(SHIPPED_NETWORKS.parsing, pixels, str(photo))[0]
+            face = find_faces(networks.parsing, pixels, str(photo))[0]
             crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
             write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
             landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()

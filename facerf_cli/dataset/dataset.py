@@ -26,6 +26,7 @@ import torch
 from pydantic import Field, model_validator
 
 from facerf_cli._version import __version__
+from facerf_cli.batch.made_from import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.stage_json import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.errors import InputError, UsageError
@@ -260,10 +261,18 @@ class Split:
         return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
 
 
-def preparation_key(capture: Capture, face_model_sha256: str, crop_px: int | None) -> str:
-    """Short digest of all that a subject's files depend on besides its images."""
-    content = [FORMAT, capture.pattern, face_model_sha256, crop_px, _calibration(capture)]
-    return digest(json.dumps(content, sort_keys=True).encode())
+def preparation(capture: Capture, face_model_sha256: str, crop_px: int | None, network_sha256: str) -> Recipe:
+    """List all that a subject's files depend on besides its images, by the names of options."""
+    calibration = _calibration(capture)
+    contents = {
+        "face_model": face_model_sha256,
+        "checkpoint": network_sha256,  # of the Parsing Network
+        "stage_lights": calibration["rig"],
+        "stage_cameras": calibration["cameras"],
+        "stage_values": calibration["normalisation"],
+    }
+    digests = {name: f"sha256:{digest(json.dumps(content).encode())}" for name, content in contents.items()}
+    return {"dataset_format": FORMAT, "pattern": capture.pattern, "crop": crop_px, **digests}
 
 
 def describe_dataset(
@@ -312,7 +321,7 @@ def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
 def _calibration(capture: Capture) -> dict[str, Any]:
     """Lights, cameras and the normalisation of the images' values.
 
-    `preparation_key` hashes all of it: another word here prepares every dataset again.
+    `preparation` compares all of it: another word here prepares every dataset again.
     """
     lights = zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
     gains = zip(capture.light_ids, (1 / capture.intensities).tolist(), strict=True)

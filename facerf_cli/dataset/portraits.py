@@ -21,8 +21,9 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from facerf_cli.batch.made_from import is_made_from
 from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
-from facerf_cli.dataset.textures import is_made_from, stamp
+from facerf_cli.dataset.textures import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.atomic import atomic_path
@@ -30,6 +31,7 @@ from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.portrait.person import SIDE_PX
+from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.bank.portrait_samples import LitPerson, PortraitSample, sample_of, source_light
@@ -78,13 +80,15 @@ class DatasetPortraits:
         return sample_of(lit, seen, self.backgrounds, generator)
 
 
-def open_dataset_portraits(folder: Path, backgrounds: Tensor, jobs: int) -> DatasetPortraits:
+def open_dataset_portraits(
+    folder: Path, backgrounds: Tensor, networks: Networks, jobs: int
+) -> DatasetPortraits:
     """Open the dataset in a folder, and make missing portraits of its splits train and validation.
 
     Raises InputError where a split has nobody whose face is found.
     """
     dataset = read_dataset(folder)
-    _make_missing(dataset, jobs)
+    _make_missing(dataset, networks, jobs)
     views = {split: _views_of(dataset, split) for split in ("train", "validation")}
     for split, found in views.items():
         if not found:
@@ -116,27 +120,36 @@ def _path(dataset: Dataset, subject: str, camera: str) -> Path:
     return dataset.folder / f"portraits-{SIDE_PX}" / subject / f"{camera}.safetensors"
 
 
-def _make_missing(dataset: Dataset, jobs: int) -> None:
+def _make_missing(dataset: Dataset, networks: Networks, jobs: int) -> None:
     views = _of(dataset, [*dataset.splits["train"], *dataset.splits["validation"]])
-    missing = [view for view in views if not is_made_from(dataset, *view, _path(dataset, *view))]
+    missing = [
+        view
+        for view in views
+        if not is_made_from(_path(dataset, *view), _made_from(dataset, networks, *view))
+    ]
     if missing:
         folder = dataset.folder / f"portraits-{SIDE_PX}"
         log.info("%s: looking at the people of %d stacks (done once)", folder, len(missing))
-        in_shards(partial(_make_shard, dataset), missing, jobs)
+        in_shards(partial(_make_shard, dataset, networks), missing, jobs)
 
 
-def _make_shard(dataset: Dataset, views: list[tuple[str, str]]) -> None:
+def _made_from(dataset: Dataset, networks: Networks, subject: str, camera: str) -> str:
+    """What a portrait is made from: a stack, and the network that looks at the person."""
+    return f"{stamp(dataset, subject, camera)}-{networks.sha256('parsing')}"
+
+
+def _make_shard(dataset: Dataset, networks: Networks, views: list[tuple[str, str]]) -> None:
     with one_thread():
         for view in views:
             tensors: dict[str, Tensor] = {}
             with suppress(InputError):
-                tensors = _portrait_of(dataset.stack_path(*view))
+                tensors = _portrait_of(networks, dataset.stack_path(*view))
             with atomic_path(_path(dataset, *view)) as temporary:
-                save_file(tensors, temporary, {"of": stamp(dataset, *view)})
+                save_file(tensors, temporary, {"of": _made_from(dataset, networks, *view)})
 
 
 @torch.no_grad()
-def _portrait_of(stack: Path) -> dict[str, Tensor]:
+def _portrait_of(networks: Networks, stack: Path) -> dict[str, Tensor]:
     """Look at the person of a stack; raises InputError where no face is found.
 
     olats [L, 3, S, S], lit [3, S, S] and inside [S, S], where the crop lies: float16; directions [L, 3];
@@ -144,7 +157,7 @@ def _portrait_of(stack: Path) -> dict[str, Tensor]:
     """
     header = read_olat_header(stack)
     directions, around = torch.from_numpy(header.directions).float(), rig_directions(_AROUND)
-    person = person_in(header.source)
+    person = person_in(networks.parsing, header.source)
     squared = [
         _in_square(person.square.apply(olat.permute(1, 2, 0).float().numpy())) for olat in read_olats(stack)
     ]

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.batch.made_from import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import Selection
 from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
@@ -37,7 +38,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.portrait.find import choose_face, detect_faces
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 
 _TILE_PX = 192
@@ -65,17 +66,19 @@ def prepare_subject(
     subject: str,
     chosen: Selection,
     model: MorphableModel,
+    networks: Networks,
     folder: Path,
     crop_px: int | None,
-    key: str,
+    made_from: Recipe,
     strict: bool = False,
 ) -> dict[str, Any]:
     """Write a subject's stacks, fits, sheet and record, and return the record.
 
-    `key` comes from `preparation_key`. With `strict` a camera that does not see the face is an error.
+    `made_from` is that of `preparation`; `networks` find the faces. With `strict` a camera that does not see
+    the face is an error.
     """
     record_path(folder, subject).unlink(missing_ok=True)
-    person = _Subject(capture, subject, chosen.lights, model)
+    person = _Subject(capture, subject, chosen.lights, model, networks)
     landmarks = [_find_landmarks(person, camera) for camera in chosen.cameras]
     try:
         joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
@@ -98,7 +101,7 @@ def prepare_subject(
     sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
     write_display(sheet_path(folder, subject), sheet, metadata=person.provenance())
     record = {
-        "prepared": key,
+        "prepared": made_from,
         "error_iod": round(joint.mean_error_iod, 5),
         "quality": quality_of(joint.mean_error_iod),
         "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
@@ -110,7 +113,7 @@ def prepare_subject(
 
 
 def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
-    """Records of the finished subjects, by subject; 'prepared' is the key of `prepare_subject`."""
+    """Records of the finished subjects, by subject; 'prepared' is what they were made from."""
     return {
         subject: read_document(record_path(folder, subject), dict[str, Any], "")
         for subject in capture.subjects
@@ -137,6 +140,7 @@ class _Subject:
     name: str
     lights: tuple[int, ...]
     model: MorphableModel
+    networks: Networks
 
     @property
     def directions_world(self) -> np.ndarray:
@@ -194,7 +198,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
     for light, weight in zip(person.lights, weights, strict=True):
         lit += weight * person.capture.frame(person.name, camera, light)
-    faces = detect_faces(SHIPPED_NETWORKS.parsing, to_display(lit))
+    faces = detect_faces(person.networks.parsing, to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 

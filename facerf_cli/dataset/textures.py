@@ -21,10 +21,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from facerf_cli.batch.made_from import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs
 from facerf_cli.errors import InputError
@@ -96,9 +97,8 @@ def _pairs(dataset: Dataset, subject: str) -> list[Pair]:
 
 
 def stamp(dataset: Dataset, subject: str, camera: str) -> str:
-    """Text that changes when a stack is written again."""
-    facts = dataset.stack_path(subject, camera).stat()
-    return f"{LAYOUT_VERSION}-{facts.st_size}-{facts.st_mtime_ns}"
+    """Text that changes when a stack is written again, or the UV layout changes."""
+    return f"{LAYOUT_VERSION}-{text_of_state(dataset.stack_path(subject, camera))}"
 
 
 def _is_finished(dataset: Dataset, side: int, subject: str) -> bool:
@@ -107,18 +107,7 @@ def _is_finished(dataset: Dataset, side: int, subject: str) -> bool:
 
 
 def _is_unwrapped(dataset: Dataset, side: int, subject: str, camera: str) -> bool:
-    return is_made_from(dataset, subject, camera, texture_path(dataset, side, subject, camera))
-
-
-def is_made_from(dataset: Dataset, subject: str, camera: str, path: Path) -> bool:
-    """Tell whether a safetensors file was made from a stack as it is, by its metadata `of`; see `stamp`."""
-    if not path.is_file():
-        return False
-    try:
-        with safe_open(path, framework="pt") as file:
-            return (file.metadata() or {}).get("of") == stamp(dataset, subject, camera)
-    except (SafetensorError, OSError):
-        return False
+    return is_made_from(texture_path(dataset, side, subject, camera), stamp(dataset, subject, camera))
 
 
 def _has_sources(dataset: Dataset, subject: str) -> bool:

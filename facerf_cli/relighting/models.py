@@ -48,8 +48,14 @@ class Networks:
         device: torch.device = _CPU,
         given: Mapping[str, nn.Module] | None = None,
     ) -> None:
-        self.files, self.device = dict(files), device
-        self._loaded: dict[str, Any] = dict(given or {})
+        self.files, self.device, self._given = dict(files), device, dict(given or {})
+        self._loaded: dict[str, Any] = dict(self._given)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send the files to another process, which loads each network once, or the given networks."""
+        if self._given:
+            return Networks, (self.files, self.device, self._given)
+        return _networks_once, (tuple(self.files.items()), self.device)
 
     @property
     def reflectance(self) -> ReflectanceNetwork:
@@ -90,6 +96,10 @@ class Networks:
         """Return the same networks with others in place of some."""
         return Networks(self.files, self.device, {**self._loaded, **networks})
 
+    def sha256(self, name: str) -> str:
+        """SHA-256 of the file that serves a network."""
+        return described_file(self.files[name])["sha256"]
+
     def served(self) -> dict[str, dict[str, str]]:
         """File and SHA-256 of each network that was needed so far, for reports."""
         names = [name for name in SHIPPED if name in self._loaded]
@@ -103,6 +113,11 @@ class Networks:
                 _CHECKS[name](path, network)
             self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
         return self._loaded[name]
+
+
+@cache
+def _networks_once(files: tuple[tuple[str, Path], ...], device: torch.device) -> Networks:
+    return Networks(dict(files), device)
 
 
 SHIPPED_NETWORKS = Networks()  # on the CPU; a verb's own are in its Models

@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.batch.made_from import Recipe, recipe_of, require_same
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.images import write_display
-from facerf_cli.files.texts import parse_json
+from facerf_cli.files.texts import file_sha256, parse_json
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.stopping import unhurried
-from facerf_cli.training.settings import MAY_CHANGE, Adadelta, AdamW, TrainSettings
+from facerf_cli.training.settings import Adadelta, AdamW, TrainSettings
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)
@@ -140,7 +141,7 @@ def stop_on_signals() -> Iterator[Stop]:
             signal.signal(which, handler)
 
 
-_FORMAT = "facerf-state-1"
+_FORMAT = "facerf-state-2"
 
 
 @dataclass
@@ -206,7 +207,7 @@ def save_state(path: Path, state: State, settings: TrainSettings) -> None:
         "best": state.best,
         "start": json.dumps(state.start),
         "provenance": json.dumps(state.provenance),
-        "settings": json.dumps(asdict(settings)),
+        "settings": json.dumps(_recipe(settings)),
     }
     with atomic_path(path) as temporary:
         torch.save(content, temporary)
@@ -218,9 +219,10 @@ def load_state(path: Path, state: State, settings: TrainSettings) -> None:
         content = torch.load(path, map_location="cpu", weights_only=True)
         if content["format"] != _FORMAT:
             raise ValueError("another version's file")
-        _refuse_other_settings(path, json.loads(content["settings"]), settings)
-        if json.loads(content["provenance"]) != json.loads(json.dumps(state.provenance)):
-            raise UsageError(f"{path.parent}: the run began with other data; resume it with the same options")
+        said, advice = f"{path.parent}: the run began otherwise", "resume it with the same options"
+        require_same(json.loads(content["settings"]), _recipe(settings), said, advice)
+        data = {"data": json.dumps(state.provenance)}
+        require_same({"data": content["provenance"]}, data, said, advice)
         state.networks.load_state_dict(content["networks"])
         state.optimizer.load_state_dict(content["optimizer"])
         for mean, saved in zip(state.average, content["average"], strict=True):
@@ -236,12 +238,11 @@ def load_state(path: Path, state: State, settings: TrainSettings) -> None:
         ) from None
 
 
-def _refuse_other_settings(path: Path, before: dict[str, Any], settings: TrainSettings) -> None:
-    now = json.loads(json.dumps(asdict(settings)))
-    other = [name for name in now if name not in MAY_CHANGE and now[name] != before.get(name)]
-    if other:
-        was = ", ".join(f"{name} {before.get(name)}" for name in other)
-        raise UsageError(f"{path.parent}: the run began with {was}; resume it with the same options")
+def _recipe(settings: TrainSettings) -> Recipe:
+    """What makes a run, by the names of options."""
+    recipe = recipe_of(settings, file_sha256)
+    del recipe["results"]  # of verbs that write images
+    return {"optimizer": type(settings.optimizer).__name__, **recipe}
 
 
 def _floats(networks: nn.ModuleDict) -> list[Tensor]:

@@ -4,8 +4,10 @@ The command line reads its defaults here, so this module imports no torch.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 
 Preset = Literal["default", "paper", "tiny"]
 Stage = Literal[
@@ -65,6 +67,10 @@ class Constant:
         return 1.0
 
 
+def _may_change(default: Any) -> Any:
+    return field(default=default, metadata=NOT_IN_RECIPE)
+
+
 @dataclass(frozen=True)
 class TrainSettings:
     """Settings of the training loop; the defaults are the preset `default`."""
@@ -75,12 +81,13 @@ class TrainSettings:
     gradient_clip: float | None = 1.0  # largest norm; None: no clipping
     ema_decay: float | None = 0.998  # of the weights that are validated and saved; None: not averaged
     bf16: bool = True
-    validate_every: int = 500  # steps
-    steps: int | None = None  # the run ends after so many steps or max_seconds, whichever comes first
-    max_seconds: float | None = None
     seed: int = 0
-    workers: int = 0  # processes that draw batches; 0: the training process itself
-    compile: bool = False
+    # What may differ between a run and its resumption.
+    validate_every: int = _may_change(500)  # steps
+    steps: int | None = _may_change(None)  # the run ends after so many steps or max_seconds, if that is first
+    max_seconds: float | None = _may_change(None)
+    workers: int = _may_change(0)  # processes that draw batches; 0: the training process itself
+    compile: bool = _may_change(False)
 
     def done(self, step: int, seconds: float) -> float:
         """Share of the run that is over before a step, counted from 0."""
@@ -118,7 +125,3 @@ def preset_of(preset: Preset, stage: Stage) -> TrainSettings:
     settings = PRESETS["default" if preset == "paper" and stage in _BESIDE_THE_PAPER else preset]
     own = preset != "tiny" and stage in _BATCHES
     return replace(settings, batch=_BATCHES[stage]) if own else settings
-
-
-# Settings that may differ between a run and its resumption.
-MAY_CHANGE = frozenset({"steps", "max_seconds", "validate_every", "workers", "compile"})

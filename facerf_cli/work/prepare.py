@@ -11,8 +11,9 @@ import numpy as np
 from rich.progress import track
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.made_from import Recipe, require_same
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture, ChartCorrection
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
@@ -27,7 +28,7 @@ from facerf_cli.dataset.dataset import (
     Dataset,
     Split,
     describe_dataset,
-    preparation_key,
+    preparation,
     read_dataset,
     record_path,
 )
@@ -48,6 +49,8 @@ from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, loa
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.texts import file_sha256
+from facerf_cli.network.files import serving_files
+from facerf_cli.relighting.models import Networks
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.run.workers import one_thread, process_died, spread
@@ -105,12 +108,15 @@ def prepare_capture(
     capture = source.opened()
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
+    networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
+        checks = CheckOnly(source.opened, networks)
+        return check_all(checks, items, batch, checking.strict, settings)
     model_sha256 = _model_digest(content.face_model)
-    key = preparation_key(capture, model_sha256, content.crop)
-    _check_earlier(capture, output, key, overwrite)
-    work = Prepare(source, checking, content.face_model, content.crop, output, key)
+    made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
+    if not overwrite:
+        _check_earlier(capture, output, made_from)
+    work = Prepare(source, checking, networks, content.face_model, content.crop, output, made_from)
     if overwrite and not batch.dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
     elif not batch.dry_run:
@@ -195,14 +201,15 @@ def _face_model(name: str) -> MorphableModel:
     return load_face_model(name)
 
 
-def _check_earlier(capture: Capture, output: Path, key: str, overwrite: bool) -> None:
-    """Raise where finished subjects were prepared with other options than this run has."""
-    earlier = {} if overwrite else prepared_subjects(capture, output)
-    other = [subject for subject, record in earlier.items() if record.get("prepared") != key]
-    if other:
-        raise UsageError(
-            f"{output}: {len(other)} subjects ({other[0]}, ...) were prepared with another crop, face model, "
-            "calibration or colour chart; give --overwrite always, or another folder"
+def _check_earlier(capture: Capture, output: Path, made_from: Recipe) -> None:
+    """Raise UsageError where finished subjects were prepared with other options than this run has."""
+    for subject, record in prepared_subjects(capture, output).items():
+        before = record.get("prepared")
+        require_same(
+            before if isinstance(before, dict) else {},
+            made_from,
+            f"{output}: {subject} was prepared otherwise",
+            "give --overwrite always, or another folder",
         )
 
 
@@ -220,10 +227,11 @@ class Prepare:
 
     source: CaptureSource
     checking: CheckSettings
+    networks: Networks
     face_model: str
     crop_px: int | None
     folder: Path
-    key: str
+    made_from: Recipe
 
     def outputs_of(self, item: Item) -> Sequence[Path]:
         """Files of a subject."""
@@ -235,7 +243,15 @@ class Prepare:
         with one_thread():
             capture, chosen = self._choose(item.name)
             record = prepare_subject(
-                capture, item.name, chosen, model, self.folder, self.crop_px, self.key, self.checking.strict
+                capture,
+                item.name,
+                chosen,
+                model,
+                self.networks,
+                self.folder,
+                self.crop_px,
+                self.made_from,
+                self.checking.strict,
             )
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
@@ -248,7 +264,7 @@ class Prepare:
     def _choose(self, subject: str) -> tuple[Capture, Selection]:
         """Check a subject, select its sound frames, and align them on request; InputError for too few."""
         capture = self.source.opened()
-        findings = check_subject(capture, subject) if self.checking.checks == "on" else []
+        findings = check_subject(capture, subject, self.networks) if self.checking.checks == "on" else []
         write_findings(self.folder, subject, findings)
         require_sound(subject, findings, self.checking.strict)
         chosen = select_frames(capture, subject, findings, self.checking.strict)
@@ -260,7 +276,7 @@ class Prepare:
 def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, model_sha256: str) -> None:
     """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
     found = prepared_subjects(capture, work.folder).items()
-    records = {subject: record for subject, record in found if record.get("prepared") == work.key}
+    records = {subject: record for subject, record in found if record.get("prepared") == work.made_from}
     findings = collect_findings(work.folder, capture.subjects)
     show_findings([row for rows in findings.values() for row in rows], work.checking.strict)
     if not records:

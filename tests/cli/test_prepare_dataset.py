@@ -25,6 +25,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.dataset.capture import Truth, write_capture
 
@@ -90,7 +91,7 @@ def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
 
 def test_what_comes_of_a_synthetic_capture_says_so(given: Given) -> None:
     capture = replace(read_capture(given[0]), provenance={"synthetic": True})
-    made = _Subject(capture, "0000", (), load_face_model()).provenance("C1")
+    made = _Subject(capture, "0000", (), load_face_model(), SHIPPED_NETWORKS).provenance("C1")
     assert made["facerf:input"] == "0000/C1" and made["facerf:synthetic"] == 1
     assert made["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
 
@@ -290,7 +291,7 @@ def test_no_capture(tmp_path: Path, capsys: Said) -> None:
 def test_other_options_do_not_mix(given: Given, prepared: Dataset, capsys: Said) -> None:
     line = ["prepare-dataset", str(given[0]), "-o", str(prepared.folder), "--crop", "128"]
     assert main(line) == 2
-    assert "prepared with another crop" in capsys.readouterr().err
+    assert "was prepared otherwise: --crop is 128, was 96; give --overwrite always" in capsys.readouterr().err
 
 
 def changed(given: Given, capture: Path, **changes: object) -> Path:

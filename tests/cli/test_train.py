@@ -16,7 +16,12 @@ from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.synth.bank.transport import TransportBankSettings, load_view, seen_in, seen_path, transport_of
+from facerf_cli.synth.bank.transport import (
+    TransportBankSettings,
+    look_at_views,
+    seen_path,
+    transport_of,
+)
 from facerf_cli.work import train as train_work
 from facerf_cli.work.train_options import TrainOptions
 from tests.dataset.dataset_fixture import write_small_dataset
@@ -190,9 +195,9 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert main([*line, "--steps", "3"]) == 2
     assert "holds a run already; give --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--batch", "3"]) == 2
-    assert "the run began with batch 2" in capsys.readouterr().err
+    assert "the run began otherwise: --batch is" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
-    assert "the run began with other data" in capsys.readouterr().err
+    assert "the run began otherwise: the data changed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -268,11 +273,10 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> N
     for person in range(5):
         path = bank / "transport" / f"{person:05}_0.safetensors"
         save_file(baked, path)
-        seen = seen_path(bank / "transport" / "00000_0.safetensors")
-        if not seen.exists():
-            save_file(seen_in(load_view(path), backgrounds, 0), seen)
-        elif person:
-            shutil.copy(seen, seen_path(path))
+        if not person:
+            look_at_views(backgrounds, SHIPPED_NETWORKS, 0, [path])
+        else:
+            shutil.copy(seen_path(bank / "transport" / "00000_0.safetensors"), seen_path(path))
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--heads", "5"]
     assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)

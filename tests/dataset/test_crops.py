@@ -30,6 +30,7 @@ from facerf_cli.files.images import write_display
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.portrait.find import Face
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 
@@ -200,18 +201,18 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked_at: list[str]
 def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: pytest.LogCaptureFixture) -> None:
     paths, cache = sorted(folder.glob("*.png")), folder / "cache"
     with caplog.at_level(logging.WARNING):
-        first = open_photos(paths, cache, 64)
+        first = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
     assert [Path(name).name for name in looked_at] == ["a.png", "b.png", "c.png"]
     assert caplog.text.count("c.png: no face found") == 1
-    again = open_photos(paths, cache, 64)
+    again = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
     assert len(looked_at) == 3 and again.paths == first.paths and len(first.paths) == 2
     os.utime(paths[0], (0, 0))
-    open_photos(paths, cache, 64)
+    open_photos(paths, cache, SHIPPED_NETWORKS, 64)
     assert len(looked_at) == 4  # the one that changed
 
 
 def test_crops_hold_their_landmarks(folder: Path) -> None:
-    found = open_photos(sorted(folder.glob("*.png")), folder / "cache", 64)
+    found = open_photos(sorted(folder.glob("*.png")), folder / "cache", SHIPPED_NETWORKS, 64)
     drawn = found.draw(torch.Generator().manual_seed(0))
     assert drawn.crops.shape == (1, 3, 64, 64) and drawn.landmarks_px.shape == (1, 68, 2)
     full = found.landmarks_px / CACHED_SIDE_PX
@@ -231,4 +232,4 @@ def _after_the_choice(seed: int) -> torch.Generator:
 
 def test_no_face_at_all_is_an_error(folder: Path) -> None:
     with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
-        open_photos([folder / "c.png"], folder / "cache", 64)
+        open_photos([folder / "c.png"], folder / "cache", SHIPPED_NETWORKS, 64)

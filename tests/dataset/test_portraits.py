@@ -11,6 +11,7 @@ from facerf_cli.dataset.portraits import DatasetPortraits, open_dataset_portrait
 from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
 
@@ -25,7 +26,7 @@ def backgrounds() -> Tensor:
 def portraits(tmp_path_factory: pytest.TempPathFactory) -> DatasetPortraits:
     folder = tmp_path_factory.mktemp("dataset")
     write_small_dataset(folder, (2, 1, 0), 1, lights=14, crop_px=192, lacking={"0001": range(LACKS)})
-    return open_dataset_portraits(folder, backgrounds(), 1)
+    return open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)
 
 
 def drawn(portraits: DatasetPortraits, person: int, seed: int = 1) -> PortraitSample:
@@ -69,11 +70,11 @@ def test_people_with_fewer_lights_fit_into_a_batch(portraits: DatasetPortraits) 
 def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
     path = portraits.views[0][0]
     before = path.stat().st_mtime_ns
-    open_dataset_portraits(portraits.dataset.folder, backgrounds(), 1)
+    open_dataset_portraits(portraits.dataset.folder, backgrounds(), SHIPPED_NETWORKS, 1)
     assert path.stat().st_mtime_ns == before
 
 
 def test_a_split_without_a_face_is_refused(tmp_path: Path) -> None:
     write_small_dataset(tmp_path, (1, 0, 0), 1, lights=4, crop_px=192)
     with pytest.raises(InputError, match="no face was found in the split validation"):
-        open_dataset_portraits(tmp_path, backgrounds(), 1)
+        open_dataset_portraits(tmp_path, backgrounds(), SHIPPED_NETWORKS, 1)

@@ -22,7 +22,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.portrait.find import choose_face, detect_faces
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.models import Networks
 
 _TURN_DEG = 20.0  # sound rigs give 1 to 11, on Extended Yale B and synthetic faces
 _SWAP_DEG, _LIKE_DEG = 12.0, 12.0  # least turn of a swapped camera; largest distance from the other's pose
@@ -141,10 +141,10 @@ class FaceNormals:
     normals: np.ndarray  # [N, 3] unit, camera space
 
 
-def find_face_normals(frames: CameraFrames, posed: PosedCamera) -> FaceNormals | None:
+def find_face_normals(frames: CameraFrames, posed: PosedCamera, networks: Networks) -> FaceNormals | None:
     """Fit the mean face to the landmarks in the mean of all frames; None without a face."""
     rgb = np.repeat(frames.lit[..., None], 3, -1).clip(0)
-    faces = detect_faces(SHIPPED_NETWORKS.parsing, to_display(rgb)) if rgb.max() > 0 else []
+    faces = detect_faces(networks.parsing, to_display(rgb)) if rgb.max() > 0 else []
     if not faces:
         return None
     landmarks_px = choose_face(faces, "largest", frames.camera)[0].landmarks_px * frames.lit_scale

@@ -36,18 +36,20 @@ from facerf_cli.capture.checks.shading import (
     fit_stereo,
 )
 from facerf_cli.capture.findings import Finding
+from facerf_cli.relighting.models import Networks
 
 _FACE_TRIES = 3  # cameras without a face that are searched; each costs a second or more
 
 
-def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Finding]:
+def check_subject(capture: Capture, subject: str, networks: Networks, side_px: int = 96) -> list[Finding]:
     """Check a subject's frames; findings are sorted, errors first.
 
     Each frame is read once, and one camera is in memory at a time, with `side_px` squared values per light.
     Unreadable frames are findings, not exceptions; a missing frame that the capture marks as damaged is none.
-    The checks see the frames without a colour chart's matrix, which would hide clipped channels.
+    `networks` find the face. The checks see the frames without a colour chart's matrix, which would hide
+    clipped channels.
     """
-    checks = _Checks(replace(capture, charts=()), subject, side_px)
+    checks = _Checks(replace(capture, charts=()), subject, networks, side_px)
     found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
     found += check_gamma(subject, checks.curves)
     found += check_rigs(subject, checks.rigs) if checks.rigs else checks.rough
@@ -59,8 +61,8 @@ def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Fin
 class _Checks:
     """Checks of a subject's cameras in turn, and the results that are judged at the end."""
 
-    def __init__(self, capture: Capture, subject: str, side_px: int) -> None:
-        self.capture, self.subject, self.side_px = capture, subject, side_px
+    def __init__(self, capture: Capture, subject: str, networks: Networks, side_px: int) -> None:
+        self.capture, self.subject, self.networks, self.side_px = capture, subject, networks, side_px
         self.curves: list[Curve] = []
         self.rough: list[Finding] = []  # of the rig, without a face
         self.rigs: list[RigFit] = []
@@ -111,7 +113,7 @@ class _Checks:
         if not self.rigs:
             self.rough += check_rig_roughly(frames, stereo)
         if self._face_tries:
-            face = find_face_normals(frames, self.capture.cameras[frames.camera])
+            face = find_face_normals(frames, self.capture.cameras[frames.camera], self.networks)
             rig = None if face is None else measure_rig(frames, stereo, face, self.capture.cameras)
             self.rigs += [] if rig is None else [rig]
             self._face_tries -= face is None

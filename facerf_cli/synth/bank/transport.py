@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from facerf_cli.batch.made_from import is_made_from
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
@@ -23,11 +24,12 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SIDE_PX, SIDES, SeenPerson, look_at_person, surface_of
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.run.workers import in_shards
+from facerf_cli.relighting.models import Networks
+from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.bank.texture_samples import draw_light
@@ -136,10 +138,11 @@ def _draw_camera(subject: Subject, random: np.random.Generator) -> StageCamera:
     return StageCamera(lens, rotation, towards)
 
 
-def add_proxies(folder: Path, backgrounds: Tensor, jobs: int, seed: int) -> None:
-    """Add to each portrait of a bank what is seen of it: see `seen_in`; keep finished ones."""
-    missing = [path for path in sorted(folder.glob("[0-9]*.safetensors")) if not seen_path(path).exists()]
-    in_shards(partial(_see_shard, backgrounds, seed), missing, jobs)
+def add_proxies(folder: Path, backgrounds: Tensor, networks: Networks, jobs: int, seed: int) -> None:
+    """Add to each portrait of a bank what the networks see of it (`seen_in`); keep finished ones."""
+    sha256, paths = networks.sha256("parsing"), sorted(folder.glob("[0-9]*.safetensors"))
+    missing = [path for path in paths if not is_made_from(seen_path(path), sha256)]
+    in_shards(partial(look_at_views, backgrounds, networks, seed), missing, jobs)
 
 
 def seen_path(path: Path) -> Path:
@@ -147,17 +150,19 @@ def seen_path(path: Path) -> Path:
     return path.with_name(f"seen_{path.name}")
 
 
-def _see_shard(backgrounds: Tensor, seed: int, paths: list[Path]) -> None:
-    torch.set_num_threads(1)
-    for path in paths:
-        with atomic_path(seen_path(path)) as temporary:
-            save_file(
-                seen_in(load_view(path), backgrounds, seed + int(path.stem.replace("_", ""))), temporary
-            )
+def look_at_views(backgrounds: Tensor, networks: Networks, seed: int, paths: list[Path]) -> None:
+    """Write what is seen of views, on one thread."""
+    made_from = {"of": networks.sha256("parsing")}
+    with one_thread():
+        for path in paths:
+            number = int(path.stem.replace("_", ""))
+            seen = seen_in(load_view(path), backgrounds, networks.parsing, seed + number)
+            with atomic_path(seen_path(path)) as temporary:
+                save_file(seen, temporary, made_from)
 
 
 @torch.no_grad()
-def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Tensor]:
+def seen_in(view: "StoredView", backgrounds: Tensor, parsing: ParsingNetwork, seed: int) -> dict[str, Tensor]:
     """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
 
     All is seen in the view's own frame, so that it lies on the view's images; see `layers_of`.
@@ -172,19 +177,19 @@ def seen_in(view: "StoredView", backgrounds: Tensor, seed: int) -> dict[str, Ten
         image = image / image.mean().clamp_min(1e-6) * 0.1 + (1 - view.alpha) * background
         exposed = (image / image.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
-            return layers_of(person_in(exposed, frame), portrait.directions)
+            return layers_of(person_in(parsing, exposed, frame), portrait.directions)
     return {}
 
 
-def person_in(photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
+def person_in(parsing: ParsingNetwork, photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
     """Find the largest face of a scene-linear photo [H, W, 3], fit it, and look at the person.
 
     All is seen in the square around the landmarks, or in a given one. Raises InputError without a face.
     """
-    face = find_faces(SHIPPED_NETWORKS.parsing, photo, "portrait")[0]
+    face = find_faces(parsing, photo, "portrait")[0]
     crop = from_landmarks(face.landmarks_px, _CROP_PX)
     fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-    return look_at_person(SHIPPED_NETWORKS.parsing, _builtin(), photo, fit, square)
+    return look_at_person(parsing, _builtin(), photo, fit, square)
 
 
 def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:

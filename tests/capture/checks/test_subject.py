@@ -12,6 +12,7 @@ from facerf_cli.capture.checks.rig import FaceNormals
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, frames_left_out, stopping
 from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.capture.checks.egg_stage import (
     CAMERA,
     HEIGHT,
@@ -36,7 +37,7 @@ def the_egg_is_the_face(monkeypatch: pytest.MonkeyPatch) -> None:
     """The normals that a face would have, known from the egg: it has no face to be found."""
     field, inside = normals()
 
-    def known(frames: CameraFrames, posed: object) -> FaceNormals:
+    def known(frames: CameraFrames, posed: object, networks: object) -> FaceNormals:
         step = frames.scale
         height, width = frames.grey.shape[1:]
         rows, columns = np.mgrid[:height, :width]
@@ -55,7 +56,7 @@ def sound() -> np.ndarray:
 
 
 def findings(folder: Path) -> list[Finding]:
-    return check_subject(read_capture(folder), SUBJECT)
+    return check_subject(read_capture(folder), SUBJECT, SHIPPED_NETWORKS)
 
 
 def only(found: list[Finding]) -> Finding:
@@ -272,7 +273,7 @@ def test_a_camera_whose_pose_is_wrong_is_named_and_that_of_all_is_the_rigs(
 def test_without_a_face_a_mirrored_rig_shows_in_the_shape(
     tmp_path: Path, sound: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "find_face_normals", lambda frames, posed: None)
+    monkeypatch.setattr(module, "find_face_normals", lambda frames, posed, networks: None)
     found = findings(write_stage(tmp_path / "s", sound, lights=lights_of(directions() * [-1, 1, 1])))
     assert only(found).check == "rig" and "hollow" in found[0].words
     assert not findings(write_stage(tmp_path / "sound", sound))

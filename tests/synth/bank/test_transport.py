@@ -13,6 +13,7 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank import transport
 from facerf_cli.synth.bank.portrait_samples import PortraitSample, StoredTransport
 from facerf_cli.synth.bank.transport import (
@@ -20,7 +21,7 @@ from facerf_cli.synth.bank.transport import (
     TransportBankSettings,
     add_transport,
     load_view,
-    seen_in,
+    look_at_views,
     seen_path,
     transport_of,
 )
@@ -41,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for view, tensors in enumerate(transport_of("builtin", 1, 3, SMALL)):
         save_file(tensors, path / f"00001_{view}.safetensors")
     for stored in sorted(path.iterdir()):
-        save_file(seen_in(load_view(stored), backgrounds(), 0), seen_path(stored))
+        look_at_views(backgrounds(), SHIPPED_NETWORKS, 0, [stored])
     return path
 
 
