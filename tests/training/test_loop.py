@@ -251,6 +251,7 @@ def _free_port() -> int:
 
 def test_a_batch_is_shared_in_equal_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("facerf_cli.training.loop.process_count", lambda: 3)
+    monkeypatch.setattr("facerf_cli.training.loop.distributed", lambda objective, _: objective)
     with pytest.raises(UsageError, match="--batch 2: 3 processes cannot share it"):
         train(toy_objective(), tmp_path, TINY)
 
