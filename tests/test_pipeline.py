@@ -9,7 +9,7 @@ from facerf_cli.baselines import Kind
 from facerf_cli.errors import InputError
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.topology import region_mask
-from facerf_cli.light.estimate import estimate_weights
+from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import Estimator, Person, estimate_light, predict_olat, reflectance_of
@@ -38,7 +38,7 @@ def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head)
     texture = head.face.texture[:, seen]
 
     def error(olats: torch.Tensor) -> float:
-        weights = estimate_weights(olats[..., seen], texture)
+        weights = estimate_signed_weights(olats[..., seen], texture)
         rendered = weighted_sum([olats], weights[None])[0][:, seen]
         return float((rendered - texture).norm() / texture.norm())
 

@@ -23,8 +23,8 @@ Features = Callable[[Tensor], Sequence[Tensor]]  # of linear textures [B, 3, T, 
 _WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their neighbours, lie above this
 _LEAST_TEXELS = 200  # fewer do not determine where light comes from
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
-_RIDGE = 0.02  # as a share of the photo's norm, against lights that cancel each other
-_EVEN, _ONE_COLOUR = 0.3, 0.3  # the same, against uneven light from around, and lights of several colours
+# As shares of the photo's norm, against uneven light from around, and against lights of several colours.
+_EVEN, _ONE_COLOUR = 0.3, 0.3
 _REACHES = 0.1  # share of the largest mean radiance of the face under a light; below it, it is not solved for
 _CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
 _OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
@@ -103,21 +103,11 @@ def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
     )
 
 
-def estimate_weights(olats: Tensor, image: Tensor) -> Tensor:
-    """Solve Eq. (leastsq) for non-negative weights [L, C], which sum images [L, C, N] to an image [C, N].
-
-    Iteratively reweighted least squares, a channel at a time: clipped, covered and misfitted elements lose
-    weight. All images are scene-linear.
-    """
-    pairs = _channels(olats, image)
-    solved = [_reweighted(a, b, _RIDGE * np.eye(len(olats)), np.zeros(len(olats))) for a, b in pairs]
-    return torch.from_numpy(np.stack(solved, -1)).float()
-
-
 def estimate_lamps(olats: Tensor, image: Tensor, lamps: int) -> Tensor:
-    """Solve Eq. (leastsq) for weights [L, C] of some lamps and light from around, as `estimate_weights` does.
+    """Solve Eq. (leastsq) for non-negative weights [L, C] of some lamps and light from around.
 
-    The lights after the first `lamps` are the light from around; it is as even, and all lights are as much of
+    Weights of scene-linear images [L, C, N] sum to an image [C, N], by iteratively reweighted least squares:
+    clipped, covered and misfitted elements lose weight. The lights after the first `lamps` are the light from around; it is as even, and all lights are as much of
     one colour, as the image allows.
     """
     count, even = len(olats), np.zeros((len(olats) - lamps, len(olats)))
