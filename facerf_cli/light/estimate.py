@@ -106,9 +106,9 @@ def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
 def estimate_lamps(olats: Tensor, image: Tensor, lamps: int) -> Tensor:
     """Solve Eq. (leastsq) for non-negative weights [L, C] of some lamps and light from around.
 
-    Weights of scene-linear images [L, C, N] sum to an image [C, N], by iteratively reweighted least squares:
-    clipped, covered and misfitted elements lose weight. The lights after the first `lamps` are the light from around; it is as even, and all lights are as much of
-    one colour, as the image allows.
+    Images [L, C, N], which are to sum to an image [C, N], are scene-linear. Iteratively reweighted least
+    squares: clipped, covered and misfitted elements lose weight. The lights after the first `lamps` are the
+    light from around; it is as even, and all lights are as much of one colour, as the image allows.
     """
     count, even = len(olats), np.zeros((len(olats) - lamps, len(olats)))
     even[:, lamps:] = np.eye(count - lamps) - 1 / (count - lamps)

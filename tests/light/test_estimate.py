@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from scipy.optimize import nnls
@@ -51,10 +52,8 @@ def flat(evidence: LightEvidence) -> tuple[torch.Tensor, torch.Tensor]:
 def free_weights(olats: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
     """Non-negative weights [L, 3] that nothing else holds."""
     pairs = zip(olats.unbind(1), image, strict=True)
-    solved = [
-        torch.from_numpy(nnls(lights.T.double().numpy(), one.double().numpy())[0]) for lights, one in pairs
-    ]
-    return torch.stack(solved, -1).float()
+    solved = [nnls(lights.T.double().numpy(), one.double().numpy())[0] for lights, one in pairs]
+    return torch.from_numpy(np.stack(solved, -1)).float()
 
 
 def test_the_plain_form_is_exact_where_lights_can_be_told_apart_even_if_they_are_negative() -> None:
@@ -128,9 +127,8 @@ def test_what_the_face_leaves_open_is_smooth_and_of_one_colour() -> None:
     weights = torch.tensor([0.3, 0.2, 0.1]) * (0.2 + (rig_directions(150)[:, 1:2] + 1))
     evidence = lit(shaded_ball(150), weights)
     found = evidence.least_squares()
-    own = free_weights(*flat(evidence))
     assert evidence.residual(evidence.relit(found)) < 0.05
-    assert (found - weights).norm() < 0.5 * (own - weights).norm()
+    assert (found - weights).norm() < 0.15 * weights.norm()
     colour = found / found.sum(1, keepdim=True)
     assert (colour - torch.tensor([0.5, 1 / 3, 1 / 6])).abs().mean() < 0.03
 
