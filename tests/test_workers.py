@@ -11,7 +11,7 @@ import pytest
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
-from facerf_cli.run.workers import Workers, in_order, spread
+from facerf_cli.run.workers import Workers, in_order, in_shards, spread
 
 
 def work(item: str) -> str:
@@ -95,3 +95,27 @@ def test_neighbours_go_to_one_process_and_outlive_another() -> None:
     found = list(spread(process_of, items, Workers(2, in_a_row=4), broken))
     assert len(set(found[:4])) == 1 and found[5] == "die: killed by SIGKILL"
     assert found[4] not in found[:4] and found[6].isdecimal() and found[6] == found[7]
+
+
+def _fail_or_wait(items: list[Path]) -> None:
+    if items[0].name == "fails":
+        raise ValueError("no")
+    time.sleep(60)
+    items[0].touch()
+
+
+def _write(items: list[Path]) -> None:
+    for path in items:
+        path.touch()
+
+
+def test_every_item_is_worked_on_once(tmp_path: Path) -> None:
+    paths = [tmp_path / str(i) for i in range(5)]
+    in_shards(_write, paths, 2)
+    assert all(path.exists() for path in paths)
+
+
+def test_an_error_ends_the_other_shards(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no"):
+        in_shards(_fail_or_wait, [tmp_path / "fails", tmp_path / "waits"], 2)
+    assert not (tmp_path / "waits").exists()

@@ -199,7 +199,6 @@ _FORMS = {
         ("aac", "mp3", "ac3", "alac", "pcm_s16le", "pcm_s24le"),
     ),
 }
-WRITTEN = frozenset(_FORMS)
 
 
 @dataclass(frozen=True)

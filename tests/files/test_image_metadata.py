@@ -128,7 +128,7 @@ def test_xmp_marks_a_display_image_as_synthetic(tmp_path: Path, suffix: str) -> 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
 def test_a_packet_is_added_without_the_file_in_memory(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a.{suffix}"
-    noise = np.random.default_rng(0).random((1200, 1600, 3), np.float32)
+    noise = np.random.default_rng(0).random((700, 900, 3), np.float32)
     write_tiff(path, noise) if suffix == "tif" else write_display(path, noise)
     size = path.stat().st_size
     tracemalloc.start()

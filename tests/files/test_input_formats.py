@@ -150,8 +150,9 @@ def by_pillow(levels: np.ndarray, path: Path, orientation: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
-@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize(
+    ("suffix", "orientation"), [("jpg", 3), ("jpg", 6), ("jpg", 8), ("png", 5), ("tif", 6), ("webp", 7)]
+)
 def test_exif_orientation_turns_a_photo_upright_once(tmp_path: Path, suffix: str, orientation: int) -> None:
     """A file is turned as EXIF says, and what is written of it needs no turning."""
     stored = np.full((24, 40, 3), 40, np.uint8)

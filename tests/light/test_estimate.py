@@ -1,3 +1,5 @@
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import torch
@@ -6,11 +8,14 @@ from scipy.optimize import nnls
 from facerf_cli.errors import InputError
 from facerf_cli.light.estimate import (
     LightEvidence,
+    RefineSettings,
     estimate_lamps,
     estimate_signed_weights,
     estimate_smooth_weights,
     lamp_error,
+    refine_light,
 )
+from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
 
 LIGHTS = 24
@@ -197,3 +202,110 @@ def test_the_error_of_a_lamp_is_least_where_it_is() -> None:
     image = 0.8 * grey[5] + 0.3 * grey.mean(0)
     errors = [lamp_error(lamp, grey.mean(0), image) for lamp in grey]
     assert errors[5] == min(errors) and errors[5] < 1e-6 < sorted(errors)[1]
+
+
+def edges(textures: torch.Tensor) -> Sequence[torch.Tensor]:
+    """Features of a kind: differences of neighbours, and the values a little."""
+    return [textures.diff(dim=-1), textures.diff(dim=-2), 0.1 * textures]
+
+
+def test_the_loss_falls_and_the_light_comes_nearer() -> None:
+    weights = some_weights()
+    evidence = lit(shaded_ball(), weights)
+    start = (weights + 0.05).roll(1, 1)
+    refined = refine_light(evidence, start, edges)
+    assert refined.loss_after < 0.2 * refined.loss_before
+    assert evidence.residual(evidence.relit(refined.weights)) < evidence.residual(evidence.relit(start))
+    assert (refined.weights >= 0).all() and refined.steps > 5
+
+
+def test_gradients_are_taken_where_the_caller_needs_none() -> None:
+    evidence = lit(shaded_ball(), some_weights())
+    with torch.no_grad():  # as in `facerf evaluate`
+        refined = refine_light(evidence, some_weights() + 0.1, edges)
+    assert refined.loss_after < refined.loss_before
+
+
+def test_a_start_that_is_best_is_given_back() -> None:
+    weights = some_weights()
+    evidence = lit(shaded_ball(), weights)
+    refined = refine_light(evidence, weights, edges)
+    assert torch.equal(refined.weights, weights) and refined.loss_after == refined.loss_before
+
+
+def test_steps_that_only_harm_give_the_start_back() -> None:
+    start = some_weights() + 0.01
+    evidence = lit(shaded_ball(), some_weights())
+    refined = refine_light(evidence, start, edges, settings=RefineSettings(steps=15, learning_rate=1e4))
+    assert torch.equal(refined.weights, start) and refined.loss_after == refined.loss_before > 0
+
+
+def test_it_ends_when_nothing_is_gained() -> None:
+    evidence = lit(shaded_ball(), some_weights())
+    settings = RefineSettings(steps=500, patience=5, settled=0.9)
+    assert refine_light(evidence, some_weights() + 0.1, edges, settings=settings).steps <= 10
+
+
+def test_signed_weights_may_stay_negative_and_the_others_may_not() -> None:
+    truth = some_weights() - 0.02
+    evidence = lit(shaded_ball(), truth)
+    signed = refine_light(evidence, some_weights(), edges, non_negative=False)
+    assert (signed.weights < 0).any()
+    assert (refine_light(evidence, some_weights(), edges).weights >= 0).all()
+
+
+def test_clipped_texels_and_those_beyond_the_mask_ask_for_nothing() -> None:
+    truth = some_weights() * 4
+    bright = lit(shaded_ball(), truth)
+    mask = bright.mask.clone()
+    mask[:6] = False
+    photo = bright.photo.clamp(max=1)
+    photo[:, :6] = 0.7  # hair
+    evidence = LightEvidence(bright.directions, bright.olats, photo, mask)
+    refined = refine_light(evidence, truth, edges)
+    assert refined.loss_before < 1e-9 and torch.equal(refined.weights, truth)
+
+
+def test_no_light_at_all_is_a_start_too() -> None:
+    evidence = lit(shaded_ball(), some_weights())
+    refined = refine_light(evidence, torch.zeros(LIGHTS, 3), edges)
+    assert refined.loss_after < refined.loss_before and refined.weights.isfinite().all()
+
+
+SEEN = torch.ones(16, 16)
+
+
+def _images() -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    explained = 0.3 + 0.4 * torch.rand(3, 16, 16, generator=generator)
+    return explained * (0.8 + 0.4 * torch.rand(3, 16, 16, generator=generator)), explained
+
+
+def test_under_the_photos_own_light_the_error_goes() -> None:
+    photo, explained = _images()
+    corrected = Quotient.of(photo, explained, SEEN).corrected(explained[None])[0]
+    assert (corrected - photo).norm() < 0.25 * (explained - photo).norm()
+
+
+def test_a_light_that_shades_otherwise_is_left_alone() -> None:
+    photo, explained = _images()
+    side = torch.zeros(1, 3, 16, 16)
+    side[..., :2] = 0.5
+    other = Quotient.of(photo, explained, SEEN).corrected(side)
+    assert torch.allclose(other, side, rtol=0.02)
+
+
+def test_texels_that_the_photo_does_not_show_are_left_alone_and_ratios_are_bounded() -> None:
+    photo, explained = _images()
+    seen = SEEN.clone()
+    seen[:8] = 0
+    quotient = Quotient.of(100 * photo, explained, seen)
+    assert (quotient.ratio[:, :8] == 1).all()
+    assert quotient.ratio.max() <= 3
+
+
+def test_black_and_larger_textures_stay_finite_and_keep_their_shape() -> None:
+    photo, explained = _images()
+    quotient = Quotient.of(torch.zeros_like(photo), torch.zeros_like(explained), SEEN)
+    corrected = quotient.corrected(torch.zeros(2, 3, 64, 64))
+    assert corrected.shape == (2, 3, 64, 64) and (corrected == 0).all()
