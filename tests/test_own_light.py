@@ -26,7 +26,7 @@ def models() -> Models:
 
 @pytest.fixture(scope="module")
 def face() -> FaceTexture:
-    head = fit_photo(models, astronaut.photo(), astronaut.face().landmarks_px)
+    head = fit_photo(astronaut.models(), astronaut.photo(), astronaut.face().landmarks_px)
     small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))
 

@@ -20,7 +20,7 @@ PHOTO = ROOT / "examples/astronaut.jpg"
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The names that the code of docs/python.md leaves, run from top to bottom."""
+    """The names that the code of docs/python.md leaves, run from top to bottom, with rigs of few lights."""
     folder = tmp_path_factory.mktemp("page")
     (folder / "examples").symlink_to(ROOT / "examples")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(), re.S)
@@ -28,6 +28,10 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     names: dict[str, Any] = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        of_map, estimate = facerf.Light.from_envmap, facerf.estimate_light
+        few = lambda envmap, rotate_deg=0.0, lights=24: of_map(envmap, rotate_deg, lights)  # noqa: E731
+        patch.setattr(facerf.Light, "from_envmap", staticmethod(few))
+        patch.setattr(facerf, "estimate_light", lambda models, head: estimate(models, head, lights=24))
         for block in blocks:
             exec(compile(block, "docs/python.md", "exec"), names)
     return names
