@@ -207,13 +207,9 @@ class Composition:
 
         The photo's background keeps its look at an exposure of `ev`; one that is given is `behind` [H, W, 3].
         """
-        photo = self._photo
-        if photo is None:
-            return {"rgb": self._rendered(relit), "A": self._mask}
-        person = self._relit_person(relit)
-        if self._target.background == "none":
-            return {"rgb": person, "A": self.matte}
-        gain = np.float32(2.0**-ev)
+        person, photo, gain = self._relit_pixels(relit), self._photo, np.float32(2.0**-ev)
+        if photo is None or self._target.background == "none":
+            return {"rgb": person, "A": self._share}
 
         def of(rows: slice) -> np.ndarray:
             pixels, matte = person(rows), self.matte[rows][..., None]
@@ -224,15 +220,19 @@ class Composition:
 
         return {"rgb": of}
 
-    def _rendered(self, relit: Relit) -> Band:
-        return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
-
     @property
     def _mask(self) -> Band:
         return self.view.in_frame(lambda rows: self.view.mask[rows])
 
-    def _relit_person(self, relit: Relit) -> Band:
-        """Pixels [H, W, 3], by rows, of the person, also where the matte leaves none of them."""
+    @property
+    def _share(self) -> Layer:
+        """Share [H, W] of the frame that is relit."""
+        return self._mask if self._photo is None else self.matte
+
+    def _relit_pixels(self, relit: Relit) -> Band:
+        """Pixels [H, W, 3], by rows, of the person or the face alone, also where its share leaves none."""
+        if self._photo is None:
+            return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
         assert self.surround is not None and relit.surround is not None
         around = self.surround.over_photo(self.own, relit.surround, self._display_ev)
         detail, view = self._detail.relit(self.own, relit.texture), self.view
@@ -262,15 +262,12 @@ class Composition:
             own = mask(rows) if person is None else person.matte[rows]
             return np.minimum(self.matte[rows], own)
 
-        return self._relit_person(relit), share
+        return self._relit_pixels(relit), share
 
     def light_layer(self, relit: Relit) -> Band:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""
-        if self._photo is None:
-            rendered, mask = self._rendered(relit), self._mask
-            return lambda rows: rendered(rows) * mask(rows)[..., None]
-        pixels = self._relit_person(relit)
-        return lambda rows: pixels(rows) * self.matte[rows][..., None]
+        pixels, share = self._relit_pixels(relit), by_rows(self._share)
+        return lambda rows: pixels(rows) * share(rows)[..., None]
 
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
@@ -436,7 +433,6 @@ class GroupComposition:
 
     def __init__(self, compositions: Sequence[Composition]) -> None:
         self._first, *self._others = compositions
-
         self.size_px = self._first.size_px
         self.nbytes = sum(one.nbytes for one in compositions)
 
