@@ -55,6 +55,8 @@ def ict_source(shared_data: Path) -> SourceModel:
         for member in tar:
             if Path(member.name).stem in wanted and "FaceXModel/" in member.name:
                 raw[Path(member.name).stem] = tar.extractfile(member).read()
+                if len(raw) == len(wanted):
+                    break
     return ict_source_of(archive, raw)
 
 

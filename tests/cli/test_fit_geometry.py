@@ -93,18 +93,14 @@ def test_the_overlay_is_the_photo_but_for_the_face(fitted: Path) -> None:
     assert np.percentile(corner, 90) < 1.1 * np.percentile(corner, 10)  # the same but for its exposure
 
 
-def test_two_faces_each_get_their_files(landmarks: Path, tmp_path: Path) -> None:
+def test_two_faces_each_get_their_files(tmp_path: Path) -> None:
     photo = read_image(PHOTO).pixels
-    write_display(tmp_path / "two.png", np.concatenate([photo[:, 60:400], photo[:, 60:400]], 1))
+    write_display(tmp_path / "two.png", np.concatenate([photo[:300, 60:400]] * 2, 1))
     assert main(["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o"), "--face", "all"]) == 0
     row = json.loads((tmp_path / "o" / "report.jsonl").read_text())
     assert set(row["outputs"]) == {f"two_face{n}{ending}" for n in (0, 1) for ending in ENDINGS}
     left, right = (load_fit(tmp_path / "o" / f"two_face{n}_fit.npz").crop.x0_px for n in (0, 1))
     assert abs(right - left - 340) < 10 and len(row["faces"]) == 2
-    line = ["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o2"), "--face"]
-    assert main([*line, "1"]) == 0
-    assert load_fit(tmp_path / "o2" / "two_fit.npz").crop.x0_px == right
-    assert main([*line, "2", "--overwrite", "always"]) == 1
 
 
 def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
@@ -126,9 +122,3 @@ def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
         assert "astronaut" in err and message in err and "Traceback" not in err and "unexpected" not in err
     assert main([*line, str(tmp_path / "none")]) == 2
     assert not (tmp_path / "o").exists()
-
-
-def test_the_fit_is_of_the_named_face_model(fitted: Path) -> None:
-    fit = fit_of(fitted)
-    model = load_face_model("builtin")
-    assert fit.vertices_camera(model).shape == (len(model.mean), 3)

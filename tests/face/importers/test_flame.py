@@ -3,6 +3,7 @@
 import io
 import pickle
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ def face() -> Head:
     return head(ROWS, COLUMNS, LOOSE)
 
 
-def tables(face: Head, shapes_count: int = 400) -> dict[str, Any]:
+def tables(face: Head, shapes_count: int = 302) -> dict[str, Any]:
     """The arrays of `generic_model.pkl`; its jaw hangs below the lips and turns about an axis in the head."""
     shapes = np.zeros((5023, 3, shapes_count))
     shapes[..., :2] = np.moveaxis(face.shapes, 0, -1)[..., :2]
@@ -102,14 +103,14 @@ def test_its_arrays_are_read_in_metres_and_deviations(source: SourceModel, face:
     assert source.name == "flame" and "Max-Planck" in source.licence
     np.testing.assert_allclose(source.mean, face.mean)
     assert source.triangles.shape == (TRIANGLES, 3)
-    assert source.identity.shape == (300, 5023, 3) and source.expression.shape == (103, 5023, 3)
+    assert source.identity.shape == (300, 5023, 3) and source.expression.shape == (5, 5023, 3)
     np.testing.assert_allclose(source.identity[:2], face.shapes[:2], atol=1e-8)
     np.testing.assert_allclose(source.expression[0], face.shapes[0] / 2, atol=1e-8)
-    assert source.expression_names[0] == "expression_000" and source.expression_names[100] == "jaw_open"
+    assert source.expression_names[0] == "expression_000" and source.expression_names[2] == "jaw_open"
 
 
 def test_the_jaw_opens_about_its_joint(source: SourceModel, face: Head) -> None:
-    opened = source.expression[100]
+    opened = source.expression[2]
     chin = np.linalg.norm(face.mean - face.landmarks[8], axis=-1).argmin()
     x, y, z = face.mean[chin] - face.mean[5000]
     turned = [x, y * np.cos(0.1) - z * np.sin(0.1), y * np.sin(0.1) + z * np.cos(0.1)]
@@ -134,9 +135,9 @@ def test_an_import_reproduces_the_mesh(source: SourceModel, face: Head, tmp_path
     found = landmarks_of(source)
     off = 1000 * np.linalg.norm(found - face.landmarks, axis=-1)
     assert off.mean() < 0.8 and off.max() < 2.0  # without an embedding
-    model = resample_model(source)
+    model = resample_model(replace(source, identity=source.identity[:2]))
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
-    assert model.identity.shape[0] == 300 and model.expression.shape[0] == 103
+    assert model.identity.shape[0] == 2 and model.expression.shape[0] == 5
     save_face_model(tmp_path / "flame.npz", model)
     again = load_face_model(tmp_path / "flame.npz")
     assert again.name == "flame" and again.expression_names[-3:] == ("jaw_open", "jaw_turn", "jaw_roll")
@@ -179,7 +180,7 @@ def test_a_table_of_arrays_is_as_good_as_a_pickle(face: Head, source: SourceMode
     again = read_flame(tmp_path)
     np.testing.assert_array_equal(again.mean, source.mean)
     np.testing.assert_array_equal(again.identity, source.identity)
-    assert len(again.expression) == 100  # no skeleton, no jaw
+    assert len(again.expression) == 2  # no skeleton, no jaw
 
 
 def test_without_a_jaw_the_expressions_open_the_mouth(face: Head, tmp_path: Path) -> None:
@@ -204,17 +205,14 @@ def changed(face: Head, **changes: Any) -> dict[str, Any]:
 
 BROKEN: dict[str, tuple[Callable[[Head], Any], str]] = {
     "no mean": (lambda face: changed(face, v_template=None), "it lacks 'v_template'"),
-    "no shapes": (lambda face: changed(face, shapedirs=None), "it lacks 'shapedirs'"),
     "shapes of another mesh": (lambda face: changed(face, shapedirs=np.zeros((9, 3, 2))), r"shape \[9, 3"),
     "too many": (lambda face: changed(face, shapedirs=np.zeros((5023, 3, 501), "f2")), "shapedirs has"),
     "text for numbers": (lambda face: changed(face, shapedirs="many"), "a str stands where numbers"),
-    "a flat mean": (lambda face: changed(face, v_template=np.zeros(15069)), "its mean has shape"),
     "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "not finite"),
     "triangles beyond": (lambda face: changed(face, f=np.array([[0, 1, 9999]])), "does not have"),
     "another skeleton": (lambda face: changed(face, weights=np.zeros((5023, 9))), r"shape \[5023, 9\]"),
     "a list": (lambda face: [1, 2], "holds a list"),
     "millimetres": (lambda face: changed(face, v_template=face.mean * 1000), "the unit of its"),
-    "one point": (lambda face: changed(face, v_template=face.mean * 0), "the unit of its"),
 }
 
 

@@ -170,28 +170,15 @@ def cut(path: Path) -> Path:
 
 HOSTILE = {
     "not there": (lambda t: t / "none.zip", "folder, or its .zip"),
-    "a picture": (lambda t: (t / "a.png").write_bytes(b"\x89PNG") and t / "a.png", "folder, or its .zip"),
     "an empty folder": (lambda t: t, "no FaceXModel"),
-    "an empty zip": (lambda t: zipped(t / "a.zip"), "no FaceXModel"),
     "no neutral mesh": (lambda t: zipped(t / "a.zip", jawOpen=obj()), "no FaceXModel"),
-    "no shapes": (lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj()), "are missing"),
     "a short mesh": (
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(10), identity000=obj()),
         "10 vertices",
     ),
-    "words for numbers": (
-        lambda t: zipped(t / "a.zip", generic_neutral_mesh=b"v one two three\n"),
-        "damaged",
-    ),
     "faces beyond the vertices": (
         lambda t: zipped(
             t / "a.zip", generic_neutral_mesh=obj(face=b"f 1 2 99999\n"), identity000=obj(), jawOpen=obj()
-        ),
-        "faces are damaged",
-    ),
-    "a face of words": (
-        lambda t: zipped(
-            t / "a.zip", generic_neutral_mesh=obj(face=b"f a b c\n"), identity000=obj(), jawOpen=obj()
         ),
         "faces are damaged",
     ),
@@ -204,16 +191,10 @@ HOSTILE = {
         "largest side is 0 mm",
     ),
     "a bomb": (lambda t: zipped(t / "a.zip", generic_neutral_mesh=bytes(65 << 20)), "too large"),
-    "a damaged zip": (
-        lambda t: damaged(zipped(t / "a.zip", generic_neutral_mesh=noise(200_000)), 0.5),
-        "cannot be read",
-    ),
     "a damaged xz": (
         lambda t: damaged(tarred(t / "a.tar.xz", "w:xz", noise(200_000)), 0.5),
         "cannot be read",
     ),
-    "a cut xz": (lambda t: cut(tarred(t / "a.tar.xz", "w:xz", noise(200_000))), "cannot be read"),
-    "a cut gz": (lambda t: cut(tarred(t / "a.tar.gz", "w:gz", noise(200_000))), "cannot be read"),
     "a cut tar": (lambda t: cut(tarred(t / "a.tar", "w", noise(200_000))), "cannot be read"),
 }
 
@@ -224,10 +205,3 @@ def test_what_is_not_ict_facekit_is_refused_in_one_line(case: str, tmp_path: Pat
     with pytest.raises(InputError, match=message) as refused:
         import_face_model("ict-facekit", make(tmp_path))
     assert str(tmp_path) in str(refused.value) and "\n" not in str(refused.value)
-
-
-def test_an_archive_that_asks_for_too_much_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    path = zipped(tmp_path / "a.zip")
-    monkeypatch.setattr(zipfile.ZipFile, "namelist", lambda _: bytearray(1 << 62))
-    with pytest.raises(InputError, match="MemoryError"):
-        import_face_model("ict-facekit", path)
