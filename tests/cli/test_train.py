@@ -128,6 +128,16 @@ def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
             "--appearance-features: takes the place of --vgg-weights; give one of them",
         ),
         (["--max-time", "0s"], "--max-time 0s: not a time; write a number and s, m or h, such as 45m"),
+        (
+            ["--checkpoint", str(SHIPPED["parsing"])],
+            f"--checkpoint {SHIPPED['parsing']}: holds a Parsing Network, but facerf train --stage "
+            "reflectance uses no network; leave it out",
+        ),
+        (
+            ["--checkpoint", str(SHIPPED["portrait"])],
+            f"--checkpoint {SHIPPED['portrait']}: holds a Portrait Network, but facerf train uses the "
+            "Parsing Network",
+        ),
         (["--heads", "13"], "--heads 13: the mean face and 12 heads are held out; give more"),
     ],
 )
