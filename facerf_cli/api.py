@@ -227,7 +227,7 @@ def relight(
     photo, rig = _checked(photo), light._rig()
     if not np.allclose(head.fit.crop.apply(photo), head.cropped, rtol=0, atol=_ALIKE * head.cropped.max()):
         raise ValueError("photo is not the one that the head was fitted in; fit it again")
-    pixels = _Photo(hashlib.blake2b(photo).digest(), photo)
+    pixels = _Photo(hashlib.blake2b(photo.data).digest(), photo)
     with torch.no_grad():
         image = _person(models, pixels, head, reflectance, network_alone).image(rig, target)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])

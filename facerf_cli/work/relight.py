@@ -388,9 +388,10 @@ def _rendered(
     share = layers.get("person.A") if keeps else None
     for part in batches(len(setup.names), composer.nbytes):
         some = scene.apart(replace(setup, lights=setup.lights[part]))
-        for name, one in zip(setup.names[part], composer.relit(some), strict=True):
+        each: Iterator[Any] = composer.relit(some)
+        for name, one in zip(setup.names[part], each, strict=True):
             layers |= filled({name: composer.light_layer(one)}, *size_px, empty)
-        del one  # before others are relit
+        del each, one  # before others are relit
     return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share)
 
 
