@@ -181,7 +181,7 @@ class BatchOptions:
         "Process this many items at a time.",
         in_recipe=False,
         flags=("--jobs", "-j"),
-        shown_default="1; with --ray one a processor",
+        shown_default="1",
         least=1,
         panel=BATCH,
     )

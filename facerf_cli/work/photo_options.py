@@ -43,7 +43,7 @@ def network_alone_option() -> Any:
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """How the field of a photo is made."""
+    """The making of the field of a photo."""
 
     network_alone: bool = network_alone_option()
 
@@ -129,7 +129,7 @@ class PhotoOptions:
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """How the light is solved for."""
+    """The solution for the light."""
 
     non_negative: bool = option(
         True,

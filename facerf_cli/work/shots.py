@@ -27,7 +27,7 @@ _DIGITS = 4  # of a film's frame numbers, or more
 
 @dataclass(frozen=True)
 class ShotOptions:
-    """Which inputs are the frames of one shot."""
+    """The inputs that are the frames of one shot."""
 
     sequence: bool = option(
         False,

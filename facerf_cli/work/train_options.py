@@ -32,7 +32,7 @@ def _seconds(text: str) -> float:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """What is trained, on what, by which losses."""
+    """The networks that are trained, their data and losses."""
 
     settings: Settings
     output: Path = option(
@@ -177,7 +177,7 @@ class TrainOptions:
 
 @dataclass(frozen=True)
 class PaceOptions:
-    """How long and how fast a run trains; None is the preset's."""
+    """Length and speed of a run; None is the preset's."""
 
     learning_rate: float | None = option(
         None,

@@ -61,7 +61,7 @@ def test_paragraphs_fill_the_width() -> None:
 def test_man_pages_have_the_panels_as_subsections() -> None:
     page = manual.pages()["facerf-estimate-light.1"]
     panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
-    assert panels == ["Light", "Method", "Face", "Image", "Batch"]
+    assert panels == ["Light", "Image", "Face", "Method", "Batch"]
     top = manual.pages()["facerf.1"]
     assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
 
