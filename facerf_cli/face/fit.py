@@ -366,7 +366,7 @@ def load_fit(path: Path) -> FaceFit:
     require_regular(path, "fit the photo again")
     try:
         return fit_from_arrays(read_npz(path, _MOST_ARRAY_BYTES))
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         raise InputError(f"{path}: not a fit that facerf wrote ({error}); fit the photo again") from None
 
 

@@ -148,7 +148,7 @@ def _read(path: Path) -> MorphableModel:
         )
     try:
         return _from_arrays(path, read_npz(path))
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
         raise InputError(
             f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"

@@ -5,10 +5,10 @@ hair and head come from it; what it gets wrong, the Portrait Network corrects. I
 that explains the photo best is a first guess of the photo's light, from which that network starts.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +44,6 @@ _SURE = 0.8  # share of skin, and cover of the proxy, of the pixels that are exp
 _RIDGE = 0.05  # of the weights, per root of the number of pixels: many lights explain a photo alike
 _LEAST_PIXELS = 30
 _BRIGHTEST = 3.0  # over the mean: clipped, so that highlights count little
-# From origins [N, 3] to directions [3] or [N, 3] of a light's middle, and to distances [N] of a near one.
-_Light = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,18 +147,21 @@ class Shadows:
 
     def along(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights from camera-space directions [L, 3] that arrives."""
-        return self._reached([partial(_along, direction) for direction in directions.numpy()])
+        return self._reached([(direction, None) for direction in directions.numpy()])
 
     def toward(self, places_m: Tensor) -> Tensor:
         """Share [P, s, s] of lights at camera-space places [P, 3] that arrives."""
-        return self._reached([partial(_toward, place) for place in places_m.numpy()])
+        offsets = places_m.numpy()[:, None] - self.origins  # [P, N, 3]
+        distances_m = np.linalg.norm(offsets, axis=2)
+        rays = offsets / distances_m[..., None].clip(min=1e-6)
+        return self._reached(list(zip(rays, distances_m, strict=True)))
 
-    def _reached(self, lights: Sequence[_Light]) -> Tensor:
-        """Visibility [L, s, s] of lights, each given by the rays from origins to it."""
+    def _reached(self, lights: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> Tensor:
+        """Visibility [L, s, s] of lights, each given by unit rays [3] or [N, 3] to it and distances [N]."""
         found = np.zeros((len(lights), *self._inside.shape), np.float32)
 
-        def trace(number: int, light: _Light) -> None:
-            axis, reach_m = light(self.origins)
+        def trace(number: int, light: tuple[np.ndarray, np.ndarray | None]) -> None:
+            axis, reach_m = light
             rays = (on_disc(axis, places) for places in self._places)
             blocked = [occluded(self._scene, self.origins, ray, reach_m) for ray in rays]
             found[number, self._inside] = 1 - np.mean(blocked, 0)
@@ -169,17 +170,6 @@ class Shadows:
             list(threads.map(trace, range(len(lights)), lights))
         filled = inpaint(torch.from_numpy(found), self.covered)
         return blurred(filled, _SOFT_PX)
-
-
-def _along(direction: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, None]:
-    return direction, None
-
-
-def _toward(place_m: np.ndarray, origins: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions [N, 3] from origins [N, 3] to a place [3], and its distances [N]."""
-    offsets = place_m - origins
-    distances_m = np.linalg.norm(offsets, axis=1)
-    return offsets / distances_m[:, None].clip(min=1e-6), distances_m
 
 
 def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) -> Tensor:

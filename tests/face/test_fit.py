@@ -201,10 +201,12 @@ def test_a_fit_survives_its_file(model, tmp_path):
     assert torch.equal(again.vertices_camera(model), fit.vertices_camera(model))
 
 
-def test_what_is_no_fit_is_refused(tmp_path):
+def test_what_is_no_fit_is_refused(model, tmp_path):
     (tmp_path / "text.npz").write_text("hello")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    for name in ("text.npz", "other.npz", "missing.npz"):
+    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
+    np.savez(tmp_path / "endless.npz", **fit_to_arrays(fit) | {"size_px": np.inf})
+    for name in ("text.npz", "other.npz", "endless.npz", "missing.npz"):
         with pytest.raises(InputError, match=name):
             load_fit(tmp_path / name)
 

@@ -71,6 +71,7 @@ CHANGES = {
     "a number for a mean": lambda a: a.update(head_mean=np.float32(1)),
     "words": lambda a: a.update(head_mean=np.full((4, 3), "x")),
     "too many vertices": lambda a: a.update(head_mean=np.zeros((60_001, 3), np.float32)),
+    "an endless layout version": lambda a: a.update(layout_version=np.inf),
     "two layout versions": lambda a: a.update(layout_version=np.array([1, 1])),
     "too large": lambda a: a.update(head_uv=np.zeros((1 << 19, 2, 50), np.float32)),
 }
