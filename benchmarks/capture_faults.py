@@ -32,7 +32,6 @@ from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding
 from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
 from facerf_cli.files.images import read_image
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults
 _PLACE = 3  # of the faulty light among those in front
@@ -107,7 +106,7 @@ class Copy:
     def findings(self) -> list[Finding]:
         """Check the copy."""
         self.save()
-        return check_subject(read_capture(self.folder), self.subject, SHIPPED_NETWORKS)
+        return check_subject(read_capture(self.folder), self.subject)
 
 
 Plant = Callable[[Copy], Sequence[str]]
@@ -268,16 +267,6 @@ def encoded(exponent: float) -> Change:
     return lambda pixels: np.maximum(pixels, 0) ** (1 / exponent)
 
 
-def with_full(exponent: float) -> Plant:
-    """Encode all frames, and add one under all lights."""
-
-    def plant(copy: Copy) -> Sequence[str]:
-        copy.write("full", sum(copy.read(light) for light in copy.ids) ** (1 / exponent))
-        return every(encoded(exponent))(copy)
-
-    return plant
-
-
 def clipped(share: float) -> Plant:
     """Clip all frames where the most frontal one has a share of its pixels above."""
 
@@ -332,7 +321,6 @@ FAULTS = (
     Fault("two fields", "of neighbours", ("fields",), woven(Copy.near)),
     Fault("two fields", "of lights far apart", ("fields",), woven(Copy.far)),
     *(Fault("gamma", f"{exponent}", ("gamma",), every(encoded(exponent))) for exponent in (1.4, 1.8, 2.2)),
-    Fault("gamma, with a full-on frame", "1.2", ("gamma",), with_full(1.2)),
     *(Fault("head moves in a third", f"{px} px", ("motion",), moved(px)) for px in (1, 2, 3, 4)),
 )
 

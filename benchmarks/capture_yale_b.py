@@ -26,7 +26,6 @@ from facerf_cli.capture.findings import Finding, frames_left_out
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, read_shifts
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 _SET_ON = ("yaleB05", "yaleB15", "yaleB22")  # subjects on which the thresholds were set
 _MARGIN_PX = 8  # left out of the sharpness, where shifted frames end
@@ -42,7 +41,7 @@ def main() -> None:
     folder = required(given.data, "Extended Yale B", "--data", YALE_B)
     capture = read_capture(folder, ReadSettings("extended-yale-b"))
     subjects = [name for name in capture.subjects if name in (given.subjects or capture.subjects)]
-    found = {subject: check_subject(capture, subject, SHIPPED_NETWORKS) for subject in subjects}
+    found = {subject: check_subject(capture, subject) for subject in subjects}
     report_broken(capture, "thresholds set on", {name: found[name] for name in subjects if name in _SET_ON})
     report_broken(capture, "others", {name: found[name] for name in subjects if name not in _SET_ON})
     print("findings:", dict(Counter(finding.check for findings in found.values() for finding in findings)))

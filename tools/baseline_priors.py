@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines.priors import ASSET, SIDE, LightPrior, LogGaussian
+from facerf_cli.baselines.synthesis import ASSET, SIDE, LightPrior, LogGaussian
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
 from facerf_cli.network.checkpoint import save_checkpoint

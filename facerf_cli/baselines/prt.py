@@ -4,14 +4,15 @@ The assumption is that of Schneider et al. (*Efficient Global Illumination for M
 on this project's fitted mesh and priors; their code and models are not used. They learn the transfer of a
 morphable model; here the transfer of each mesh is baked. It is kept in the user's cache for the next run:
 
-    CACHE/transfer/KEY.npy   [2, K, t, t] float16; KEY is the digest of the mesh and of the bake's settings
+    CACHE/transfer/KEY.npy   [2, K, t, t] float16; KEY is that of the recipe: the mesh and the bake's settings
 """
 
 import hashlib
 import logging
 import math
 import os
-from dataclasses import asdict, dataclass
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,48 +22,51 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
-from facerf_cli.baselines.priors import SIDE, light_prior, skin_prior
 from facerf_cli.baselines.synthesis import (
     DETAIL,
+    SIDE,
     Scene,
     SolveSettings,
     coarse,
     light_given,
+    light_prior,
     shrunk,
+    skin_prior,
     solve,
     with_detail,
 )
+from facerf_cli.batch.made_from import Recipe, key_of, recipe_of
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import GRID, LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import cache_folder
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated, sh_basis
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.models import Models
-from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 
 _ROUNDS = 2  # of estimating the mean albedo of the face, which tints the bounce
 _MOST_BYTES = 256 << 20  # of the cache: beyond it the files that were not used for longest are removed
-_VERSION = 1  # of the bake; a change leaves older files in the cache unused
 
 
 @dataclass(frozen=True)
 class TransferSettings:
     """Order of the harmonics, `side` in texels, number of area `lights`, each as wide as its cell.
 
-    `lamp_samples` and `bounce_samples` are rays per texel for a light and for the bounce.
+    `light_samples` and `bounce_samples` are rays per texel for a light and for the bounce.
     """
 
     order: int = 4
     side: int = 128
     lights: int = 200
-    lamp_samples: int = 4  # this name is part of the cache's keys
+    light_samples: int = 4
     bounce_samples: int = 16
     blur_texels: float = 1.0  # removes the noise of few samples
 
@@ -136,7 +140,7 @@ def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Pat
     Times the coefficients of a light they give the radiance of a white diffuse face: [0] direct, with its own
     shadows, and [1] after one bounce off a face of albedo 1.
     """
-    path = (cache or cache_folder() / "transfer") / f"{_key(vertices_head, settings)}.npy"
+    path = (cache or cache_folder() / "transfer") / f"{key_of(_recipe(vertices_head, settings))}.npy"
     kept = _read(path, settings)
     if kept is not None:
         return kept
@@ -162,7 +166,7 @@ def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
         vertices_head.numpy(),
         grid_triangles().numpy(),
         directions.numpy(),
-        BakeSettings(settings.lamp_samples, cell_deg, settings.bounce_samples),
+        BakeSettings(settings.light_samples, cell_deg, settings.bounce_samples),
     )
     cosines = torch.einsum("lc,ijc->lij", directions, normals).clamp_min(0)
     direct = torch.from_numpy(transport.visibility) * cosines
@@ -174,10 +178,10 @@ def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
     return torch.from_numpy(gaussian_filter(transfer, (0, 0, blur, blur), mode="nearest"))
 
 
-def _key(vertices_head: Tensor, settings: TransferSettings) -> str:
+def _recipe(vertices_head: Tensor, settings: TransferSettings) -> Recipe:
     rounded_um = np.round(vertices_head.double().numpy() * 1e6).astype(np.int64)
-    bake = json_line({"version": _VERSION, "layout": LAYOUT_VERSION, **asdict(settings)})
-    return hashlib.sha256(bake.encode() + rounded_um.tobytes()).hexdigest()[:32]
+    mesh = hashlib.sha256(rounded_um.tobytes()).hexdigest()
+    return recipe_of(settings, file_sha256) | {"mesh": mesh, "layout": LAYOUT_VERSION}
 
 
 def _read(path: Path, settings: TransferSettings) -> Tensor | None:
@@ -200,11 +204,9 @@ def _remove_oldest(newest: Path) -> None:
     """
     found = []
     for path in newest.parent.glob("*.npy"):
-        try:
-            facts = path.stat()
-            found.append((facts.st_mtime_ns, facts.st_size, path))
-        except OSError:
-            continue
+        with suppress(OSError):
+            state = path.stat()
+            found.append((state.st_mtime_ns, state.st_size, path))
     total = sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
         if total <= _MOST_BYTES or path == newest:

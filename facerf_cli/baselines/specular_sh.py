@@ -17,14 +17,16 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
-from facerf_cli.baselines.priors import SIDE, light_prior, skin_prior
 from facerf_cli.baselines.synthesis import (
     DETAIL,
+    SIDE,
     Scene,
     SolveSettings,
     coarse,
     light_given,
+    light_prior,
     shrunk,
+    skin_prior,
     solve,
     with_detail,
 )

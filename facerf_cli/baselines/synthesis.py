@@ -5,17 +5,29 @@ spherical-harmonic coefficients of the light, and the transfers, linear in x, ho
 Albedo, gloss and light, as coordinates of Gaussian priors, are found together by damped Gauss-Newton steps
 (Blanz and Vetter, *A Morphable Model for the Synthesis of 3D Faces*, 1999, optimise them likewise). Texels
 that the priors cannot explain (hair, glasses, clipped highlights) lose influence by a Cauchy weight.
+
+The methods with which the paper compares use a morphable model of albedo (the same; with specular albedo:
+Smith et al., *A Morphable Face Albedo Model*, 2020). Here it is replaced by the principal components of
+logarithms of albedo and gloss in UV space, learnt from procedural skins: albedo stays positive, and the
+colour and strength of a light only add to it. The prior of light is learnt from procedural envmaps.
+`tools/baseline_priors.py` learns both; they ship as an asset, so that every machine has the same.
 """
 
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.baselines.priors import SIDE, LightPrior, LogGaussian
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import region_mask
+from facerf_cli.network.checkpoint import load_checkpoint
+
+SIDE = 64  # texels of the priors of skin; finer detail is individual
+ASSET = Path(__file__).parents[1] / "assets" / "baseline_priors.safetensors"
+_LEAST_SPREAD = 1e-3  # of a mode of light, relative to the first: below it a mode is rounding error
 
 DETAIL = 0.5  # share of the photo's residual that is added to the albedo
 _SEEN = 0.5  # visible share of a coarse texel from which on it counts
@@ -24,6 +36,58 @@ _SHADOW_FLOOR = 0.15  # share of the mean shading: in darker shadow less of the 
 _MOST_DETAIL = 1.5  # bound of the residual's logarithm
 _FIRM_STEPS = 3  # before outliers are found by their errors
 _OUTLIER = 2.0  # median errors at which a texel's weight is halved
+
+
+@dataclass(frozen=True, eq=False)
+class LogGaussian:
+    """Logarithm of a texture: mean [C, t, t] plus standard normal coordinates times modes [Q, C, t, t]."""
+
+    mean: Tensor
+    modes: Tensor
+
+    def at(self, coordinates: Tensor, side: int) -> Tensor:
+        """The logarithm [C, T, T] at coordinates [Q], resampled to `side` texels."""
+        field = self.mean + (coordinates.to(self.modes) @ self.modes.flatten(1)).view_as(self.mean)
+        return F.interpolate(field[None], (side, side), mode="bilinear", align_corners=False)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class SkinPrior:
+    """Diffuse albedo [3, t, t], linear Rec.709, and gloss: reflectance at normal incidence [1, t, t]."""
+
+    diffuse: LogGaussian
+    gloss: LogGaussian
+
+
+@dataclass(frozen=True, eq=False)
+class LightPrior:
+    """Coefficients of a light (`light/sh.py`): mean [K, 3] plus standard normals times modes [R, K, 3]."""
+
+    mean: Tensor
+    modes: Tensor
+
+
+@cache
+def skin_prior() -> SkinPrior:
+    """Load the shipped prior of skin."""
+    tensors, _ = load_checkpoint(ASSET)
+    return SkinPrior(
+        LogGaussian(tensors["diffuse.mean"], tensors["diffuse.modes"]),
+        LogGaussian(tensors["gloss.mean"], tensors["gloss.modes"]),
+    )
+
+
+@cache
+def light_prior(order: int) -> LightPrior:
+    """Load the shipped prior of light, truncated to an order up to that of the asset; R <= 3 K."""
+    tensors, _ = load_checkpoint(ASSET)
+    count = (order + 1) ** 2
+    mean, modes = tensors["light.mean"], tensors["light.modes"]
+    if count > len(mean):
+        raise ValueError(f"the prior has {len(mean)} coefficients, not {count}")
+    _, spread, rotated = torch.linalg.svd(modes[:, :count].flatten(1), full_matrices=False)
+    kept = spread > _LEAST_SPREAD * spread[0]
+    return LightPrior(mean[:count], (spread[kept, None] * rotated[kept]).view(-1, count, 3))
 
 
 @dataclass(frozen=True)

@@ -83,6 +83,12 @@ def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
     return recipe
 
 
+def key_of(recipe: Recipe) -> str:
+    """A short digest of a recipe, by which outputs and cached files name it."""
+    text = json.dumps(recipe, sort_keys=True)
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]
+
+
 def differences(old: Recipe, new: Recipe) -> str:
     """Say which options of a recipe changed, as they are typed; empty if none did."""
     parts = []
@@ -259,7 +265,7 @@ class FolderIndex:
 
     def want(self, recipes_of: RecipesOf) -> None:
         """Judge outputs by other recipes from now on."""
-        self._wanted = [(_key(recipe), recipe) for recipe in recipes_of(self.digest_of)]
+        self._wanted = [(key_of(recipe), recipe) for recipe in recipes_of(self.digest_of)]
 
     def digest_of(self, path: Path) -> str:
         """SHA-256 of a file; an unchanged one that the index knows is not read. Raises InputError."""
@@ -364,8 +370,3 @@ class FolderIndex:
 
 def _state(state: os.stat_result) -> dict[str, int]:
     return {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "inode": state.st_ino}
-
-
-def _key(recipe: Recipe) -> str:
-    text = json.dumps(recipe, sort_keys=True)
-    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]

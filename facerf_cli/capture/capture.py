@@ -72,6 +72,10 @@ def correct_colours(charts: Iterable[ChartCorrection], camera: str, linear: np.n
     return linear
 
 
+class FrameSizeError(InputError):
+    """A frame is not of its camera's size."""
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """Description of a capture, axes as in raster/camera.py; no image is read until `frame` is called."""
@@ -105,13 +109,14 @@ class Capture:
 
         The colour chart's correction and the shift of the frame are applied. NaN and infinite values become
         0, with a warning. Values below the black level, from noise or a wide gamut, stay negative here so
-        that sums have no bias. InputError for a file that cannot be read or is not of the camera's size.
+        that sums have no bias. InputError for a file that cannot be read, FrameSizeError for one that has not
+        the camera's size.
         """
         path = self.frame_path(subject, camera, self.light_ids[light])
         pixels = read_frame(path, self.colour_space)
         posed = self.cameras[camera]
         if pixels.shape[:2] != (posed.height_px, posed.width_px):
-            raise InputError(
+            raise FrameSizeError(
                 f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but camera {camera} has "
                 f"{posed.width_px} x {posed.height_px}; give frames of one size, or correct the camera"
             )

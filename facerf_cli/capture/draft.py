@@ -14,7 +14,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -60,31 +60,17 @@ ListedLight = tuple[str, Direction]  # name of an image, empty in a list without
 Key = tuple[str, str, str]  # subject, camera and light; empty where the pattern does not name them
 
 
-@dataclass
-class Scan:
-    """Files below a folder, as paths with / between names."""
-
-    images: list[str] = field(default_factory=list)
-    lists: list[str] = field(default_factory=list)  # lists of lights, the uppermost first
-    unreadable: list[str] = field(default_factory=list)  # folders
-
-
 @dataclass(frozen=True)
 class Frames:
     """Images sorted by a pattern."""
 
     paths: dict[Key, str]
     ambient: Counter[str]  # names in the light's place of images without lights
-    strays: list[str]  # images that do not match the pattern
-    unnameable: list[str]  # ids that cannot be parts of file names
+    strays: list[str]  # images that do not match the pattern, or whose ids cannot be parts of file names
 
     def ids(self, field: str) -> list[str]:
         """Ids of all subjects, cameras or lights, numbers in their natural order: 2 before 10."""
         return sorted({key[FIELDS.index(field)] for key in self.paths}, key=_natural_order)
-
-    def of_camera(self, camera: str) -> list[str]:
-        """Paths of a camera's frames."""
-        return [path for key, path in self.paths.items() if key[1] == camera]
 
     @property
     def expected(self) -> int:
@@ -109,19 +95,22 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> d
     """
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a capture")
-    scan, chosen = scan_folder(folder, suffixes), pattern
-    if not scan.images:
+    images, lists = scan_folder(folder, suffixes)
+    if not images:
         raise UsageError(f"{folder}: no images found (looked for {' '.join(sorted(suffixes))})")
     try:
-        if pattern:
-            frames = frames_by_pattern(scan.images, pattern)
-        else:
-            frames, chosen = frames_by_depth(scan.images)
+        frames, chosen = frames_by_pattern(images, pattern) if pattern else frames_by_depth(images)
         headers = {camera: _read_headers(folder, frames, camera) for camera in frames.ids("camera")}
-        _require_capture(frames, headers)
+        if len(lights := frames.ids("light")) < _LEAST_LIGHTS:
+            names = f"{counted(len(lights), 'light')} ({', '.join(lights)})"
+            raise UsageError(
+                f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder or --pattern"
+            )
+        if not any(header.sizes for header in headers.values()):
+            raise UsageError("the images cannot be read; check the files")
     except UsageError as error:
         raise UsageError(f"{folder}: {error}") from None
-    directions, about_list = _read_directions(folder, scan, frames)
+    directions, about_list = _read_directions(folder, lists, frames)
     content = _content(folder, chosen, frames, headers, directions)
     notes = [
         _summary(chosen, frames),
@@ -129,8 +118,10 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> d
         *(["check: pattern: chosen by folder depth; --pattern gives another one"] if not pattern else []),
         *([about_list] if about_list else []),
         *(f"check: {note}" for note in _assumptions(headers, content)),
-        *(f"left out: {note}" for note in _left_out(scan, frames)),
     ]
+    if strays := frames.strays:
+        wrong = "do not match the pattern, or have ids not of letters, digits, - and _ alone"
+        notes.append(f"left out: {counted(len(strays), 'image')} that {wrong} ({_list(strays)})")
     return {"format": STAGE_FORMAT, "draft": notes, **content}
 
 
@@ -147,7 +138,7 @@ def as_text(stage: Mapping[str, Any]) -> str:
 
 
 def _read_headers(folder: Path, frames: Frames, camera: str) -> CameraHeaders:
-    paths = [folder / path for path in frames.of_camera(camera)]
+    paths = [folder / path for (_, of_camera, _), path in frames.paths.items() if of_camera == camera]
     step = max(len(paths) // _HEADERS, 1)
     headers = [(path, read_header(path)) for path in paths[::step][:_HEADERS]]
     read = [(path, header) for path, header in headers if header is not None]
@@ -167,20 +158,13 @@ def _space_name(path: Path, header: Header) -> str | None:
     return header.space.name if find_space(header.space.name) == header.space else None
 
 
-def _require_capture(frames: Frames, headers: Mapping[str, CameraHeaders]) -> None:
-    lights = frames.ids("light")
-    if len(lights) < _LEAST_LIGHTS:
-        names = f"{counted(len(lights), 'light')} ({', '.join(lights)})"
-        raise UsageError(f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder or --pattern")
-    if not any(header.sizes for header in headers.values()):
-        raise UsageError("the images cannot be read; check the files")
-
-
-def _read_directions(folder: Path, scan: Scan, frames: Frames) -> tuple[dict[str, list[float]], str]:
-    """Directions by light from the uppermost list of lights, and a note about the list."""
-    if not scan.lists:
+def _read_directions(
+    folder: Path, lists: Sequence[str], frames: Frames
+) -> tuple[dict[str, list[float]], str]:
+    """Directions by light from the first list of lights, and a note about the list."""
+    if not lists:
         return {}, ""
-    lights, name = frames.ids("light"), scan.lists[0]
+    lights, name = frames.ids("light"), lists[0]
     stems = {PurePosixPath(path).stem: light for (_, _, light), path in frames.paths.items()}
     try:
         listed = read_light_list(folder / name)
@@ -270,33 +254,22 @@ def _assumptions(headers: Mapping[str, CameraHeaders], content: Mapping[str, Any
         yield f"ambient: {_list([content['ambient']])}; --subtract-ambient subtracts such images"
 
 
-def _left_out(scan: Scan, frames: Frames) -> Iterator[str]:
-    if frames.strays:
-        yield f"{counted(len(frames.strays), 'image')} that do not match the pattern ({_list(frames.strays)})"
-    if frames.unnameable:
-        names = sorted(set(frames.unnameable))
-        yield f"images with ids not of letters, digits, - and _ alone; rename them ({_list(names)})"
-    if scan.unreadable:
-        yield f"{counted(len(scan.unreadable), 'folder')} that cannot be read ({_list(scan.unreadable)})"
-
-
 def _list(names: Sequence[str]) -> str:
     """The first names, escaped where a terminal cannot print them."""
-    shown = [name if name.isprintable() else ascii(name) for name in names[:_LISTED]]
-    return ", ".join([*shown, "..."] if len(names) > _LISTED else shown)
+    words = [name if name.isprintable() else ascii(name) for name in names[:_LISTED]]
+    return ", ".join([*words, "..."] if len(names) > _LISTED else words)
 
 
-def scan_folder(folder: Path, suffixes: Collection[str]) -> Scan:
-    """Find images with these suffixes, and lists of lights; hidden files and folders are skipped.
+def scan_folder(folder: Path, suffixes: Collection[str]) -> tuple[list[str], list[str]]:
+    """Find images with these suffixes, and lists of lights, the uppermost first.
 
-    Links to folders are followed, but each folder is entered once.
+    Paths are relative to the folder, with / between names. Hidden files and folders are skipped. Links to
+    folders are followed, but each folder is entered once.
     """
-    scan, entered = Scan(), set[tuple[int, int]]()
-
-    def note_unreadable(error: OSError) -> None:
-        scan.unreadable.append(os.path.relpath(error.filename, folder))
-
-    for here, folders, files in os.walk(folder, onerror=note_unreadable, followlinks=True):
+    images: list[str] = []
+    lists: list[str] = []
+    entered: set[tuple[int, int]] = set()
+    for here, folders, files in os.walk(folder, followlinks=True):
         status, below = os.stat(here), Path(here).relative_to(folder)
         folders[:] = sorted(name for name in folders if name[0] != "." and len(below.parts) < _DEEPEST)
         if (status.st_dev, status.st_ino) in entered:
@@ -306,27 +279,22 @@ def scan_folder(folder: Path, suffixes: Collection[str]) -> Scan:
         for name in sorted(name for name in files if name[0] != "."):
             suffix, path = os.path.splitext(name)[1].lower(), (below / name).as_posix()
             if suffix in suffixes:
-                scan.images.append(path)
+                images.append(path)
             elif (suffix == _LIST_SUFFIX or name.lower() in _LIST_NAMES) and (folder / path).is_file():
-                scan.lists.append(path)
-    scan.lists.sort(key=lambda path: (path.count("/"), path))
-    return scan
+                lists.append(path)
+    return images, sorted(lists, key=lambda path: (path.count("/"), path))
 
 
 def sort_frames(paths: Iterable[str], pattern: str) -> Frames:
     """Sort images into frames, ambient images and strays; images with all lights on are skipped."""
-    frames, expression = Frames({}, Counter(), [], []), compile_pattern(pattern)
+    frames, expression = Frames({}, Counter(), []), compile_pattern(pattern)
     for path in sorted(paths):
         match = expression.fullmatch(path)
-        if match is None:
-            frames.strays.append(path)
-            continue
-        named = match.groupdict()
-        bad = [name for name in named.values() if not is_name(name)]
-        if kind := unlisted_kind(named["light"]):
+        named = match.groupdict() if match else {}
+        if named and (kind := unlisted_kind(named["light"])):
             frames.ambient.update([named["light"]] if kind == "ambient" else [])
-        elif bad:
-            frames.unnameable.extend(bad)
+        elif not named or not all(map(is_name, named.values())):
+            frames.strays.append(path)
         else:
             frames.paths[named.get("subject", ""), named.get("camera", ""), named["light"]] = path
     return frames
@@ -339,7 +307,7 @@ def _natural_order(text: str) -> tuple[object, str]:
     return key, text
 
 
-def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
+def frames_by_pattern(images: Sequence[str], pattern: str) -> tuple[Frames, str]:
     """Sort images by the pattern of --pattern; UsageError for a wrong one, or one that no image matches."""
     try:
         require_pattern(pattern, "--pattern", ["light"])
@@ -348,7 +316,7 @@ def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
     frames = sort_frames(images, pattern)
     if not frames.paths:
         raise UsageError(f"--pattern {pattern}: no image matches, not even {images[0]}; correct the pattern")
-    return frames
+    return frames, pattern
 
 
 def frames_by_depth(images: Sequence[str]) -> tuple[Frames, str]:

@@ -131,12 +131,6 @@ class YaleB:
         """Read the images [L, 192, 168] of a subject under all its `flashes`."""
         return np.stack([self.image(subject, flash) for flash in self.flashes(subject)])
 
-    def ambient(self, subject: str) -> np.ndarray | None:
-        """Read the image [192, 168] of a subject without a flash; None if it is missing or not cropped."""
-        path = self.folder / subject / f"{subject}_P00_Ambient.pgm"
-        image = _read_grey(path) if path.is_file() else np.empty(0)
-        return image if image.shape == (HEIGHT_PX, WIDTH_PX) else None
-
 
 def read_yale_b(
     folder: Path,
@@ -184,35 +178,24 @@ def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
 
     Other columns are ignored. InputError names the first wrong row.
     """
-    advice = "give a list of shifts with lines subject,light,dy,dx"
-    text = read_text(path, _SHIFTS_LIMIT_BYTES, advice)
-    try:
-        rows = list(csv.DictReader(text.splitlines()))
-    except csv.Error as error:
-        raise InputError(f"{path}: not a list of shifts ({error}); give lines subject,light,dy,dx") from None
+    advice = "give lines subject,light,dy,dx under such a header"
     shifts = {}
-    for number, row in enumerate(rows, start=2):
-        shift = _shift(row)
-        if shift is None:
-            raise InputError(
-                f"{path}: line {number} is not a shift; give subject,light,dy,dx under such a header"
-            )
-        shifts[shift[:2]] = shift[2:]
-    if not shifts:
-        raise InputError(f"{path}: no shifts; give lines subject,light,dy,dx under a header of these names")
-    return shifts
-
-
-def _shift(row: Mapping[str, str | None]) -> tuple[str, Flash, int, int] | None:
-    """Parse a row into subject, flash, pixels down and right; None if it is wrong."""
-    subject, flash = row.get("subject"), Flash.named(row.get("light") or "")
     try:
-        down, right = int(row.get("dy") or ""), int(row.get("dx") or "")
-    except ValueError:
-        return None
-    if not subject or flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
-        return None
-    return subject, flash, down, right
+        rows = list(csv.DictReader(read_text(path, _SHIFTS_LIMIT_BYTES, advice).splitlines()))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a list of shifts ({error}); {advice}") from None
+    for number, row in enumerate(rows, start=2):
+        subject, flash = row.get("subject"), Flash.named(row.get("light") or "")
+        try:
+            down, right = int(row.get("dy") or ""), int(row.get("dx") or "")
+        except ValueError:
+            flash = None
+        if not subject or flash is None or max(abs(down), abs(right)) >= WIDTH_PX:
+            raise InputError(f"{path}: line {number} is not a shift; {advice}")
+        shifts[subject, flash] = down, right
+    if not shifts:
+        raise InputError(f"{path}: no shifts; {advice}")
+    return shifts
 
 
 def read_yale_capture(folder: Path) -> Capture:

@@ -222,7 +222,7 @@ def yale_b(
     _refuse_without_field(context, options, "network_alone")
     if options.reflectance is None and not options.against:
         options = replace(options, reflectance=["portrait"])
-    from facerf_cli.work.evaluate_images import run_yale_b
+    from facerf_cli.work.evaluate_items import run_yale_b
 
     raise typer.Exit(run_yale_b(folder, options, photo, shifts, subjects or [], field.network_alone, room))
 
@@ -287,7 +287,7 @@ def pairs(
     options = replace(options, reflectance=[])
     options.check()
     options.require_output_apart([*predictions, truth, *([] if masks is None else [masks])])
-    from facerf_cli.work.evaluate_images import run_pairs
+    from facerf_cli.work.evaluate_items import run_pairs
 
     settings = settings_of(context)
     raise typer.Exit(run_pairs(predictions, truth, options, settings, masks, facts, face_distance))
@@ -360,7 +360,7 @@ def _run(
     photo.check()
     solve = solve or SolveOptions()
     LightOptions(photo=photo, non_negative=solve.non_negative, refine=solve.refine).check()
-    from facerf_cli.work.evaluate_faces import FaceSettings, run_on_people, run_on_photos
+    from facerf_cli.work.evaluate_items import FaceSettings, run_on_people, run_on_photos
 
     settings = FaceSettings(
         protocol, options, photo, data, network_alone, solve.non_negative, solve.refine, mean_checkpoint

@@ -1,10 +1,11 @@
 """Folders of predictions against a folder of truths, matched by name; any images can be measured.
 
 Trees are mirrored; a name is the path without its suffix, so a truth .exr may have a .png prediction. Every
-image of every folder must have its counterparts, of the same size: without failed ones a mean improves.
+image of every folder must have its counterparts: without failed ones a mean improves.
 """
 
 import csv
+import io
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -13,14 +14,12 @@ from pathlib import Path
 from tokenize import TokenError
 
 import numpy as np
-import OpenImageIO as oiio
 
-from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.files.image_metadata import oiio_error, utf8_path
 from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
-from facerf_cli.files.texts import is_regular, require_regular
+from facerf_cli.files.texts import read_text, require_regular
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.portrait.find import find_faces
 
@@ -29,7 +28,6 @@ SUFFIXES = frozenset(
 )
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file
-_TURNED = 5  # from this Exif orientation on, width and height are exchanged
 _CSV_ADVICE = "begin with a header such as name,person,..."
 
 
@@ -64,7 +62,7 @@ def collect_pairs(
 
     `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). If it names no person, that is the
     truth's topmost folder, or in a flat tree each image is a person. Raises UsageError for folders that
-    cannot be used, InputError for names or sizes that do not match: it names the first few and counts all.
+    cannot be used, InputError for names that do not match: it names the first few and counts all.
     """
     others = [*predictions, *([] if masks is None else [masks])]
     _check_folders(predictions, [truths, *others])
@@ -80,7 +78,6 @@ def collect_pairs(
         _pair(name, found[name], {m: files[name] for m, files in by_method.items()}, mask_files, described)
         for name in sorted(found)
     ]
-    _check_sizes(pairs)
     return pairs
 
 
@@ -172,39 +169,6 @@ def _pair(
     return ImagePair(name, truth, predictions, masks.get(name), person, known.values)
 
 
-def _check_sizes(pairs: Sequence[ImagePair]) -> None:
-    """Raise InputError for images of other sizes than their truths; reads headers only."""
-    wrong: dict[str, list[str]] = {}
-    for pair in pairs:
-        wanted = _size_px(pair.truth)
-        files = dict(pair.predictions) | ({} if pair.mask is None else {"the masks": pair.mask})
-        for method, path in files.items():
-            if (size := _size_px(path)) != wanted:
-                words = f"{pair.name} is {size[0]} x {size[1]}, its truth {wanted[0]} x {wanted[1]}"
-                wrong.setdefault(method, []).append(words)
-    complaints = [
-        f"{method}: {len(names)} of {len(pairs)} have another size ({_few(names)})"
-        for method, names in wrong.items()
-    ]
-    _refuse(complaints, "give images in their truth's frame")
-
-
-def _size_px(path: Path) -> tuple[int, int]:
-    """Width and height of an image file, upright."""
-    if path.suffix.lower() == ".npy":
-        height, width = read_array(path).shape[:2]
-        return width, height
-    stream = oiio.ImageInput.open(utf8_path(path)) if is_regular(path) else None
-    if stream is None:
-        oiio_error()
-        read_image(path)  # raises an error that names the cause
-        raise FacerfError(f"{path}: cannot be read; check the file")
-    spec = stream.spec()
-    stream.close()
-    turned = spec.get_int_attribute("Orientation", 1) >= _TURNED
-    return (spec.full_height, spec.full_width) if turned else (spec.full_width, spec.full_height)
-
-
 def _read(path: Path, colourspace: str | None = None) -> LinearImage:
     if path.suffix.lower() == ".npy":
         return LinearImage(read_array(path))
@@ -216,9 +180,19 @@ def read_facts(path: Path) -> dict[str, Facts]:
 
     A column whose cells are all numbers holds numbers; an empty cell is no fact.
     """
-    header, rows = _read_rows(path)
-    if "name" not in header:
-        raise InputError(f"{path}: no column 'name'; {_CSV_ADVICE}")
+    try:
+        text = read_text(path, _LARGEST_BYTES, _CSV_ADVICE).removeprefix("\ufeff")
+        lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(text)) if any(line)]
+    except csv.Error as error:
+        raise InputError(f"{path}: not CSV ({error}); save it in that format") from None
+    header = lines[0] if lines else []
+    if "name" not in header or len(set(header)) < len(header) or not all(header):
+        raise InputError(f"{path}: no column 'name', or two columns of one name; {_CSV_ADVICE}")
+    if ragged := [line for line in lines if len(line) != len(header)]:
+        raise InputError(
+            f"{path}: {len(ragged)} lines do not have {len(header)} cells; correct {','.join(ragged[0])}"
+        )
+    rows = [dict(zip(header, line, strict=True)) for line in lines[1:]]
     others = [column for column in header if column not in ("name", "person")]
     numbers = {column for column in others if all(_is_number(row[column]) for row in rows if row[column])}
     found: dict[str, Facts] = {}
@@ -232,29 +206,6 @@ def read_facts(path: Path) -> dict[str, Facts]:
         }
         found[row["name"]] = Facts(row.get("person", ""), values)
     return found
-
-
-def _read_rows(path: Path) -> tuple[list[str], list[dict[str, str]]]:
-    """Read the header and the rows, cells stripped."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; check the path")
-    if path.stat().st_size > _LARGEST_BYTES:
-        raise InputError(f"{path}: larger than {_LARGEST_BYTES / 2**20:.0f} MiB; give a list of images")
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [[cell.strip() for cell in line] for line in csv.reader(stream) if any(line)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not CSV in UTF-8 ({error}); save it in that format") from None
-    if not lines:
-        raise InputError(f"{path}: empty; {_CSV_ADVICE}")
-    header, *body = lines
-    if len(set(header)) < len(header) or not all(header):
-        raise InputError(f"{path}: columns without a name or of the same name; change {', '.join(header)}")
-    if ragged := [line for line in body if len(line) != len(header)]:
-        raise InputError(
-            f"{path}: {len(ragged)} lines do not have {len(header)} cells; correct {','.join(ragged[0])}"
-        )
-    return header, [dict(zip(header, line, strict=True)) for line in body]
 
 
 def _is_number(cell: str) -> bool:

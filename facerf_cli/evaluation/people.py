@@ -30,13 +30,11 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
     Estimator,
+    Person,
     explain,
     find_for,
     head_of,
     reflectance_of,
-)
-from facerf_cli.pipeline import (
-    Person as FittedPerson,
 )
 from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.raster.rasterize import interpolate, rasterize
@@ -64,7 +62,7 @@ class Method:
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
-        return FittedPerson(self.models, None, head, reflectance).image(light, target).pixels
+        return Person(self.models, None, head, reflectance).image(light, target).pixels
 
     def images(
         self,
@@ -77,7 +75,7 @@ class Method:
     ) -> Iterator[np.ndarray]:
         """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, network_alone, photo=photo)
-        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
+        composition = Person(self.models, photo, head, reflectance).composed(target)
         for relit in composition.relit(Lights(directions, weights)):
             yield composition.image(relit).pixels
 
@@ -101,8 +99,8 @@ class CropView:
     mask: np.ndarray
 
     @staticmethod
-    def of(model: MorphableModel, fit: FaceFit, shown: np.ndarray, keep_eyes: bool = False) -> "CropView":
-        """View a fit of `model`; `shown` [S, S] in 0..1 is where the crop shows the photo.
+    def of(model: MorphableModel, fit: FaceFit, valid: np.ndarray, keep_eyes: bool = False) -> "CropView":
+        """View a fit of `model`; `valid` [S, S] in 0..1 is where the crop shows the photo.
 
         Raises InputError where nothing of the face is visible.
         """
@@ -112,7 +110,7 @@ class CropView:
         mask = interior_mask(vertices, fragments, uv, _MASK_SIDE)[0]
         if not keep_eyes:
             mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
-        inside = mask.numpy() * shown
+        inside = mask.numpy() * valid
         if not inside.max() > 0:
             raise InputError("nothing of the fitted face is visible in the image; give its --landmarks")
         return CropView(fit, uv, inside)
@@ -207,8 +205,12 @@ def common_mask(views: Iterable[CropView]) -> np.ndarray:
     return np.minimum.reduce([view.mask for view in views])
 
 
+class NoFaceError(InputError):
+    """No face is found in an image of a dataset."""
+
+
 @dataclass(frozen=True, eq=False)
-class Person:
+class DatasetPerson:
     """A subject of a prepared dataset.
 
     Each source is a separate photo: the face is found in it, and fitted or regressed as `geometry` says.
@@ -226,12 +228,12 @@ class Person:
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
     def face_of(self, pair: Pair) -> "SourceFace":
-        """The source of a pair; InputError where no face is found in it."""
+        """The source of a pair; NoFaceError where no face is found in it."""
         case = Case(_name(pair), self.name, self.facts | {"map": pair.envmap})
         return SourceFace(case, self.portrait(pair), (self, pair))
 
     def portrait(self, pair: Pair) -> Portrait:
-        """The face in the source of a pair; InputError where none is found in it."""
+        """The face in the source of a pair; NoFaceError where none is found in it."""
         return self._portrait(self.source(pair), pair.source_camera, _name(pair))
 
     def lit(self, camera: str) -> Portrait:
@@ -252,7 +254,12 @@ class Person:
         if self.geometry is None:
             face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
         else:
-            face = find_for(self.parsing, self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
+            try:
+                face = find_for(self.parsing, self.geometry, image, name, landmarks_from=self.landmarks_from)[
+                    0
+                ]
+            except InputError as error:
+                raise NoFaceError(str(error)) from None
         return Portrait(name, LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
 
     def source(self, pair: Pair) -> np.ndarray:
@@ -300,23 +307,23 @@ class SourceFace:
 
     case: Case
     portrait: Portrait
-    origin: tuple[Person, Pair] | None = None
+    origin: tuple[DatasetPerson, Pair] | None = None
 
 
 Compare = Callable[[Sequence[SourceFace]], Iterable[Comparison]]
 
 
 def compare_people(
-    person: Person, groups: Iterable[Sequence[Pair]], compare: Compare
+    person: DatasetPerson, groups: Iterable[Sequence[Pair]], compare: Compare
 ) -> Iterator[Comparison]:
     """Compare the sources of each group of a person's pairs; the loop of every protocol over a dataset.
 
-    A group in which no face is found, or nothing of it is visible, is named and left out.
+    A group in one of whose images no face is found is named and left out; any other error is raised.
     """
     for pairs in groups:
         try:
             found = list(compare([person.face_of(pair) for pair in pairs]))
-        except InputError as error:
+        except NoFaceError as error:
             names = " and ".join(map(_name, pairs))
             log.warning("%s: left out (%s)", names, error)
         else:

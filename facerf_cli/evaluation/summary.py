@@ -34,7 +34,7 @@ class PublishedFigure:
     data: str = "other data than ours"
     digits: int | None = None  # after the decimal point, as published; None: as ours
 
-    def shown(self, digits: int) -> tuple[str, str]:
+    def words(self, digits: int) -> tuple[str, str]:
         """Format mean and standard deviation, with the published digits if they are known."""
         digits = digits if self.digits is None else self.digits
         return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
@@ -278,18 +278,24 @@ def _table_rows(summary: Summary, group: Group, metric: str) -> Iterator[list[st
     digits = metric_named(metric).digits
     title = group.title
     for method, cell in group.cells.get(metric, {}).items():
-        yield [title, method, *_figures(cell, digits)]
+        yield [title, method, str(cell.interval.images), *cell_words(cell, digits)]
         title = ""
     for figure in published_for(summary, group, metric):
-        yield [f"published, {figure.source}", figure.method, "", *figure.shown(digits), *[""] * 4]
+        yield [f"published, {figure.source}", figure.method, "", *figure.words(digits), *[""] * 4]
 
 
-def _figures(cell: Cell, digits: int) -> list[str]:
+def cell_words(cell: Cell, digits: int, with_intervals: bool = False) -> list[str]:
+    """Mean, sd, median and interval of a cell, its difference to the first method, and the share won.
+
+    `with_intervals` adds the interval of the difference. The last two are empty for the first method.
+    """
     interval, paired = cell.interval, cell.paired
-    middle = (f"{value:.{digits}f}" for value in (interval.mean, interval.sd, interval.median))
+    middle = [f"{value:.{digits}f}" for value in (interval.mean, interval.sd, interval.median)]
     known = not math.isnan(interval.low)  # NaN with one person
     between = f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person"
-    figures = [str(interval.images), *middle, between]
     if paired is None:
-        return [*figures, "", ""]
-    return [*figures, f"{paired.difference.mean:+.{digits}f}", f"{100 * paired.won:.0f} %"]
+        return [*middle, between, "", ""]
+    apart = f"{paired.difference.mean:+.{digits}f}"
+    if known and with_intervals:
+        apart += f" ({paired.difference.low:+.{digits}f} to {paired.difference.high:+.{digits}f})"
+    return [*middle, between, apart, f"{100 * paired.won:.0f} %"]

@@ -24,10 +24,10 @@ from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
+from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.relighting.composition import Target
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
 ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
@@ -72,7 +72,7 @@ _RADIANCES: Mapping[str, tuple[tuple[float, Radiance], ...]] = {  # weighted sum
 
 
 @dataclass(frozen=True)
-class Question:
+class Relighting:
     """A source and its target light, each by name; `column` is that of the tables."""
 
     column: str  # 'frontal', 'soft' or 'environment'
@@ -95,7 +95,7 @@ class Question:
 
 
 @dataclass(frozen=True, eq=False)
-class Sitter:
+class YaleSubject:
     """A subject of the database: its images under flashes, and the sums of these. Grey, in 0..1."""
 
     database: YaleB
@@ -137,16 +137,16 @@ class Sitter:
             return environment_weights(light, tuple(self.flashes))
         return np.array([float(flash.name == light) for flash in self.flashes])
 
-    def questions(self) -> Iterator[Question]:
+    def relightings(self) -> Iterator[Relighting]:
         """Yield every case of the subject."""
         for flash in self.flashes:
             within = abs(flash.azimuth_deg) <= _WIDEST_DEG and abs(flash.elevation_deg) <= _HIGHEST_DEG
             if within and flash != FRONTAL:
-                yield Question("frontal", "frontal", flash.name)
+                yield Relighting("frontal", "frontal", flash.name)
         for source in SOFT_SOURCES:
-            yield from (Question("soft", source, flash.name) for flash in _CORE if flash in self.flashes)
+            yield from (Relighting("soft", source, flash.name) for flash in _CORE if flash in self.flashes)
         for source in ENVIRONMENT_SOURCES:
-            yield from (Question("environment", source, environment) for environment in ENVIRONMENTS)
+            yield from (Relighting("environment", source, environment) for environment in ENVIRONMENTS)
 
 
 @cache
@@ -175,41 +175,30 @@ def face_mask() -> np.ndarray:
 
 
 COLUMNS = ("frontal", "soft", "environment")
-PEERS = ("DPR", "GeomConsistentFR")
-SHOWN = ("copy of the source", *PEERS, "quotient image")
-KNOWS_MORE = (  # learn from other subjects under the same flashes
-    "others' mean",
-    "others' Lambert",
-    "quotient image",
-)
 PUBLISHED_SUBJECTS = 21
 _SOURCE = "Yale B"
 _SAME = f"same images, {PUBLISHED_SUBJECTS} people"
-_MORE = _SAME + ", given more data"
+_MORE = _SAME + ", given more data"  # learns from other subjects under the same flashes
 
-# (Si-MSE, SSIM) by column, then Si-MSE by angle.
-FIGURES: dict[str, tuple[tuple[tuple[float, float], ...], tuple[float, ...]]] = {
+# Data, then (Si-MSE, SSIM) by column, then Si-MSE by angle.
+FIGURES: dict[str, tuple[str, tuple[tuple[float, float], ...], tuple[float, ...]]] = {
     "copy of the source": (
+        _SAME,
         ((0.0299, 0.609), (0.0512, 0.495), (0.0361, 0.646)),
         (0.0044, 0.0122, 0.0308, 0.0540, 0.0570),
     ),
     "DPR": (
+        _SAME,
         ((0.0111, 0.686), (0.0131, 0.641), (0.0145, 0.729)),
         (0.0057, 0.0080, 0.0122, 0.0164, 0.0155),
     ),
     "GeomConsistentFR": (
+        _SAME,
         ((0.0119, 0.674), (0.0151, 0.629), (0.0145, 0.709)),
         (0.0055, 0.0101, 0.0139, 0.0178, 0.0145),
     ),
-    "others' mean": (
-        ((0.0123, 0.610), (0.0123, 0.619), (0.0121, 0.654)),
-        (0.0123, 0.0129, 0.0131, 0.0150, 0.0100),
-    ),
-    "others' Lambert": (
-        ((0.0092, 0.672), (0.0125, 0.616), (0.0109, 0.760)),
-        (0.0025, 0.0055, 0.0119, 0.0151, 0.0134),
-    ),
     "quotient image": (
+        _MORE,
         ((0.0074, 0.751), (0.0093, 0.724), (0.0078, 0.789)),
         (0.0024, 0.0046, 0.0094, 0.0120, 0.0105),
     ),
@@ -255,25 +244,22 @@ def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool, room: 
 def published() -> tuple[PublishedFigure, ...]:
     """The published rows for the tables."""
     rows: list[PublishedFigure] = []
-
-    def add(method: str, metric: str, mean: float, group: tuple[str, str], digits: int) -> None:
-        data = _MORE if method in KNOWS_MORE else _SAME
-        rows.append(PublishedFigure(method, metric, mean, None, group, _SOURCE, data, digits))
-
-    for method in SHOWN:
-        by_column, by_angle = FIGURES[method]
+    for method, (data, by_column, by_angle) in FIGURES.items():
         for column, (si_mse, ssim) in zip(COLUMNS, by_column, strict=True):
-            add(method, "si_mse", si_mse, ("column", column), 4)
-            add(method, "ssim", ssim, ("column", column), 3)
+            group = "column", column
+            rows.append(PublishedFigure(method, "si_mse", si_mse, None, group, _SOURCE, data, 4))
+            rows.append(PublishedFigure(method, "ssim", ssim, None, group, _SOURCE, data, 3))
         for (low, high), si_mse in zip(pairwise(ANGLES_DEG), by_angle, strict=True):
-            add(method, "si_mse", si_mse, ("angle", f"{low}-{high} deg"), 4)
+            group = "angle", f"{low}-{high} deg"
+            rows.append(PublishedFigure(method, "si_mse", si_mse, None, group, _SOURCE, data, 4))
     return tuple(rows)
 
 
-def compare_sitter(
+def compare_subject(
     database: YaleB,
-    subject: str,
+    name: str,
     methods: Sequence[Method],
+    parsing: ParsingNetwork,
     network_alone: bool = False,
     geometry: Geometry = "landmarks",
     landmarks_from: LandmarksFrom = "facerf",
@@ -281,40 +267,48 @@ def compare_sitter(
 ) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
-    `room` is what the room sends back from all around, as a share of what a flash sends. A subject's sources
-    share the landmarks, or the box, of its frontal image. Raises InputError where no face is found in that,
-    or an image cannot be read.
+    A subject's sources share the landmarks, or the box, of its frontal image. Raises InputError where no face
+    is found in that, or an image cannot be read.
+
+    Args:
+        database: The images.
+        name: The subject's.
+        methods: What is compared, at least one.
+        parsing: Finds the face.
+        network_alone: True to leave the photo's correction out of the field.
+        geometry: Whether heads are fitted to landmarks or regressed.
+        landmarks_from: Where landmarks come from.
+        room: What the room sends back from all around, as a share of what a flash sends.
     """
-    sitter = Sitter(database, subject)
-    questions = list(sitter.questions())
-    frontal = sitter.image("frontal")
-    name = str(database.folder / subject)
-    networks = methods[0].models.networks if methods else SHIPPED_NETWORKS
-    face = find_for(networks.parsing, geometry, _rgb(frontal), name, landmarks_from=landmarks_from)[0]
-    for source in dict.fromkeys(question.source for question in questions):
-        asked = [question for question in questions if question.source == source]
-        photo = sitter.image(source)
-        relit = _relit_by_all(sitter, photo, face, asked, methods, network_alone, room)
-        for row, question in enumerate(asked):
+    subject = YaleSubject(database, name)
+    relightings = list(subject.relightings())
+    frontal = _rgb(subject.image("frontal"))
+    where = str(database.folder / name)
+    face = find_for(parsing, geometry, frontal, where, landmarks_from=landmarks_from)[0]
+    for source in dict.fromkeys(one.source for one in relightings):
+        of_source = [one for one in relightings if one.source == source]
+        photo = subject.image(source)
+        relit = _relit_by_all(subject, photo, face, of_source, methods, network_alone, room)
+        for row, one in enumerate(of_source):
             yield Comparison(
-                case=_case(subject, question),
-                truth=_rgb(sitter.image(question.light)),
+                case=_case(name, one),
+                truth=_rgb(subject.image(one.light)),
                 mask=face_mask().astype(np.float32),
-                predictions={name: _rgb(images[row]) for name, images in relit.items()},
+                predictions={method: _rgb(images[row]) for method, images in relit.items()},
                 source=_rgb(photo),
                 grey_as_given=True,
             )
 
 
-def _case(subject: str, question: Question) -> Case:
+def _case(subject: str, one: Relighting) -> Case:
     """The case, named by the path of its prediction in the benchmark."""
-    facts: dict[str, str | float] = {"column": question.column, "source": question.source}
-    if question.angle_bin is not None:
-        facts["angle"] = question.angle_bin
+    facts: dict[str, str | float] = {"column": one.column, "source": one.source}
+    if one.angle_bin is not None:
+        facts["angle"] = one.angle_bin
     facts["subjects"] = "settings" if subject in SETTINGS_SUBJECTS else "test"
-    if question.angle_deg is not None:
-        facts["angle_deg"] = question.angle_deg
-    return Case(f"{subject}/{question.source}/{question.light}", subject, facts)
+    if one.angle_deg is not None:
+        facts["angle_deg"] = one.angle_deg
+    return Case(f"{subject}/{one.source}/{one.light}", subject, facts)
 
 
 def _rgb(grey: np.ndarray) -> np.ndarray:
@@ -322,18 +316,18 @@ def _rgb(grey: np.ndarray) -> np.ndarray:
 
 
 def _relit_by_all(
-    sitter: Sitter,
+    subject: YaleSubject,
     photo: np.ndarray,
     face: FaceBox,
-    asked: Sequence[Question],
+    relightings: Sequence[Relighting],
     methods: Sequence[Method],
     network_alone: bool,
     room: float,
 ) -> Mapping[str, list[np.ndarray]]:
-    """The images [H, W] of a source under every light of the questions, by method."""
-    weights = torch.from_numpy(np.stack([sitter.weights(question.light) for question in asked])).float()
+    """The images [H, W] of one source under every target light, by method."""
+    weights = torch.from_numpy(np.stack([subject.weights(one.light) for one in relightings])).float()
     used = weights.sum(0) > 0
-    directions = torch.from_numpy(np.stack([flash.direction for flash in sitter.flashes])).float()[used]
+    directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()[used]
     weights = weights[:, used]
     if room:
         around, share = far_samples(StudioLight())

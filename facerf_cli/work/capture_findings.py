@@ -24,7 +24,6 @@ from facerf_cli.capture.findings import Finding, stopping
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import parse_json
-from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, counted, json_line, one_line
 from facerf_cli.run.workers import one_thread, process_died, spread
 
@@ -65,12 +64,11 @@ class CheckOnly:
     """Checks one subject of a capture; `opened` reads the capture in other processes, too."""
 
     opened: Callable[[], Capture]
-    networks: Networks
 
     def __call__(self, item: Item) -> list[Finding]:
         """Check a subject on one thread."""
         with one_thread():
-            return check_subject(self.opened(), item.name, self.networks)
+            return check_subject(self.opened(), item.name)
 
 
 def _died(item: Item, error: Exception) -> list[Finding]:

@@ -1,12 +1,13 @@
 """One protocol of `facerf evaluate` from items to tables: measure, keep figures and images, sum up."""
 
+import io
 import json
 import logging
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -24,14 +25,15 @@ from facerf_cli.evaluation.pairs import read_predictions
 from facerf_cli.evaluation.report import (
     About,
     ItemFigures,
-    KeptStrip,
+    Strip,
+    cases_to_keep,
     choose,
+    draw_strip,
     images_csv,
     page,
     read_figures,
     write_figures,
 )
-from facerf_cli.evaluation.strips import Strip, StripKeeper, strip_of
 from facerf_cli.evaluation.summary import Layout, print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
@@ -163,19 +165,21 @@ class _Measure:
         wrong: list[str] = []
         images: list[str] = []
         scaled = self.metric.startswith("si_") and self.options.space == "linear"
-        keeper, measures = StripKeeper(self.metric), _measures(self.options)
+        strips: dict[str, tuple[Strip, bytes]] = {}
+        measures = _measures(self.options)
         for own in self.compare(item):
             if self.options.pictures:
                 images += keep_images(own, self.options.output, self.settings, self.stamp)
             comparison = _with_others(own, self.options.folders, wrong)
             if wrong:
                 continue  # to name all that is missing at once
-            measured = measure(comparison, measures)
-            keeper.offer(measured, partial(strip_of, comparison, scaled))
-            rows += measured
+            rows += measure(comparison, measures)
+            strip, pixels = draw_strip(comparison, scaled)
+            strips[strip.case] = strip, _as_jpeg(pixels)
         _require_whole(item, rows, wrong)
-        strips = keep_strips(keeper.kept(), self.options.output, item.name, self.settings, self.stamp)
-        write_figures(self.path_of(item), ItemFigures(tuple(rows), strips, tuple(images)))
+        chosen = [strips[case] for case in cases_to_keep(rows, self.metric)]
+        kept = keep_strips(chosen, self.options.output, item.name, self.settings, self.stamp)
+        write_figures(self.path_of(item), ItemFigures(tuple(rows), kept, tuple(images)))
         facts = {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)}
         return Outcome(self.outputs_of(item), facts)
 
@@ -238,23 +242,31 @@ def _place(kind: str, case: str) -> str:
     return f"{KEPT}/{kind}/{case}.exr"
 
 
+def _as_jpeg(pixels: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, "JPEG", quality=_STRIP_QUALITY, subsampling=0)
+    return stream.getvalue()
+
+
 def keep_strips(
-    strips: Mapping[str, Strip], folder: Path, item: str, settings: Settings, stamp: Mapping[str, str]
-) -> tuple[KeptStrip, ...]:
+    strips: Iterable[tuple[Strip, bytes]],
+    folder: Path,
+    item: str,
+    settings: Settings,
+    stamp: Mapping[str, str],
+) -> tuple[Strip, ...]:
     """Write an item's strips to FOLDER/strips/ITEM/NUMBER.jpg, in place of older ones."""
     place = folder / STRIPS / item
     for old in place.glob("[0-9][0-9][0-9].jpg"):
         old.unlink()
     kept = []
-    for number, (case, strip) in enumerate(strips.items()):
+    for number, (strip, jpeg) in enumerate(strips):
         path = place / f"{number:03d}.jpg"
-        made = Provenance(case, _checkpoint_of("field", settings), **stamp)
+        made = Provenance(strip.case, _checkpoint_of("field", settings), **stamp)
         with atomic_path(path) as temporary:
-            Image.fromarray(strip.pixels).save(temporary, quality=_STRIP_QUALITY, subsampling=0)
+            temporary.write_bytes(jpeg)
             embed_xmp(temporary, made.attributes())
-        size = (strip.pixels.shape[1], strip.pixels.shape[0])
-        relative = path.relative_to(folder).as_posix()
-        kept.append(KeptStrip(case, relative, strip.methods, strip.ev, strip.scales, strip.has_source, size))
+        kept.append(replace(strip, file=path.relative_to(folder).as_posix()))
     return tuple(kept)
 
 

@@ -110,8 +110,7 @@ def prepare_capture(
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     if checking.checks == "only" and not batch.dry_run:
-        checks = CheckOnly(source.opened, networks)
-        return check_all(checks, items, batch, checking.strict, settings)
+        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
     model_sha256 = _model_digest(content.face_model)
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
     if not overwrite:
@@ -264,7 +263,7 @@ class Prepare:
     def _choose(self, subject: str) -> tuple[Capture, Selection]:
         """Check a subject, select its sound frames, and align them on request; InputError for too few."""
         capture = self.source.opened()
-        findings = check_subject(capture, subject, self.networks) if self.checking.checks == "on" else []
+        findings = check_subject(capture, subject) if self.checking.checks == "on" else []
         write_findings(self.folder, subject, findings)
         require_sound(subject, findings, self.checking.strict)
         chosen = select_frames(capture, subject, findings, self.checking.strict)

@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from facerf_cli.light.sh import cosine_lobe, sh_basis
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.raster.texture import normal_map
 
-SMALL = TransferSettings(order=4, side=32, lights=80, lamp_samples=2, bounce_samples=4, blur_texels=0.5)
+SMALL = TransferSettings(order=4, side=32, lights=80, light_samples=2, bounce_samples=4, blur_texels=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +76,6 @@ def test_lights_that_turn_with_the_head_change_nothing(transfer: Tensor) -> None
     assert not torch.allclose(face.relit(rig, weights, turn), wanted, atol=0.01)
 
 
-def test_a_light_from_the_right_lights_the_right(transfer: Tensor) -> None:
-    image = lit(white(transfer), 60, 0)
-    assert float(image[:, 40:].mean()) > 2 * float(image[:, :24].mean())
-
-
 def test_a_second_run_does_not_bake(
     vertices: Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -108,20 +102,6 @@ def test_a_damaged_file_is_baked_again(
         path.write_bytes(broken)
         baked.baked_transfer(vertices, SMALL, tmp_path)
         assert len(path.read_bytes()) == len(whole)
-
-
-def test_the_cache_stays_small(
-    vertices: Tensor, transfer: Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for age in range(4):
-        old = tmp_path / f"old{age}.npy"
-        old.write_bytes(bytes(200_000))
-        os.utime(old, (1000 - age, 1000 - age))
-    monkeypatch.setattr(baked, "_MOST_BYTES", 600_000)
-    monkeypatch.setattr(baked, "bake_transfer", lambda *_: transfer)
-    baked.baked_transfer(vertices, SMALL, tmp_path)
-    left = {path.name for path in tmp_path.glob("old*.npy")}
-    assert left == {"old0.npy", "old1.npy"} and len(list(tmp_path.glob("*.npy"))) == 3
 
 
 def test_a_cache_that_cannot_be_written_is_a_warning(

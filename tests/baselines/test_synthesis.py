@@ -5,8 +5,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.baselines import synthesis
-from facerf_cli.baselines.priors import LightPrior, LogGaussian
-from facerf_cli.baselines.synthesis import Scene, SolveSettings, light_given, solve
+from facerf_cli.baselines.synthesis import LightPrior, LogGaussian, Scene, SolveSettings, light_given, solve
 
 T, K = 12, 9
 

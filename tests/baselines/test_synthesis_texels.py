@@ -2,8 +2,7 @@
 
 import torch
 
-from facerf_cli.baselines.priors import SIDE
-from facerf_cli.baselines.synthesis import coarse, shrunk, with_detail
+from facerf_cli.baselines.synthesis import SIDE, coarse, shrunk, with_detail
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import region_mask
 

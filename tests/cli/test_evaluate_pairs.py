@@ -59,7 +59,8 @@ def test_what_is_missing_or_of_another_size_makes_no_table(folders: Path, capsys
     (folders / "bad/bea/2.png").rename(folders / "bad/bea/1.png")
     write_exr(folders / "good/anna/0.exr", np.zeros((4, 5, 3), np.float32))
     assert pairs(folders) == 1
-    assert "anna/0 is 5 x 4, its truth 48 x 36" in capsys.readouterr().err
+    assert "anna/0: good has 5 x 4 pixels, the truth 48 x 36" in capsys.readouterr().err
+    assert not (folders / "out/summary.json").exists()
 
 
 def test_a_folder_may_be_given_from_inside(

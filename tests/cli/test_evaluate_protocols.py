@@ -26,8 +26,7 @@ from facerf_cli.main import main
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting.models import Models
-from facerf_cli.work import evaluate_faces
-from facerf_cli.work.evaluate_faces import FaceSettings, faces_of, load_methods
+from facerf_cli.work.evaluate_items import FaceSettings, faces_of
 from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
@@ -52,7 +51,7 @@ def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(settings: FaceSettings) -> tuple[Double, ...]:
         return (Double("field", models=load_models_once(settings.photo)),)
 
-    monkeypatch.setattr(evaluate_faces, "load_methods", load)
+    monkeypatch.setattr(FaceSettings, "methods", load)
 
 
 def run(protocol: str, *words: str | Path) -> int:
@@ -231,8 +230,8 @@ def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch
     """Signed least squares, then features: it reaches every method, and the light of every image."""
     photo = PhotoOptions(Settings(device="cpu"))
     settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), photo, SplitOptions())
-    (method,) = load_methods(replace(settings, non_negative=False, refine="features"))
-    (plain,) = load_methods(settings)
+    (method,) = replace(settings, non_negative=False, refine="features").methods()
+    (plain,) = settings.methods()
     assert not method.estimator.non_negative and isinstance(method.estimator.features, LightNetwork)
     assert plain.estimator.non_negative and plain.estimator.features is None
     asked = []

@@ -14,11 +14,12 @@ from facerf_cli.capture.yale_b import Flash, read_yale_b
 from facerf_cli.evaluation import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
-from facerf_cli.work import evaluate_images
+from facerf_cli.work.evaluate_items import FaceSettings, YaleWork
+from facerf_cli.work.evaluation_settings import EvaluateOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
 from tests.evaluation.method_doubles import FaceModelOnly
-from tests.evaluation.toy_sitters import Lambert, someone
+from tests.evaluation.toy_subjects import Lambert, someone
 
 Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
@@ -33,7 +34,9 @@ def folder(tmp_path: Path) -> Path:
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    monkeypatch.setattr(evaluate_images, "methods_of", lambda *_: (Lambert("field", models),))
+    monkeypatch.setattr(FaceSettings, "methods", lambda _: (Lambert("field", models),))
+    monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("overhead",))
+    monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
 
 
@@ -45,15 +48,15 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
     assert "of 2 people" in said and "published, Yale B" in said and "no --shifts" in said
     with (out / "images.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    # yaleB05 lacks one flash, which is known to be damaged: from the front, and from four soft lights
-    assert len(rows) == (2 + 12 + 8) + (1 + 8 + 8)
+    # yaleB05 lacks one flash, which is known to be damaged: from the front, and from the soft light
+    assert len(rows) == (2 + 3 + 4) + (1 + 2 + 4)
     assert {row["person"]: row["subjects"] for row in rows} == {"yaleB05": "settings", "yaleB07": "test"}
     summary = json.loads((out / "summary.json").read_text())
     counts = {
         (group["fact"], group["value"]): group["metrics"]["si_mse"]["field"]["pictures"]
         for group in summary["groups"][1:]
     }
-    assert counts["column", "frontal"] == 3 and counts["column", "environment"] == 16
+    assert counts["column", "frontal"] == 3 and counts["column", "environment"] == 8
     assert sum(count for (fact, _), count in counts.items() if fact == "angle") == 3
     for kind in ("source", "truth", "mask", "field"):
         assert (out / "pictures" / kind / "yaleB07" / "overhead" / "A+035E+40.exr").is_file()
@@ -69,7 +72,7 @@ def test_a_missing_prediction_of_another_method(folder: Path, tmp_path: Path, ca
     assert main([*line, "--subjects", "yaleB07"]) == 1
     said = capsys.readouterr()
     assert "no prediction for case yaleB07/frontal/A+035E+40" in said.err
-    assert "frontal/A-025E+00" not in said.err and said.err.count("no prediction for case") == 21
+    assert "frontal/A-025E+00" not in said.err and said.err.count("no prediction for case") == 8
     assert not (out / "summary.json").exists()
 
 
@@ -117,9 +120,8 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
-    photo = PhotoOptions(Settings())
-    work = evaluate_images._YaleB(photo, ("field", "prt"), (), None, False, 0.1, read_yale_b(folder))
-    sent = pickle.loads(pickle.dumps(work))
-    assert sent.room == 0.1 and sent.kinds == ("field", "prt")
+    settings = FaceSettings("yale-b", EvaluateOptions(folder), PhotoOptions(Settings()), network_alone=False)
+    sent = pickle.loads(pickle.dumps(YaleWork(settings, None, 0.1, read_yale_b(folder))))
+    assert sent.room == 0.1 and sent.settings == settings
     assert sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

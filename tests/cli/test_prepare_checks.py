@@ -29,7 +29,7 @@ def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
     """Have the checks find these, whatever is there."""
 
     def planted(*findings: Finding) -> None:
-        def check_subject(capture: Capture, subject: str, networks: object) -> list[Finding]:
+        def check_subject(capture: Capture, subject: str) -> list[Finding]:
             return [found for found in findings if found.subject == subject]
 
         for module in ("capture_findings", "prepare"):

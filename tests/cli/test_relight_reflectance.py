@@ -25,7 +25,7 @@ given = relighting.given  # the fixture
 def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarse bake, and a cache of the test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    small = TransferSettings(order=4, side=32, lights=60, lamp_samples=1, bounce_samples=2)
+    small = TransferSettings(order=4, side=32, lights=60, light_samples=1, bounce_samples=2)
     monkeypatch.setattr(prt.explain_by_prt, "__defaults__", (prt.SETTINGS, small, DETAIL))
 
 

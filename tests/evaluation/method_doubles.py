@@ -10,13 +10,13 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
-from facerf_cli.evaluation.people import Method, Person, Portrait
+from facerf_cli.evaluation.people import DatasetPerson, Method, Portrait
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import Person as FittedPerson
+from facerf_cli.pipeline import Person
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
@@ -81,11 +81,11 @@ class Double(Method):
         reflectance = Unlit(head.face, self.gain)
         for row in weights:
             light = RigLight(directions, row)
-            yield FittedPerson(self.models, photo, head, reflectance).image(light, target).pixels
+            yield Person(self.models, photo, head, reflectance).image(light, target).pixels
 
 
 @dataclass(frozen=True, eq=False)
-class PersonOfAlbedo(Person):
+class PersonOfAlbedo(DatasetPerson):
     """A person whose sources are images of the albedo, computed from the stack's frontal light."""
 
     def source(self, pair: Any) -> np.ndarray:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.pairs import read_array, read_predictions
+from facerf_cli.evaluation.pairs import read_predictions
 from facerf_cli.files.images import write_display, write_exr
 
 SHAPE = (6, 9, 3)
@@ -41,28 +41,3 @@ def test_a_wrong_size_and_two_files_of_a_case(folder: Path) -> None:
     write_exr(folder / "a/02.exr", np.zeros(SHAPE, np.float32))
     with pytest.raises(InputError, match=r"02.exr and 02.npy; remove all but one"):
         read_predictions((folder,), "a/02", SHAPE)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (np.zeros(SHAPE, np.uint8), "give floats of linear light"),
-        (np.zeros((2, 3, 4)), r"give .height, width, 3."),
-        (np.full(SHAPE, np.nan), "NaN"),
-        (np.array([{"a": 1}], dtype=object), "not an array"),
-        (np.zeros((0, 3, 3)), r"give .height, width, 3."),
-    ],
-)
-def test_arrays_that_are_no_images(tmp_path: Path, content: np.ndarray, words: str) -> None:
-    np.save(tmp_path / "x.npy", content)
-    with pytest.raises(InputError, match=words):
-        read_array(tmp_path / "x.npy")
-
-
-def test_a_file_that_is_no_array_and_one_cut_short(tmp_path: Path) -> None:
-    (tmp_path / "text.npy").write_text("hello")
-    np.save(tmp_path / "cut.npy", np.zeros(SHAPE))
-    (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:200])
-    for name in ("text.npy", "cut.npy", "none.npy"):
-        with pytest.raises(InputError, match=r"not an array|no such file"):
-            read_array(tmp_path / name)

@@ -1,15 +1,13 @@
 """A comparison becomes rows: which figures, of which values, and what cannot be compared."""
 
-import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as module
-from facerf_cli.evaluation.measure import METRICS, Case, Comparison, Measures, Row, measure, shown
+from facerf_cli.evaluation.measure import METRICS, Case, Comparison, Measures, measure, shown
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 
@@ -103,19 +101,6 @@ def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.M
 def test_what_a_protocol_measured_itself_is_kept(comparison: Comparison) -> None:
     near, far = measure(replace(comparison, extra={"far": {"light_error_deg": 3.0}}), Measures())
     assert far.values["light_error_deg"] == 3 and "light_error_deg" not in near.values
-
-
-def test_heads_of_lpips_without_vgg_are_said_before_anything_is_measured() -> None:
-    Measures().check()
-    with pytest.raises(UsageError, match="--vgg-weights"):
-        Measures(lpips=Path("vgg.pth")).check()
-
-
-def test_measures_go_to_other_processes(comparison: Comparison) -> None:
-    how = Measures("display", None, "imagenet")
-    assert pickle.loads(pickle.dumps(how)) == how
-    row = measure(comparison, Measures())[0]
-    assert pickle.loads(pickle.dumps(row)) == row and isinstance(row, Row)
 
 
 @pytest.mark.parametrize("trouble", ["size", "nan", "truth", "mask size", "empty mask"])

@@ -73,13 +73,6 @@ def test_folders_may_lie_in_the_truths(truths: Path, ours: Path) -> None:
     assert [pair.name for pair in collect_pairs([truths / "ours"], truths)] == list(NAMES)
 
 
-def test_names_with_dots(tmp_path: Path) -> None:
-    save(tmp_path / "truth/a.v1.exr", image("a"))
-    save(tmp_path / "ours/a.v1.npy", image("a"))
-    (pair,) = collect_pairs([tmp_path / "ours"], tmp_path / "truth")
-    assert (pair.name, pair.person) == ("a.v1", "a.v1")
-
-
 def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: Path) -> None:
     (ours / "anna/one.npy").unlink()
     (ours / "anna/two.exr").unlink()
@@ -95,16 +88,6 @@ def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: 
 def test_two_images_of_one_name_are_refused(truths: Path, ours: Path) -> None:
     save(ours / "anna/one.exr", image("a"))
     with pytest.raises(InputError, match=r"anna/one has the files one\.exr and one\.npy"):
-        collect_pairs([ours], truths)
-
-
-@pytest.mark.parametrize("suffix", [".npy", ".exr", ".png"])
-def test_another_size_is_refused_before_anything_is_read(truths: Path, ours: Path, suffix: str) -> None:
-    (ours / "anna/one.npy").unlink()
-    save(ours / f"anna/one{suffix}", np.zeros((6, 8, 3), np.float32))
-    with pytest.raises(
-        InputError, match=r"ours: 1 of 3 have another size .anna/one is 8 x 6, its truth 9 x 6"
-    ):
         collect_pairs([ours], truths)
 
 
@@ -151,10 +134,10 @@ def test_facts_of_a_list(truths: Path, ours: Path) -> None:
     ("text", "words"),
     [
         ("person\nA\n", "no column 'name'"),
-        ("", "empty"),
+        ("", "no column 'name'"),
         ("name,person\nanna/one,A\n", "2 of 3 missing .anna/two, bert/one"),
         ("name\nanna/one\nanna/one\n", "anna/one has two lines"),
-        ("name,name\na,b\n", "of the same name"),
+        ("name,name\na,b\n", "two columns of one name"),
         ("name,pose\nanna/one\n", "do not have 2 cells"),
         ("name\nanna/one\0\n", "1 without a truth|not CSV"),
     ],
@@ -203,7 +186,7 @@ def test_files_that_hold_no_image(truths: Path, ours: Path, trouble: str) -> Non
         path.unlink()
         (ours / "anna/one.exr").write_text("no picture")
     with pytest.raises(InputError, match=r"anna/one\.(npy|exr)"):
-        collect_pairs([ours], truths)
+        compare_pair(collect_pairs([ours], truths)[0])
 
 
 def test_a_truth_without_a_face_has_no_face_distance(truths: Path, ours: Path) -> None:

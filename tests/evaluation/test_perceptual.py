@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as perceptual
 from facerf_cli.evaluation.measure import perceptual_metric
 from facerf_cli.network.features import Lpips
@@ -69,17 +69,6 @@ def test_heads_of_the_installed_package_are_found_without_importing_it(
     (tmp_path / "site/lpips/__init__.py").write_text("raise ImportError('torchvision')\n")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
     assert callable(perceptual_metric(None, vgg)) and "lpips" not in sys.modules
-
-
-def test_without_heads_the_line_says_what_to_do(vgg: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match="install the package lpips"):
-        perceptual_metric(None, vgg)
-
-
-def test_without_vgg_the_line_says_what_to_do(tmp_path: Path, heads: dict[str, torch.Tensor]) -> None:
-    with pytest.raises(UsageError, match="--vgg-weights imagenet"):
-        perceptual_metric(save(tmp_path / "heads.pth", heads), None)
 
 
 def test_heads_of_another_version_are_refused(

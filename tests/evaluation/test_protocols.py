@@ -21,7 +21,7 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.olat import LAMBERT, compare_olats
 from facerf_cli.evaluation.people import (
     CropView,
-    Person,
+    DatasetPerson,
     SourceFace,
     angle_class,
     angle_of,
@@ -48,7 +48,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def person(dataset: Dataset) -> Person:
+def person(dataset: Dataset) -> DatasetPerson:
     return person_of(dataset)
 
 
@@ -69,20 +69,20 @@ def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
 
 
 def olats(
-    person: Person, pairs: list[Pair], methods: list[Double], network_alone: bool = False
+    person: DatasetPerson, pairs: list[Pair], methods: list[Double], network_alone: bool = False
 ) -> Iterator[Comparison]:
     compare = partial(compare_olats, methods=methods, network_alone=network_alone)
     return compare_people(person, [(pair,) for pair in pairs], compare)
 
 
-def side_light(person: Person, camera: str) -> int:
+def side_light(person: DatasetPerson, camera: str) -> int:
     """A light from the side that the camera sees."""
     directions = person.header(camera).directions
     return int(np.abs(directions @ np.array([0.7, 0.1, 0.7]) - 1).argmin())
 
 
 @pytest.mark.parametrize("target", ["C0", "C1"])
-def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, target: str) -> None:
+def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: DatasetPerson, target: str) -> None:
     asked = pair(3, "C0", target, side_light(person, target))
     (found,) = olats(person, [asked], [unlit()])
     truth, mask = found.truth, found.mask
@@ -99,7 +99,9 @@ def test_lamberts_law_on_true_albedo_is_the_truth_in_any_pose(person: Person, ta
     assert found.case.facts["map"] == "a"
 
 
-def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, dataset: Dataset) -> None:
+def test_drift_of_the_tone_is_measured_where_the_skin_is_known(
+    person: DatasetPerson, dataset: Dataset
+) -> None:
     traits = {"ita_deg": 30.0, "melanin": 0.05, "haemoglobin": 0.02, "random_texture": False}
     known = person_of(replace(dataset, traits={"0000": traits}))
     front = int(known.header("C0").directions[:, 2].argmax())
@@ -113,7 +115,7 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(person: Person, d
     assert person_of(painted).facts == {"tone": "unknown"}
 
 
-def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) -> None:
+def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: DatasetPerson) -> None:
     asked = pair(0, "C0", "C0", 0)
     image = person.source(asked)
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
@@ -129,7 +131,7 @@ def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: Person) 
     np.testing.assert_allclose(found.landmarks_px, portrait.by(FACE_ONLY).head.fit.landmarks_px)
 
 
-def test_reflectances_change_places_and_lights_stay(person: Person) -> None:
+def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> None:
     method = unlit()
     sides = []
     for camera in ("C0", "C1"):
@@ -270,7 +272,15 @@ def test_images_without_a_face_are_left_out_and_named(
     assert sum("left out" in record.message for record in caplog.records) == 2
 
 
-def test_open_eyes_are_left_out_unless_they_are_kept(person: Person) -> None:
+def test_any_other_trouble_with_a_source_is_an_error(person: DatasetPerson) -> None:
+    def compare(_: object) -> list[Comparison]:
+        raise InputError("damaged")
+
+    with pytest.raises(InputError, match="damaged"):
+        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare))
+
+
+def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
     view, header = person.lit("C0").by(FACE_ONLY).view, person.header("C0")
     kept = CropView.of(FACE_ONLY.face, view.fit, header.seen, keep_eyes=True)
     eyes = view.region("eyes") > 0.9
@@ -278,7 +288,7 @@ def test_open_eyes_are_left_out_unless_they_are_kept(person: Person) -> None:
     assert kept.mask[eyes].min() > 0.5 and (kept.mask >= view.mask).all()
 
 
-def test_a_face_of_which_nothing_is_seen_is_named(person: Person) -> None:
+def test_a_face_of_which_nothing_is_seen_is_named(person: DatasetPerson) -> None:
     fit = person.lit("C0").by(FACE_ONLY).view.fit
     with pytest.raises(InputError, match="nothing of the fitted face"):
         CropView.of(FACE_ONLY.face, fit, 0 * person.header("C0").seen)
@@ -318,7 +328,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     from facerf_cli.dataset.pairs import image_path, read_pairs, weights_path
 
     person, (first, second) = (
-        Person(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.parsing),
+        DatasetPerson(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.parsing),
         read_pairs(dataset),
     )
     directions, weights = person.light(second)
@@ -340,7 +350,9 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
             del content["subjects"]["0000"]["traits"]
         (folder / "dataset.json").write_text(json.dumps(content))
         assert (
-            Person(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.parsing).facts["tone"]
+            DatasetPerson(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.parsing).facts[
+                "tone"
+            ]
             == tone
         )
     content["subjects"]["0000"]["traits"] = ["dark"]

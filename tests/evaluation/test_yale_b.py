@@ -1,6 +1,5 @@
 """Extended Yale B as a protocol: its cases, lights and images are those of the benchmark."""
 
-import csv
 import importlib.util
 import sys
 from collections import Counter
@@ -15,7 +14,7 @@ import torch
 from PIL import Image
 
 from facerf_cli import pipeline
-from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
+from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import yale_b
 from facerf_cli.evaluation.measure import Measures, measure
@@ -23,25 +22,25 @@ from facerf_cli.evaluation.pairs import read_predictions
 from facerf_cli.evaluation.people import Method
 from facerf_cli.evaluation.yale_b import (
     FIGURES,
-    Question,
-    Sitter,
-    compare_sitter,
+    Relighting,
+    YaleSubject,
+    compare_subject,
     environment_weights,
     face_mask,
-    layout,
     published,
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import Person, fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
-from facerf_cli.relighting.models import load_models
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly
-from tests.evaluation.toy_sitters import Lambert, someone
+from tests.evaluation.toy_subjects import Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
+PARSING = SHIPPED_NETWORKS.parsing
 
 
 @pytest.fixture(scope="module")
@@ -72,20 +71,21 @@ def test_cases_are_the_benchmarks(databases: tuple[YaleB, Any]) -> None:
     assert ours.subjects == theirs.subjects
     tasks = {"frontal": "A", "soft": "A", "environment": "B"}
     for subject in ours.subjects:
-        questions = Sitter(ours, subject).questions()
-        found = [(tasks[question.column], question.source, question.light) for question in questions]
+        found = [
+            (tasks[one.column], one.source, one.light) for one in YaleSubject(ours, subject).relightings()
+        ]
         assert found == theirs.cases(subject)
 
 
 @pytest.mark.parametrize("subject", ["yaleB02", "yaleB05", "yaleB13"])
 def test_images_are_the_benchmarks(databases: tuple[YaleB, Any], subject: str) -> None:
     ours, theirs = databases
-    sitter = Sitter(ours, subject)
-    questions = list(sitter.questions())
-    for source in {question.source for question in questions}:
-        np.testing.assert_allclose(sitter.image(source), theirs.source(subject, source), atol=1e-6)
-    for light in {question.light for question in questions}:
-        np.testing.assert_allclose(sitter.image(light), theirs.target(subject, light), atol=1e-6)
+    own = YaleSubject(ours, subject)
+    relightings = list(own.relightings())
+    for source in {one.source for one in relightings}:
+        np.testing.assert_allclose(own.image(source), theirs.source(subject, source), atol=1e-6)
+    for light in {one.light for one in relightings}:
+        np.testing.assert_allclose(own.image(light), theirs.target(subject, light), atol=1e-6)
 
 
 def test_lights_are_the_benchmarks(
@@ -108,7 +108,7 @@ def test_scores_are_the_benchmarks(
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
     monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
-    comparisons = list(compare_sitter(databases[0], "yaleB05", []))
+    comparisons = list(compare_subject(databases[0], "yaleB05", [], PARSING))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
         subject, _, light = comparison.case.name.split("/")
@@ -120,7 +120,7 @@ def test_scores_are_the_benchmarks(
 
 
 def too_bright_sources(
-    sitter: Sitter, photo: np.ndarray, face: Face, asked: list[Any], *_: Any
+    subject: YaleSubject, photo: np.ndarray, face: Face, asked: list[Any], *_: Any
 ) -> dict[str, np.ndarray]:
     """In the place of methods: the source itself, twice as bright, so that scale and clipping count."""
     assert face.landmarks_px.shape == (68, 2)
@@ -133,7 +133,7 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
     figures = [
         [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
     ]
-    assert sorted([*sum(columns, ()), *angles] for columns, angles in FIGURES.values()) == sorted(figures)
+    assert all([*sum(columns, ()), *angles] in figures for _, columns, angles in FIGURES.values())
     quotient = [row for row in published() if row.method == "quotient image"]
     assert len(published()) == 11 * 4 and len(quotient) == 11
     assert all(row.data == "same images, 21 people, given more data" for row in quotient)
@@ -144,8 +144,10 @@ def small(tmp_path: Path) -> YaleB:
     return read_yale_b(write_yale_b(tmp_path / "yale"))
 
 
-def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     fits = Counter[str]()
+    monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("dome",))
+    monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(
         pipeline.Person, "matte", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
@@ -155,9 +157,9 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
     models = FaceModelOnly(load_face_model("builtin"))
     methods: Any = [Lambert("a", models), Lambert("b", models)]
-    comparisons = list(compare_sitter(small, "yaleB07", methods))
+    comparisons = list(compare_subject(small, "yaleB07", methods, PARSING))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
-    assert columns == {"frontal": 6, "soft": 4 * 7, "environment": 8} and fits["fitted"] == 5  # one a source
+    assert columns == {"frontal": 6, "soft": 7, "environment": 4} and fits["fitted"] == 2  # one a source
     for comparison in comparisons:
         assert set(comparison.predictions) == {"a", "b"}
         assert comparison.truth.shape == comparison.predictions["a"].shape == (192, 168, 3)
@@ -169,21 +171,23 @@ def test_every_method_answers_every_question(small: YaleB, monkeypatch: pytest.M
     assert "angle" not in by_name["yaleB07/dome/A-070E+00"].case.facts
     centre = side.predictions["a"][110, 84]
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
-    in_room = {one.case.name: one for one in compare_sitter(small, "yaleB07", methods, room=0.5)}
-    lighter = in_room["yaleB07/frontal/A-070E+00"].predictions["a"][110, 84]
+    one = Relighting("frontal", "frontal", "A-070E+00")
+    monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
+    (in_room,) = compare_subject(small, "yaleB07", methods[:1], PARSING, room=0.5)
+    lighter = in_room.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
 
 def test_a_subject_in_whom_no_face_is_found(small: YaleB) -> None:
     with pytest.raises(InputError, match=r"yaleB07: no face found"):
-        list(compare_sitter(small, "yaleB07", []))
+        list(compare_subject(small, "yaleB07", [], PARSING))
 
 
 def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
     with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
-        list(compare_sitter(read_yale_b(folder), "yaleB07", []))
+        list(compare_subject(read_yale_b(folder), "yaleB07", [], PARSING))
 
 
 def test_environments_come_from_their_side(small: YaleB) -> None:
@@ -199,32 +203,17 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     models = load_models()
-    sitter = Sitter(small, "yaleB07")
-    photo = np.repeat(sitter.image("win_left")[..., None], 3, -1)
+    subject = YaleSubject(small, "yaleB07")
+    photo = np.repeat(subject.image("win_left")[..., None], 3, -1)
     head = fit_photo(models, photo, someone().landmarks_px)
     person = Person(models, photo, head, reflectance_of(models, head))
-    directions = torch.from_numpy(np.stack([flash.direction for flash in sitter.flashes])).float()
-    for name, light in (("soft", "A-070E+00"), ("environment", "env_two_side")):
-        questions = [Question(name, "win_left", light)]
-        monkeypatch.setattr(Sitter, "questions", lambda self, asked=questions: iter(asked))
-        (comparison,) = compare_sitter(small, "yaleB07", [Method("field", "field", models)])
-        weights = torch.from_numpy(sitter.weights(light)).float()[:, None].expand(-1, 3)
-        expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
-        np.testing.assert_allclose(comparison.predictions["field"][..., 1], expected, rtol=1e-4, atol=1e-5)
-
-
-def test_notes_below_the_figures(small: YaleB, tmp_path: Path) -> None:
-    plain = layout(small, ["yaleB05"])
-    assert not any("--room" in note for note in plain.notes)
-    assert any("0.03 of its light" in note for note in layout(small, ["yaleB05"], room=0.03).notes)
-    assert any("no --shifts" in note for note in plain.notes)
-    assert any("chosen on yaleB05" in note for note in plain.notes)
-    assert any("1 known to be" in note for note in plain.notes)
-    with (tmp_path / "shifts.csv").open("w", newline="") as stream:
-        csv.writer(stream).writerows([("subject", "light", "dy", "dx"), ("yaleB07", "A+000E+00", 1, 0)])
-    moved = read_yale_b(small.folder, read_shifts(tmp_path / "shifts.csv"))
-    assert not any("no --shifts" in note for note in layout(moved, ["yaleB07"]).notes)
-    assert moved.shifts == {("yaleB07", Flash(0, 0)): (1, 0)}
+    directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()
+    one = Relighting("environment", "win_left", "env_two_side")
+    monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
+    (comparison,) = compare_subject(small, "yaleB07", [Method("field", "field", models)], PARSING)
+    weights = torch.from_numpy(subject.weights(one.light)).float()[:, None].expand(-1, 3)
+    expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
+    np.testing.assert_allclose(comparison.predictions["field"][..., 1], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_predictions_in_files_are_read_as_the_benchmark_reads_them(

@@ -2,7 +2,7 @@
 
 import torch
 
-from facerf_cli.baselines.priors import ASSET, SIDE, light_prior, skin_prior
+from facerf_cli.baselines.synthesis import ASSET, SIDE, light_prior, skin_prior
 from facerf_cli.face.topology import region_mask
 from tools import baseline_priors
 from tools.baseline_priors import LIGHT_ORDER, learn_light, learn_skin

@@ -12,13 +12,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.capture.capture import Capture, unlisted_kind
+from facerf_cli.capture.capture import Capture, FrameSizeError, unlisted_kind
 from facerf_cli.capture.findings import Finding
 from facerf_cli.errors import InputError
-from facerf_cli.face.joint_fit import PosedCamera
-from facerf_cli.files.images import read_image
 
-_FACE_PX = 512  # longest side of the image in which the face is detected
 _BRIGHT = 0.2  # of the brightest blocks: darker ones do not count in `comb`
 _AT_THE_TOP = 1 - 1e-5  # of a frame's maximum: arithmetic may move clipped values this far apart
 _LISTED = 3  # file names of a message
@@ -62,8 +59,6 @@ class CameraFrames:
     grey: np.ndarray  # [L, h, w] float32 linear, under a light of rgb 1
     figures: tuple[FrameFigures, ...]
     scale: float  # pixels of the camera per pixel of `grey`
-    lit: np.ndarray  # [H, W] float32: mean of all frames, larger, to detect the face in
-    lit_scale: float  # pixels of the camera per pixel of `lit`
 
     def without(self, broken: set[str]) -> "CameraFrames":
         """Remove the frames under these lights."""
@@ -101,9 +96,8 @@ def read_frames(
 ) -> tuple[CameraFrames, list[Unread]]:
     """Read the frames of a camera that exist, shrunk to `side_px`; return unreadable ones separately."""
     posed = capture.cameras[camera]
-    size, scale = _fitted(posed, side_px)
-    lit_size, lit_scale = _fitted(posed, _FACE_PX)
-    lit = np.zeros(lit_size, np.float32)
+    scale = max(posed.width_px, posed.height_px, side_px) / side_px
+    size = (max(round(posed.height_px / scale), 1), max(round(posed.width_px / scale), 1))
     places, greys, figures, unread = [], [], [], []
     for place, light in enumerate(capture.light_ids):
         if not capture.frame_path(subject, camera, light).exists():
@@ -111,13 +105,11 @@ def read_frames(
         try:
             pixels = capture.frame(subject, camera, place)
         except InputError as error:
-            unread.append(Unread(light, str(error), _decodes(capture, subject, camera, light)))
+            unread.append(Unread(light, str(error), isinstance(error, FrameSizeError)))
             continue
         places.append(place)
         figures.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
-        grey = grey_of(pixels)
-        greys.append(small(grey, size))
-        lit += small(grey, lit_size)
+        greys.append(small(grey_of(pixels), size))
     rows = np.array(places, int)
     frames = CameraFrames(
         subject=subject,
@@ -128,24 +120,8 @@ def read_frames(
         grey=np.stack(greys) if greys else np.zeros((0, *size), np.float32),
         figures=tuple(figures),
         scale=scale,
-        lit=lit / max(len(places), 1),
-        lit_scale=lit_scale,
     )
     return frames, unread
-
-
-def _fitted(posed: PosedCamera, side_px: int) -> tuple[tuple[int, int], float]:
-    """Height and width of a camera's image shrunk to `side_px`, and the camera's pixels per pixel of it."""
-    scale = max(posed.width_px, posed.height_px, side_px) / side_px
-    return (max(round(posed.height_px / scale), 1), max(round(posed.width_px / scale), 1)), scale
-
-
-def _decodes(capture: Capture, subject: str, camera: str, light: str) -> bool:
-    try:
-        read_image(capture.frame_path(subject, camera, light), capture.colour_space, non_finite="zero")
-    except InputError:
-        return False
-    return True
 
 
 def grey_of(pixels: np.ndarray) -> np.ndarray:

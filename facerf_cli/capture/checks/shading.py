@@ -6,14 +6,17 @@ albedo. A constant per pixel is fitted too, for the light of the room. The fit i
 highlights and broken frames: weights fall with the residual, and frames under lights behind a pixel do not
 count.
 
-**Order.** In front of the face, the direction of a frame's light is solved for on the fitted normals. Lights
-at the side or behind reach only edges and hair; there, brightness is compared with neighbouring lights.
+**Order.** The direction of a frame's light is solved for on the fitted normals, for lights in front of the
+face; others reach only edges and hair.
 
-**Display curve.** Two methods find the exponent e for which values^e are linear. With a frame under all
-lights at once, the other frames must add up to it; this needs no model of the object, but few stages record
-that frame. Otherwise shading decides: photometric stereo is fitted to values^e, raised to 1/e and compared
-with the values. That comparison uses the same values for every e; on values^e a low exponent would win by
-flattening everything.
+**Rig.** Lights mirrored or turned as a whole, or swapped cameras, leave frames consistent with each other,
+but turn the fitted normals. The visible side of any object faces the camera: normals lean to the right on its
+right side, and slopes from outline to outline cancel, so that the mean normal points to the camera (upward by
+some 30 degrees, because what faces down is dark).
+
+**Display curve.** To find the exponent e for which values^e are linear, photometric stereo is fitted to
+values^e, raised to 1/e and compared with the values. That comparison uses the same values for every e; on
+values^e a low exponent would win by flattening everything.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,11 +24,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facerf_cli.capture.capture import FULL_NAMES, Capture
-from facerf_cli.capture.checks.frames import CameraFrames, grey_of, reaches_face, same_frames, small
+from facerf_cli.capture.checks.frames import CameraFrames, reaches_face, same_frames
 from facerf_cli.capture.findings import Finding
-from facerf_cli.errors import InputError
-from facerf_cli.files.images import read_image
 
 # Photometric stereo.
 _LEAST_FRAMES = 8  # fewer do not determine what another one should look like
@@ -40,27 +40,21 @@ EXPONENTS = np.array([0.35, 0.4, 0.45, 0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8, 2.2
 # Linear frames of Extended Yale B's subjects 05, 15 and 22 give 0.85 to 1, synthetic ones 1; encoded by 1/2.2
 # they give 1.7 to 2.4.
 _LINEAR = (0.6, 1.5)
-_EXACTLY_LINEAR = (0.93, 1.07)  # by a frame under all lights
 _CLEAR = 1.25  # least ratio of the error at exponent 1 to the smallest error
-# By shading.
 _PIXELS = 600
 _FACING = 0.3  # cosine of light and normal
 _LIT = 0.25  # of a pixel's brightest frame, values as they are
-# By additivity.
-_FINE_EXPONENTS = np.geomspace(EXPONENTS[0], EXPONENTS[-1], 80)  # its minimum is sharp
-_NOISE = 1e-3  # least log ratio that a sum can reach
-_DARK_PIXEL = 0.02  # of the brightest: darker pixels are noise
 # Order of lights in front. On Extended Yale B's subjects 05, 15 and 22 and synthetic faces the light of a
 # frame is found to 14 degrees at worst.
 _OFF_DEG = 30.0
 _IN_FRONT, _BELOW = 0.4, -0.7  # cosine to the camera's axis; sine of elevation: other lights leave shadows
 _MOST_SWAPPED = 0.25  # of the frames: with more off, the list of lights is wrong
 _LIGHT_ITERATIONS = 4
-# Order of lights at the side and behind. Sound frames of synthetic faces reach 1.5 times their neighbours, of
-# Extended Yale B 1.1.
-_BRIGHTEST_RATIO = 2.5
-_AROUND, _LEAST_AROUND = 0.7, 3  # cosine between neighbouring lights; number of them needed
-_DARK_FRAME = 0.05  # of the brightest frames: noise and the room dominate darker ones
+# Rig. Mean normals of synthetic heads, seen from the front and up to 54 degrees from the side, point left or
+# right of the camera by 9 degrees at most and up by 14 to 37; they lean by 0.5 to 0.8. On the 21
+# subjects of Extended Yale B they point left or right by 5 at most, up by -18 to 14, and lean by 0.9.
+_TURN_DEG, _UP_DEG = 20.0, (-45.0, 75.0)
+_LEAN = 0.3  # correlation of a normal's x with the pixel's x, negative for mirrored lights
 # Lights that did not fire. Sound frames of Extended Yale B's subjects 05, 15 and 22 have 0.77 of their
 # neighbours' gain or more, those of synthetic faces 0.41; a light that did not fire leaves some hundredths.
 _LEAST_GAIN = 0.3
@@ -203,21 +197,6 @@ def solve_light(image: np.ndarray, stereo: Stereo) -> np.ndarray:
     return light / max(np.linalg.norm(light), 1e-12)
 
 
-def check_too_bright(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
-    """Report each frame of a light not in front that is far brighter than those of neighbouring lights."""
-    means = frames.grey[:, stereo.lit].mean(1)
-    near = frames.directions @ frames.directions.T > _AROUND
-    np.fill_diagonal(near, False)
-    # The second brightest neighbour: of two neighbours that are swapped, each sees the other.
-    around = np.sort(np.where(near, means, 0), axis=1)[:, -2]
-    judged = (frames.directions[:, 2] <= _IN_FRONT) & (near.sum(1) >= _LEAST_AROUND)
-    judged &= means > _DARK_FRAME * np.percentile(means, 95)
-    for row in np.flatnonzero(judged & (means > _BRIGHTEST_RATIO * around)).tolist():
-        times = float(means[row] / max(float(around[row]), 1e-12))
-        brighter = f"is {min(times, 999):.0f} times as bright as the frames of neighbouring lights"
-        yield frames.error("order", f"{brighter}; correct the file's name", row, times=round(times, 1))
-
-
 def check_unlit(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     """Report each frame with far less of its predicted light than the frames of neighbouring lights have."""
     expected, gains = measure_gains(frames, stereo)
@@ -255,7 +234,6 @@ class Curve:
 
     exponent: float
     times_worse: float  # error at exponent 1 over the smallest error
-    exact: bool = False  # found by additivity, not by shading
 
 
 def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:
@@ -264,8 +242,7 @@ def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:
         return
     exponent = float(np.median([curve.exponent for curve in curves]))
     worse = float(np.median([curve.times_worse for curve in curves]))
-    least, most = _EXACTLY_LINEAR if all(curve.exact for curve in curves) else _LINEAR
-    if least < exponent < most or worse < _CLEAR:
+    if _LINEAR[0] < exponent < _LINEAR[1] or worse < _CLEAR:
         return
     words = (
         f"frames are declared linear, but values to the power {exponent:.1f} explain them {worse:.1f} "
@@ -308,39 +285,53 @@ def _shading_error(values: np.ndarray, used: np.ndarray, directions: np.ndarray,
     return float(np.median(np.abs(values - back)[used]))
 
 
-def added_exponent(capture: Capture, frames: CameraFrames) -> Curve | None:
-    """Fit the exponent for which all frames add up to the frame under all lights; None without that frame.
+@dataclass(frozen=True)
+class RigFit:
+    """The object's normals under the declared lights, as a camera sees them."""
 
-    None also where a light's frame is missing, which would look like a curve.
-    """
-    full = _full_frame(capture, frames)
-    if full is None or len(frames.light_ids) < len(capture.light_ids):
-        return None
-    strength = capture.intensities[frames.places].mean(1)[:, None]
-    lit = full > _DARK_PIXEL * full.max()
-    each = np.maximum(frames.grey[:, lit] * strength, 0).astype(float)
-    together = full[lit].astype(float)
-    errors = np.array([_sum_error(each, together, exponent) for exponent in _FINE_EXPONENTS])
-    at_one = _sum_error(each, together, 1.0)
-    exponent = float(_FINE_EXPONENTS[errors.argmin()])
-    return Curve(exponent, at_one / max(float(errors.min()), _NOISE), exact=True)
+    camera: str
+    mirrored: bool  # they lean to the left on the object's right side
+    right_deg: float  # of the mean normal, from the camera's axis
+    up_deg: float
 
-
-def _sum_error(each: np.ndarray, together: np.ndarray, exponent: float) -> float:
-    """Median log ratio of the sum of linearised frames [L, P] and the linearised full frame [P]."""
-    return float(np.median(np.abs(np.log((each**exponent).sum(0) + 1e-12) - exponent * np.log(together))))
+    @property
+    def faults(self) -> list[str]:
+        """Faults of the lights in words; empty for none."""
+        ways = ["mirrored left to right"] if self.mirrored else []
+        ways += (
+            [f"turned sideways by {self.right_deg:.0f} degrees"] if abs(self.right_deg) > _TURN_DEG else []
+        )
+        upright = _UP_DEG[0] < self.up_deg < _UP_DEG[1]
+        return ways + ([] if upright else [f"turned up or down by {self.up_deg:.0f} degrees"])
 
 
-def _full_frame(capture: Capture, frames: CameraFrames) -> np.ndarray | None:
-    """Read the grey frame [h, w] under all lights, as recorded less the black level; None without one."""
-    for name in FULL_NAMES:
-        path = capture.frame_path(frames.subject, frames.camera, name)
-        if name in capture.light_ids or not path.is_file():
-            continue
-        try:
-            pixels = read_image(path, capture.colour_space, non_finite="zero").pixels
-        except InputError:
-            return None
-        grey = small(grey_of(pixels) - np.float32(capture.black_level), frames.grey.shape[1:])
-        return grey if grey.max() > 0 else None
-    return None
+def measure_rig(camera: str, stereo: Stereo) -> RigFit:
+    """Measure the object's normals against the camera's axis."""
+    columns = np.nonzero(stereo.lit)[1].astype(float)
+    leaning = float(np.corrcoef(stereo.normals[:, 0], columns)[0, 1])
+    right, up, toward = stereo.normals.mean(0)
+    right_deg, up_deg = np.degrees(np.arctan2([right, up], toward)).tolist()
+    return RigFit(camera, leaning < -_LEAN, right_deg, up_deg)
+
+
+def check_rigs(subject: str, rigs: Sequence[RigFit]) -> Iterator[Finding]:
+    """Report lights that are mirrored or turned against the object in most cameras, or each such camera."""
+    off = [rig for rig in rigs if rig.faults]
+    if not off:
+        return
+    half = len(rigs) / 2
+    right_deg, up_deg = (
+        float(np.median([getattr(rig, name) for rig in rigs])) for name in ("right_deg", "up_deg")
+    )
+    of_most = RigFit("", sum(rig.mirrored for rig in rigs) > half, right_deg, up_deg)
+    what, advice = "unlike in other cameras, the lights are", "its world_to_camera, or its frames"
+    if of_most.faults:
+        off, what = off[:1], "the lights are"
+        advice = "their directions, their names or world_to_camera"
+    for rig in off:
+        words = (
+            f"{what} {' and '.join(rig.faults)} against the object that this camera sees; correct {advice}"
+        )
+        figures = {"right_deg": round(rig.right_deg, 1), "up_deg": round(rig.up_deg, 1)}
+        check = "rig" if of_most.faults else "camera"
+        yield Finding("error", check, subject, words, rig.camera, figures=figures)

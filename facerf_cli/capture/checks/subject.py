@@ -16,43 +16,33 @@ from facerf_cli.capture.checks.frames import (
     same_frames,
 )
 from facerf_cli.capture.checks.motion import check_motion
-from facerf_cli.capture.checks.rig import (
-    RigFit,
-    check_rig_roughly,
-    check_rigs,
-    find_face_normals,
-    measure_rig,
-)
 from facerf_cli.capture.checks.shading import (
     Curve,
+    RigFit,
     Stereo,
-    added_exponent,
     check_duplicates,
     check_frames_order,
     check_gamma,
-    check_too_bright,
+    check_rigs,
     check_unlit,
     fit_exponent,
     fit_stereo,
+    measure_rig,
 )
 from facerf_cli.capture.findings import Finding
-from facerf_cli.relighting.models import Networks
-
-_FACE_TRIES = 3  # cameras without a face that are searched; each costs a second or more
 
 
-def check_subject(capture: Capture, subject: str, networks: Networks, side_px: int = 96) -> list[Finding]:
+def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Finding]:
     """Check a subject's frames; findings are sorted, errors first.
 
     Each frame is read once, and one camera is in memory at a time, with `side_px` squared values per light.
     Unreadable frames are findings, not exceptions; a missing frame that the capture marks as damaged is none.
-    `networks` find the face. The checks see the frames without a colour chart's matrix, which would hide
-    clipped channels.
+    The checks see the frames without a colour chart's matrix, which would hide clipped channels.
     """
-    checks = _Checks(replace(capture, charts=()), subject, networks, side_px)
+    checks = _Checks(replace(capture, charts=()), subject, side_px)
     found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
     found += check_gamma(subject, checks.curves)
-    found += check_rigs(subject, checks.rigs) if checks.rigs else checks.rough
+    found += check_rigs(subject, checks.rigs)
     marked = capture.marked.get(subject, frozenset())
     found = [finding for finding in found if finding.check != "missing" or finding.light not in marked]
     return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
@@ -61,13 +51,11 @@ def check_subject(capture: Capture, subject: str, networks: Networks, side_px: i
 class _Checks:
     """Checks of a subject's cameras in turn, and the results that are judged at the end."""
 
-    def __init__(self, capture: Capture, subject: str, networks: Networks, side_px: int) -> None:
-        self.capture, self.subject, self.networks, self.side_px = capture, subject, networks, side_px
+    def __init__(self, capture: Capture, subject: str, side_px: int) -> None:
+        self.capture, self.subject, self.side_px = capture, subject, side_px
         self.curves: list[Curve] = []
-        self.rough: list[Finding] = []  # of the rig, without a face
         self.rigs: list[RigFit] = []
         self._digests: dict[str, str] = {}
-        self._face_tries = _FACE_TRIES
 
     def of_camera(self, camera: str) -> list[Finding]:
         """Check the frames of a camera."""
@@ -100,23 +88,11 @@ class _Checks:
         found = list(check_frames_order(frames, stereo))
         if is_disordered(found):
             return found  # then the normals are wrong
-        found += check_too_bright(frames, stereo)
-        self._measure_rig(frames, stereo)
-        found += check_motion(frames.without(left_out(found)), stereo)
-        curve = added_exponent(self.capture, frames)
-        curve = curve or fit_exponent(frames.without(left_out(found)), stereo.lit)
+        self.rigs.append(measure_rig(frames.camera, stereo))
+        whole = frames.without(left_out(found))
+        curve = fit_exponent(whole, stereo.lit)
         self.curves += [] if curve is None else [curve]
-        return found
-
-    def _measure_rig(self, frames: CameraFrames, stereo: Stereo) -> None:
-        """Compare the rig with the face, if the camera shows one."""
-        if not self.rigs:
-            self.rough += check_rig_roughly(frames, stereo)
-        if self._face_tries:
-            face = find_face_normals(frames, self.capture.cameras[frames.camera], self.networks)
-            rig = None if face is None else measure_rig(frames, stereo, face, self.capture.cameras)
-            self.rigs += [] if rig is None else [rig]
-            self._face_tries -= face is None
+        return [*found, *check_motion(whole, stereo)]
 
 
 def is_disordered(findings: Iterable[Finding]) -> bool:

@@ -1,8 +1,8 @@
-"""`facerf evaluate` olat, reconstruction, transfer and geometry: people of a dataset, or photos."""
+"""The items of each protocol of `facerf evaluate`: people of a dataset, photos, and folders of images."""
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -10,13 +10,24 @@ from typing import Literal, TypeVar
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
-from facerf_cli.batch.settings import NOT_IN_RECIPE
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
+from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import UsageError
+from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.olat import TABLE_1, TABLE_3, compare_olats
-from facerf_cli.evaluation.people import Compare, Method, Person, Portrait, SourceFace, compare_people, evenly
+from facerf_cli.evaluation.pairs import ImagePair, collect_pairs, compare_pair
+from facerf_cli.evaluation.people import (
+    Compare,
+    DatasetPerson,
+    Method,
+    Portrait,
+    SourceFace,
+    compare_people,
+    evenly,
+)
 from facerf_cli.evaluation.reconstruction import (
     FULL,
     MEAN,
@@ -27,6 +38,7 @@ from facerf_cli.evaluation.reconstruction import (
 )
 from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.transfer import TABLE_2_TRANSFER, couples_of, transfer
+from facerf_cli.evaluation.yale_b import compare_subject, layout
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.pipeline import Estimator
@@ -38,12 +50,13 @@ from facerf_cli.work.photo_options import LightOptions, PhotoOptions, Refine, ne
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
 
 T = TypeVar("T")
-Protocol = Literal["olat", "reconstruction", "transfer", "geometry"]
+Protocol = Literal["olat", "reconstruction", "transfer", "geometry", "yale-b"]
 Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person: pairs whose sources are compared together
 
 # The paper's numbers of images ('Quantitative Evaluations', Tables 2 and 4).
 _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 160, 3900, 8100
 _PAPER_PHOTOS, _PAPER_COUPLES = 130, 43
+_PARTS = 64  # most items of `pairs`
 
 
 @dataclass(frozen=True)
@@ -53,22 +66,83 @@ class FaceSettings:
     protocol: Protocol
     options: EvaluateOptions
     photo: PhotoOptions
-    data: SplitOptions
+    data: SplitOptions = field(default_factory=SplitOptions)
     network_alone: bool = True
     non_negative: bool = True
     refine: Refine = "none"
     mean_checkpoint: Path | None = None
+
+    def methods(self) -> tuple[Method, ...]:
+        """The methods, in the order of their names, once a process."""
+        options = self.options
+        refined = self.refine == "features"
+        weights = options.vgg_weights if refined else None
+        return _methods(self.photo, options.kinds, options.checkpoints, self.non_negative, refined, weights)
+
+    def prepare(self) -> None:
+        """Load what all items need; raises UsageError or InputError for what would fail each."""
+        uses = networks_of(self.options.kinds)
+        if self.refine == "features" and self.options.vgg_weights is None:
+            uses |= {"light_features"}
+        prepare_photos(self.photo, uses, with_networks=not self.options.dry_run)
+        if not self.options.dry_run:
+            self.methods()
+            if self.protocol == "geometry":
+                mean_methods(self)
+
+    def run(self, tables: Layout, items: Sequence[Item], work: Callable[[Item], Iterator[Comparison]]) -> int:
+        """Measure items; the exit code."""
+        return run_protocol(tables, items, work, self.options, self.photo.settings, self.photo, self.prepare)
+
+
+@cache
+def _methods(
+    photo: PhotoOptions,
+    kinds: tuple[RelightKind, ...],
+    checkpoints: tuple[Path, ...],
+    non_negative: bool,
+    refined: bool,
+    vgg_weights: str | None,
+) -> tuple[Method, ...]:
+    models = load_models_once(photo)
+    features = feature_network(LightOptions(photo=photo, vgg_weights=vgg_weights))[0] if refined else None
+    estimator = Estimator(non_negative, features)
+    others = [
+        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device))
+        for path in checkpoints
+    ]
+    return (
+        *(Method(kind, kind, models, estimator) for kind in kinds),
+        *(Method(name, "field", other, estimator) for name, other in others),
+    )
+
+
+def mean_methods(settings: FaceSettings) -> tuple[Method, ...]:
+    """The methods over a face model whose shapes do nothing, once a process."""
+    return _mean_methods(settings.methods(), settings.mean_checkpoint, settings.photo.face_model)
+
+
+@cache
+def _mean_methods(
+    methods: tuple[Method, ...], checkpoint: Path | None, face_model: str
+) -> tuple[Method, ...]:
+    found = []
+    for method in methods:
+        models = method.models
+        if checkpoint is not None and method.kind == "field":
+            models = load_models((checkpoint_file(checkpoint),), face_model, models.device)
+        found.append(replace(method, models=replace(models, face=models.face.pose_only())))
+    return tuple(found)
 
 
 def run_on_people(settings: FaceSettings, folder: Path) -> int:
     """Measure a split of a prepared dataset; the exit code."""
     dataset, pairs = _read_split(settings, folder)
     groups = _choose(settings, folder, pairs)
-    output = settings.options.output
-    items = [Item(folder / "olat" / name, output / "cases" / name, name) for name in sorted(groups)]
-    files = (folder / "dataset.json", pairs_path(dataset))
-    work = FaceWork(settings, files, dataset, groups)
-    return _run(work, items, sum(map(len, groups.values())))
+    cases = settings.options.output / "cases"
+    items = [Item(folder / "olat" / name, cases / name, name) for name in sorted(groups)]
+    work = FaceWork(settings, (folder / "dataset.json", pairs_path(dataset)), dataset, groups)
+    return settings.run(_tables(settings, sum(map(len, groups.values()))), items, work)
 
 
 def run_on_photos(settings: FaceSettings, inputs: Sequence[str]) -> int:
@@ -77,30 +151,15 @@ def run_on_photos(settings: FaceSettings, inputs: Sequence[str]) -> int:
     if settings.protocol == "transfer":
         couples = _preset_couples(_couples(inputs, options.output), options)
         files = tuple(couple.second.input_path for couple in couples.values())
-        return _run(FaceWork(settings, files, couples=couples), list(couples), None)
+        work = FaceWork(settings, files, couples=couples)
+        return settings.run(_tables(settings, None), list(couples), work)
     items = collect_items(inputs, options.output, PHOTO_SUFFIXES)
     if options.preset and len(items) < _PAPER_PHOTOS:
         raise UsageError(
             f"{len(items)} photos, --preset paper measures {_PAPER_PHOTOS}; give a folder of more"
         )
-    return _run(FaceWork(settings), items[:_PAPER_PHOTOS] if options.preset else items, None)
-
-
-def _run(work: "FaceWork", items: Sequence[Item], chosen: int | None) -> int:
-    settings = work.settings
-
-    def prepare() -> None:
-        uses = networks_of(settings.options.kinds)
-        if settings.refine == "features" and settings.options.vgg_weights is None:
-            uses |= {"light_features"}
-        prepare_photos(settings.photo, uses, with_networks=not settings.options.dry_run)
-        if not settings.options.dry_run:
-            compare_of(settings)
-
-    layout = _layout(settings, chosen)
-    return run_protocol(
-        layout, items, work, settings.options, settings.photo.settings, settings.photo, prepare
-    )
+    chosen = items[:_PAPER_PHOTOS] if options.preset else items
+    return settings.run(_tables(settings, None), chosen, FaceWork(settings))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +191,7 @@ class FaceWork:
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         """Yield the comparisons of an item."""
-        compare = compare_of(self.settings)
+        compare = self._compare()
         if self.dataset is not None:
             yield from compare_people(self._person(item.name, self.dataset), self.groups[item.name], compare)
         elif item in self.couples:
@@ -145,18 +204,29 @@ class FaceWork:
             for face in faces_of(item, self.settings):
                 yield from compare([face])
 
-    def _person(self, name: str, dataset: Dataset) -> Person:
+    def _compare(self) -> Compare:
+        """The protocol's comparison of faces."""
+        settings, methods = self.settings, self.settings.methods()
+        if settings.protocol == "olat":
+            return partial(compare_olats, methods=methods, network_alone=settings.network_alone)
+        if settings.protocol == "reconstruction":
+            return partial(reconstruct, methods=methods)
+        if settings.protocol == "transfer":
+            return partial(transfer, methods=methods, network_alone=settings.network_alone)
+        return partial(compare_geometries, forms={FULL: methods, MEAN: mean_methods(settings)})
+
+    def _person(self, name: str, dataset: Dataset) -> DatasetPerson:
         """A person, fitted as the options say, by default as the first method's networks expect."""
-        models, photo = load_methods(self.settings)[0].models, self.settings.photo
+        models, photo = self.settings.methods()[0].models, self.settings.photo
         geometry = None if self.settings.data.joint_fit else photo.geometry or models.default_geometry
         sides = models.sides(photo.texture_side)
         parsing, keep_eyes = models.networks.parsing, self.settings.options.keep_eyes
-        return Person(dataset, name, geometry, sides, parsing, keep_eyes, photo.landmarks_from)
+        return DatasetPerson(dataset, name, geometry, sides, parsing, keep_eyes, photo.landmarks_from)
 
 
 def faces_of(item: Item, settings: FaceSettings) -> Iterator[SourceFace]:
     """Yield the chosen faces of a photo; each counts as a person."""
-    photo, models = settings.photo, load_methods(settings)[0].models
+    photo, models = settings.photo, settings.methods()[0].models
     image, sides = read_photo(item, photo), models.sides(photo.texture_side)
     for face in fit_faces(item, image, photo):
         name = f"{item.name}{face.tag}"
@@ -165,74 +235,17 @@ def faces_of(item: Item, settings: FaceSettings) -> Iterator[SourceFace]:
         yield SourceFace(Case(name, name, {"quality": face.fit.quality}), portrait)
 
 
-def compare_of(settings: FaceSettings) -> Compare:
-    """The protocol's comparison of faces by the methods that the settings name."""
-    methods = load_methods(settings)
-    if settings.protocol == "olat":
-        return partial(compare_olats, methods=methods, network_alone=settings.network_alone)
-    if settings.protocol == "reconstruction":
-        return partial(reconstruct, methods=methods)
-    if settings.protocol == "transfer":
-        return partial(transfer, methods=methods, network_alone=settings.network_alone)
-    mean = _mean_methods(methods, settings.mean_checkpoint, settings.photo)
-    return partial(compare_geometries, forms={FULL: methods, MEAN: mean})
-
-
-def load_methods(settings: FaceSettings) -> tuple[Method, ...]:
-    """The methods, in the order of their names, once a process."""
-    options = settings.options
-    weights = options.vgg_weights if settings.refine == "features" else None
-    estimating = settings.non_negative, settings.refine == "features", weights
-    return methods_of(settings.photo, options.kinds, options.checkpoints, estimating)
-
-
-@cache
-def methods_of(
-    photo: PhotoOptions,
-    kinds: tuple[RelightKind, ...],
-    checkpoints: tuple[Path, ...],
-    estimating: tuple[bool, bool, str | None] = (True, False, None),
-) -> tuple[Method, ...]:
-    """Methods of reflectance models and of other checkpoints, once a process.
-
-    `estimating` tells how the field's light is estimated: with weights from 0 up, refined by features, and
-    the weights of V_f for that.
-    """
-    models = load_models_once(photo)
-    non_negative, refined, vgg_weights = estimating
-    how = LightOptions(photo=photo, vgg_weights=vgg_weights)
-    estimator = Estimator(non_negative, feature_network(how)[0] if refined else None)
-    others = [
-        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device))
-        for path in checkpoints
-    ]
-    return (
-        *(Method(kind, kind, models, estimator) for kind in kinds),
-        *(Method(name, "field", other, estimator) for name, other in others),
-    )
-
-
-@cache
-def _mean_methods(
-    methods: tuple[Method, ...], checkpoint: Path | None, photo: PhotoOptions
-) -> tuple[Method, ...]:
-    """The methods over a face model whose shapes do nothing, once a process."""
-    found = []
-    for method in methods:
-        models = method.models
-        if checkpoint is not None and method.kind == "field":
-            models = load_models((checkpoint_file(checkpoint),), photo.face_model, models.device)
-        found.append(replace(method, models=replace(models, face=models.face.pose_only())))
-    return tuple(found)
-
-
-def _layout(settings: FaceSettings, chosen: int | None) -> Layout:
+def _tables(settings: FaceSettings, chosen: int | None) -> Layout:
     """The tables of a protocol; `chosen` counts the images or couples of a dataset, None are photos."""
     alone = settings.network_alone
     light = f"The field's light is estimated by {_squares(settings)}."
     of_set = () if chosen is None else (_note_of_chosen(chosen, settings.data.joint_fit),)
     tone = () if chosen is None else ("tone",)
     if settings.protocol == "olat":
+        field_is = "the network alone" if alone else "corrected by its source image"
+        clipped = (
+            "si_mse_clipped clips the truth at white, as a camera does; otherwise a glint outweighs a face."
+        )
         return Layout(
             name="olat",
             title="Single lights of held-out people",
@@ -240,11 +253,9 @@ def _layout(settings: FaceSettings, chosen: int | None) -> Layout:
             by=("pose", "turn", "angle", "tone"),
             published=TABLE_1 + (TABLE_3 if settings.options.against else ()),
             notes=(
-                f"Split {settings.data.split}. The field is "
-                f"{'the network alone' if alone else 'corrected by its source image'}.",
+                f"Split {settings.data.split}. The field is {field_is}.",
                 *of_set,
-                "si_mse_clipped clips the truth at white, as a camera does; otherwise a glint outweighs a "
-                "face.",
+                clipped,
                 "tone_drift_deg is of the skin under lights within 25 degrees of the camera's axis.",
             ),
         )
@@ -262,8 +273,9 @@ def _layout(settings: FaceSettings, chosen: int | None) -> Layout:
             ),
         )
     if settings.protocol == "transfer":
-        field = "the network alone" if alone else "corrected by the photo that it is read from"
+        field_is = "the network alone" if alone else "corrected by the photo that it is read from"
         mouths = "Where expressions differ, mouths differ, which no reflectance describes."
+        red = "one photo cannot separate red light from red skin"
         return Layout(
             name="transfer",
             title="Reflectances of two images of a person exchanged",
@@ -271,9 +283,8 @@ def _layout(settings: FaceSettings, chosen: int | None) -> Layout:
             by=("turn", *tone),
             published=TABLE_2_TRANSFER,
             notes=(
-                f"The field is {field}.",
-                "si_mse_channels fits a scale for each channel: one photo cannot separate red light from red "
-                "skin.",
+                f"The field is {field_is}.",
+                f"si_mse_channels fits a scale for each channel: {red}.",
                 *(() if of_set else (mouths,)),
                 light,
                 *of_set,
@@ -446,3 +457,98 @@ def _preset_couples(couples: dict[Item, _Couple], options: EvaluateOptions) -> d
         groups.setdefault(couple.person, []).append(item)
     chosen = evenly(groups, _PAPER_COUPLES)
     return {item: couples[item] for members in chosen.values() for item in members}
+
+
+def run_yale_b(
+    folder: Path,
+    options: EvaluateOptions,
+    photo: PhotoOptions,
+    shifts: Path | None,
+    subjects: Sequence[str],
+    network_alone: bool,
+    room: float,
+) -> int:
+    """Measure the subjects of Extended Yale B, all if none are named; the exit code."""
+    database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
+    chosen = _chosen(database, subjects)
+    settings = FaceSettings("yale-b", options, photo, network_alone=network_alone)
+    items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
+    work = YaleWork(settings, shifts, room, database)
+    return settings.run(layout(database, chosen, network_alone, room), items, work)
+
+
+def _chosen(database: YaleB, given: Sequence[str]) -> list[str]:
+    """The chosen subjects; raises UsageError for one that is not in the database."""
+    wanted = {name.strip() for entry in given for name in entry.split(",") if name.strip()}
+    if unknown := sorted(wanted - set(database.subjects)):
+        there = ", ".join(database.subjects)
+        raise UsageError(f"--subjects {', '.join(unknown)}: not in {database.folder}; give some of {there}")
+    return [name for name in database.subjects if not wanted or name in wanted]
+
+
+@dataclass(frozen=True, eq=False)
+class YaleWork:
+    """Compares one subject's cases."""
+
+    settings: FaceSettings
+    shifts: Path | None
+    room: float
+    database: YaleB = field(metadata=NOT_IN_RECIPE)
+
+    def __call__(self, item: Item) -> Iterator[Comparison]:
+        """Yield the comparisons of a subject."""
+        methods, photo = self.settings.methods(), self.settings.photo
+        models = methods[0].models
+        return compare_subject(
+            self.database,
+            item.name,
+            methods,
+            models.networks.parsing,
+            self.settings.network_alone,
+            photo.geometry or models.default_geometry,
+            photo.landmarks_from,
+            self.room,
+        )
+
+
+def run_pairs(
+    predictions: Sequence[Path],
+    truth: Path,
+    options: EvaluateOptions,
+    settings: Settings,
+    masks: Path | None,
+    facts: Path | None,
+    face_distance: bool,
+) -> int:
+    """Measure folders of predictions against a folder of truths; the exit code."""
+    pairs = collect_pairs(predictions, truth, masks, facts)
+    by = dict.fromkeys(n for pair in pairs for n, value in pair.facts.items() if isinstance(value, str))
+    asked = {"lpips": options.vgg_weights is not None, "face_distance": face_distance}
+    metrics = ("si_mse", "mse", "psnr", "ssim", *(name for name, wanted in asked.items() if wanted))
+    tables = Layout("pairs", f"Predictions against {folder_name(truth)}", metrics, tuple(by))
+    size = math.ceil(len(pairs) / _PARTS)
+    starts = range(0, len(pairs), size)
+    items = [Item(truth, options.output / f"part-{n:02d}", f"part-{n:02d}") for n, _ in enumerate(starts)]
+    parts = {item.name: tuple(pairs[start : start + size]) for item, start in zip(items, starts, strict=True)}
+    names = tuple(map(folder_name, predictions))
+    work = PairsWork(names, tuple(predictions), masks, facts, face_distance, settings, parts)
+    return run_protocol(tables, items, work, options, settings)
+
+
+@dataclass(frozen=True)
+class PairsWork:
+    """Reads an item's pairs."""
+
+    names: tuple[str, ...]
+    predictions: tuple[Path, ...]
+    masks: Path | None
+    facts: Path | None
+    face_distance: bool
+    settings: Settings
+    parts: Mapping[str, tuple[ImagePair, ...]] = field(metadata=NOT_IN_RECIPE)
+
+    def __call__(self, item: Item) -> Iterator[Comparison]:
+        """Yield the comparisons of a part of the pairs."""
+        models = load_models_once(PhotoOptions(self.settings)) if self.face_distance else None
+        for pair in self.parts[item.name]:
+            yield compare_pair(pair, models.networks.parsing if models else None)
