@@ -118,17 +118,15 @@ def _fetch(published: PublishedFile, path: Path) -> None:
 
 def _download(published: PublishedFile, part: Path) -> None:
     """Download the rest of `part`; connect again as long as each connection delivers some data."""
-    for _ in range(_TRIES):
+    for attempt in range(1, _TRIES + 1):
         before = _size(part)
-        failure: Exception = ConnectionError("the connection broke off")
         try:
             if _one_connection(published, part):
                 return
-        except _NO_NETWORK as error:
-            failure = error
-        if _size(part) <= before:
-            break
-    raise failure
+            raise ConnectionError("the connection broke off")
+        except _NO_NETWORK:
+            if _size(part) <= before or attempt == _TRIES:
+                raise
 
 
 def _one_connection(published: PublishedFile, part: Path) -> bool:
