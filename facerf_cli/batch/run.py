@@ -170,11 +170,7 @@ class BatchOptions:
         panel=BATCH,
     )
     dry_run: bool = option(
-        False,
-        "List what would be read and written; write nothing.",
-        in_recipe=False,
-        flags=("--dry-run",),
-        panel=BATCH,
+        False, "List what would be read and written; write nothing.", in_recipe=False, panel=BATCH
     )
     jobs: int | None = option(
         None,

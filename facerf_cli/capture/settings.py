@@ -20,16 +20,10 @@ class ReadSettings:
         panel=CAPTURE,
     )
     subtract_ambient: bool = option(
-        False,
-        "Subtract each camera's image without lights, where there is one.",
-        flags=("--subtract-ambient",),
-        panel=CORRECTION,
+        False, "Subtract each camera's image without lights, where there is one.", panel=CORRECTION
     )
     align: bool = option(
-        False,
-        "Shift frames in which the head has moved back to its place.",
-        flags=("--align",),
-        panel=CORRECTION,
+        False, "Shift frames in which the head has moved back to its place.", panel=CORRECTION
     )
 
 
@@ -65,8 +59,5 @@ class CheckSettings:
         panel=CORRECTION,
     )
     strict: bool = option(
-        False,
-        "Stop a subject for any finding, missing frame or undetected face.",
-        flags=("--strict",),
-        panel=CORRECTION,
+        False, "Stop a subject for any finding, missing frame or undetected face.", panel=CORRECTION
     )

@@ -10,11 +10,10 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, Outcome
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.option import Without
-from facerf_cli.work.film_output import film_output
 from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.output_options import NEEDS, STDOUT
 from facerf_cli.work.relight_options import Relight
-from facerf_cli.work.shots import ShotOptions
+from facerf_cli.work.shots import ShotOptions, film_output
 
 
 def relight(

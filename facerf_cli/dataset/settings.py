@@ -47,9 +47,4 @@ class PairSettings:
     per_subject: int = option(
         1000, "Make so many images of each subject.", "N", panel=_PAIRS, least=1, most=100_000
     )
-    lazy: bool = option(
-        False,
-        "Write the recipes alone; training relights when it needs them.",
-        flags=("--lazy",),
-        panel=_PAIRS,
-    )
+    lazy: bool = option(False, "Write the recipes alone; training relights when it needs them.", panel=_PAIRS)

@@ -15,13 +15,7 @@ class StageSettings:
     """Settings of a capture; `size_px` is the side of an image."""
 
     size_px: int = option(
-        256,
-        "Write square images of this side.",
-        "PX",
-        panel=_IMAGE,
-        flags=("--size",),
-        least=64,
-        most=1024,
+        256, "Write square images of this side.", "PX", panel=_IMAGE, flags=("--size",), least=64, most=1024
     )
     face_model: str = option(
         "builtin",

@@ -64,11 +64,7 @@ class EvaluateOptions(BatchOptions):
         "Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.",
         panel=MEASURES,
     )
-    keep_eyes: bool = option(
-        False,
-        "Compare open eyes, too (default: not, as in the paper).",
-        panel=MEASURES,
-    )
+    keep_eyes: bool = option(False, "Compare open eyes, too (default: not, as in the paper).", panel=MEASURES)
     space: Literal["linear", "display"] = option(
         "linear", "Measure scene-linear values, or values encoded by sRGB.", panel=MEASURES
     )

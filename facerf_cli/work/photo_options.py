@@ -165,9 +165,7 @@ class LightOptions(SolveOptions):
         shown_default="S_f, the shipped network trained to find the light",
         panel=METHOD,
     )
-    keep_eyes: bool = option(
-        False, "Use the eyes, too (the paper leaves them out).", flags=("--keep-eyes",), panel=FACE
-    )
+    keep_eyes: bool = option(False, "Use the eyes, too (the paper leaves them out).", panel=FACE)
     matte: Path | None = option(
         None,
         "Use only what a grey image, or its alpha, of the photo's size shows, such as skin alone.",

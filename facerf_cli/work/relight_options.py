@@ -5,6 +5,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -17,7 +18,6 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.light.entries import is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
-from facerf_cli.work.film_output import FilmOutput, run_to_film
 from facerf_cli.work.light_setups import LightSetup, LightSources, PhotoLight, Sampling, collect_setups
 from facerf_cli.work.output_options import STDOUT, Exposure, OutputOptions, check_stdout, parse_exposure
 from facerf_cli.work.photo_options import (
@@ -31,9 +31,11 @@ from facerf_cli.work.photo_options import (
 )
 from facerf_cli.work.shots import (
     FRAMES_IN_A_ROW,
+    FilmOutput,
     Shot,
     ShotOptions,
     collect_frames,
+    film_rate,
     recipe_of_shots,
 )
 
@@ -211,19 +213,16 @@ class Relight:
         panel=IMAGE,
     )
     ball: bool = option(
-        False,
-        "Write a mirror ball and a diffuse ball under each map, too.",
-        in_recipe=False,
-        flags=("--ball",),
-        panel=IMAGE,
+        False, "Write a mirror ball and a diffuse ball under each map, too.", in_recipe=False, panel=IMAGE
     )
     network_alone: bool = network_alone_option()
-    fps: str | None = option(
+    fps: Fraction | None = option(
         None,
         "Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.",
         "RATE",
         in_recipe=False,
         shown_default="24",
+        parse=film_rate,
         panel=IMAGE,
     )
     name: NamePattern | None = option(
@@ -271,26 +270,21 @@ class Relight:
         batch = replace(batch, in_a_row=in_a_row, print_outputs=film is None)
         work = replace(work.with_leaders(items), shots=shots)
         work.refuse_meeting(items)
-        settings = work.photo.settings
-        if film is not None:
-            return run_to_film(film, items, shots, work, batch, settings, process)
+        images = [path for item in items for path in work.outputs_of(item)]
+        key = film.key_of_new(items, shots, images, work.recipes_of, batch) if film else ""
+        if film is not None and not key:
+            return 0
         index = FolderIndex(batch.output, "relight", batch.shard, work.recipes_of)
         usable, finished = work, all_finished(items, work.outputs_of, batch, index)
         index.edited.clear()  # they are judged again
         if not finished:
             usable = work.readable(batch.dry_run)
             index.want(usable.recipes_of)
+        relit, settings = partial(process, usable), work.photo.settings
         recipes = usable.recipes_of
-        code = run_items(
-            "relight",
-            items,
-            partial(process, usable),
-            usable.outputs_of,
-            batch,
-            settings,
-            recipes,
-            index=index,
-        )
+        code = run_items("relight", items, relit, usable.outputs_of, batch, settings, recipes, index=index)
+        if film is not None:
+            return film.joined(images, shots, key, code)
         if work.ball and not batch.dry_run and batch.shard.number == 1:
             _write_balls(usable, batch)
         return max(code, int(len(usable.setups) < len(work.setups)))

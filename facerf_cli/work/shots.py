@@ -1,9 +1,11 @@
-"""Shots among the inputs: films, and with `--sequence` numbered images, whose frames show one person."""
+"""Shots: films, and with `--sequence` numbered images, whose frames show one person; and a film as output."""
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from fractions import Fraction
+from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
 
 from facerf_cli.batch.inputs import (
@@ -15,13 +17,20 @@ from facerf_cli.batch.inputs import (
     fields_of,
     split_frame,
 )
-from facerf_cli.batch.made_from import DigestOf, Recipe
-from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf
+from facerf_cli.batch.run import BatchOptions, folder_not_file
+from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import UsageError
 from facerf_cli.option import BATCH, option
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.output_options import Format
 from facerf_cli.work.photo_options import PhotoOptions
 
+log = logging.getLogger(LOGGER_NAME)
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
+_FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
+_RATE = Fraction(24)
+_MOST_RATE = 1000
 _DIGITS = 4  # of a film's frame numbers, or more
 
 
@@ -32,10 +41,9 @@ class ShotOptions:
     sequence: bool = option(
         False,
         "Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.",
-        flags=("--sequence",),
         panel=BATCH,
     )
-    no_cuts: bool = option(False, "Take a film that cuts as one shot.", flags=("--no-cuts",), panel=BATCH)
+    no_cuts: bool = option(False, "Take a film that cuts as one shot.", panel=BATCH)
 
 
 @dataclass(frozen=True, eq=False)  # as a key of caches by identity: it has thousands of frames
@@ -157,3 +165,123 @@ def whole_shots(items: Sequence[Item], shots: Sequence[Shot]) -> list[Item]:
         name = PurePosixPath(shot.frames[0].name).with_name(shot.base.name).as_posix()
         alone.append(replace(shot.frames[0], output_base=shot.base, name=name))
     return alone
+
+
+@dataclass(frozen=True)
+class FilmOutput:
+    """The film to write, and its rate where that is given."""
+
+    path: Path
+    rate: Fraction | None = None
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the frames, which goes when the film is whole."""
+        return self.path.with_name(f"{self.path.name}.frames")
+
+    @property
+    def formats(self) -> tuple[Format, ...]:
+        """The format of the frames."""
+        return (_FORMATS[self.path.suffix.lower()],)
+
+    def check(self, items: Sequence[Item], shots: Sequence[Shot], images: Sequence[Path]) -> None:
+        """Raise UsageError unless the images are the frames of one film."""
+        photos = len(items) - sum(len(shot.frames) for shot in shots)
+        one = len(items) == len(images) if shots else len(images) > 1
+        if photos + len(shots) != 1 or not one:
+            raise UsageError(
+                f"-o {self.path}: is one film; give one film and one light, or one photo and --rotate "
+                "FROM:TO:N, or a folder with -o"
+            )
+        if any(item.input_path.resolve() == self.path.resolve() for item in items):
+            raise UsageError(f"-o {self.path}: is the input; give another name")
+        if self.rate and shots and shots[0].film:
+            raise UsageError("--fps: a film keeps its own times; leave it out")
+
+    def key_of_new(
+        self,
+        items: Sequence[Item],
+        shots: Sequence[Shot],
+        images: Sequence[Path],
+        recipes_of: RecipesOf,
+        batch: BatchOptions,
+    ) -> str:
+        """The key of the film that is to be made of images; empty in a dry run and if it is finished."""
+        self.check(items, shots, images)
+        if batch.dry_run:
+            print(f"{items[0].input_path} -> {self.path}")
+            return ""
+        key = self.key(items, recipes_of)
+        if self.is_finished(key, batch.overwrite):
+            log.info("%s: already finished", self.path)
+            return ""
+        return key
+
+    def key(self, items: Sequence[Item], recipes_of: RecipesOf) -> str:
+        """Identify what the film is made from: inputs and recipes."""
+        import hashlib
+        import json
+
+        from facerf_cli.files.texts import file_sha256
+
+        digest_of = cache(file_sha256)
+        made_from = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
+        return hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()[:16]
+
+    def is_finished(self, key: str, overwrite: Overwrite) -> bool:
+        """True if the film is there and need not be made again: its metadata say what it was made from."""
+        from facerf_cli.files.film import comment_of
+
+        if overwrite == "always" or not self.path.is_file():
+            return False
+        return overwrite == "never" or key in comment_of(self.path)
+
+    def joined(self, images: Sequence[Path], shots: Sequence[Shot], key: str, code: int) -> int:
+        """Write the film from its frames, in order, and remove them, unless some failed; the exit code."""
+        if code or not all(path.exists() for path in images):
+            log.error("%s: not written, since frames failed; the others stay in %s", self.path, self.folder)
+            return 1
+        from facerf_cli.files.film import Timing, film_timing, write_film
+        from facerf_cli.run.logs import Provenance
+
+        source = shots[0].film if shots else None
+        timing = film_timing(source) if source else Timing.steady(len(images), self.rate or _RATE)
+        facts = Provenance(source.name if source else "").attributes()
+        said = "; ".join(f"{name}={value}" for name, value in facts.items())
+        write_film(self.path, images, timing, f"Synthetic: relit by a trained model; {said}; made from {key}")
+        self._remove_frames([*images, *(shot.track for shot in shots)])
+        print(self.path)
+        return 0
+
+    def _remove_frames(self, files: Sequence[Path]) -> None:
+        for path in (*files, *self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")):
+            path.unlink(missing_ok=True)
+        if not any(self.folder.iterdir()):
+            self.folder.rmdir()
+
+
+def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
+    """The film that `-o` names; None where it names a folder."""
+    suffix = output.suffix.lower()
+    if suffix not in _FORMATS or output.is_dir():
+        if suffix in FILM_SUFFIXES and not output.is_dir():
+            raise UsageError(f"-o {output}: films are written as .mp4 or .mov; give one of these")
+        if rate is not None:
+            raise UsageError("--fps: is for -o FILE.mp4 or FILE.mov; leave it out")
+        folder_not_file(output)
+        return None
+    from facerf_cli.files.film import require_av
+
+    require_av(output)
+    return FilmOutput(output, rate)
+
+
+def film_rate(text: str) -> Fraction:
+    """Parse `--fps`, frames a second."""
+    try:
+        rate = Fraction(text)
+    except (ValueError, ZeroDivisionError):
+        rate = Fraction(0)
+    if not 0 < rate <= _MOST_RATE:
+        raise UsageError(f"--fps {text}: not a rate; give frames a second, such as 25 or 24000/1001")
+    return rate

@@ -36,12 +36,7 @@ class TrainOptions:
 
     settings: Settings
     output: Path = option(
-        Path(),
-        "Write the run to this folder.",
-        "DIR",
-        flags=("--output", "-o"),
-        panel=_RUN,
-        required=True,
+        Path(), "Write the run to this folder.", "DIR", flags=("--output", "-o"), panel=_RUN, required=True
     )
     preset: Preset = option(
         "default",
@@ -66,10 +61,7 @@ class TrainOptions:
         panel=_RUN,
     )
     resume: bool = option(
-        False,
-        "Continue the run in DIR from its last save; give the same options.",
-        flags=("--resume",),
-        panel=_RUN,
+        False, "Continue the run in DIR from its last save; give the same options.", panel=_RUN
     )
     start_from: Path | None = option(
         None,
@@ -109,10 +101,7 @@ class TrainOptions:
         panel=_DATA,
     )
     fit_with: str = option(
-        "builtin",
-        "Fit this face model to the heads; a dataset's own model.",
-        "NAME|PATH",
-        panel=_DATA,
+        "builtin", "Fit this face model to the heads; a dataset's own model.", "NAME|PATH", panel=_DATA
     )
     heads: int | None = option(
         None, "Bake so many synthetic heads.", shown_default="240; tiny 16", least=2, panel=_DATA
@@ -148,16 +137,10 @@ class TrainOptions:
         panel=_LOSSES,
     )
     without_normals: bool = option(
-        False,
-        "Train the Reflectance Network without normal maps (ablation).",
-        flags=("--without-normals",),
-        panel=_LOSSES,
+        False, "Train the Reflectance Network without normal maps (ablation).", panel=_LOSSES
     )
     mean_face: bool = option(
-        False,
-        "Fit poses alone, with the mean face for everyone (ablation).",
-        flags=("--mean-face",),
-        panel=_LOSSES,
+        False, "Fit poses alone, with the mean face for everyone (ablation).", panel=_LOSSES
     )
     geometry: Geometry = option(
         "network",
@@ -220,10 +203,7 @@ class PaceOptions:
         panel=_SPEED,
     )
     compile: bool = option(
-        False,
-        "Compile the networks with torch; the first steps take minutes.",
-        flags=("--compile",),
-        panel=_SPEED,
+        False, "Compile the networks with torch; the first steps take minutes.", panel=_SPEED
     )
 
     def of_run(self, options: TrainOptions) -> TrainSettings:

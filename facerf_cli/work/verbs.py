@@ -255,7 +255,7 @@ class PredictOlat:
         "Write OpenEXR; or a folder for the web viewers Relight and OpenLIME, front lights only.",
         panel=IMAGE,
     )
-    page: bool = option(False, "Write the web page of `facerf view`, too.", flags=("--page",), panel=IMAGE)
+    page: bool = option(False, "Write the web page of `facerf view`, too.", panel=IMAGE)
 
     def run(self, inputs: Sequence[str], batch: BatchOptions, process: "Process[PredictOlat]") -> int:
         """Predict the stacks of the inputs by `process`; return the exit code."""
@@ -387,7 +387,6 @@ class ConvertLight:
         False,
         "Keep the plain series of spherical harmonics, negative in places (default: the nearest "
         "non-negative light).",
-        flags=("--signed",),
         panel=LIGHT,
     )
 
