@@ -56,7 +56,8 @@ def relight(
     for name, needed in NEEDS.items():
         if not set(needed) & set(formats):
             refuse_given(context, (name,), f"is for {', '.join(needed)}; add that to --format")
-    work = replace(work, output=replace(work.output, formats=formats))
+    asked = work.composite == "photo" and not is_default(context, "composite")
+    work = replace(work, output=replace(work.output, formats=formats), asked_for_photo=asked)
     batch = replace(batch, output=output, name=work.name)
     raise typer.Exit(work.run(inputs, sources, shots, batch, film, _process))
 

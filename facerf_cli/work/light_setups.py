@@ -52,6 +52,14 @@ class LightSources:
         shown_default="as they are",
         panel=LIGHT,
     )
+    sampling: Sampling | None = option(
+        None,
+        "Give each light the map's integral over its cell; share it smoothly among lights; or, as in the "
+        "paper, one pixel.",
+        flags=("--envmap-sampling",),
+        shown_default="cell; smooth for --rotate FROM:TO:N",
+        panel=LIGHT,
+    )
 
 
 @dataclass(frozen=True)

@@ -124,14 +124,7 @@ class Relight:
         flags=("--lights",),
         panel=LIGHT,
     )
-    sampling: Sampling | None = option(
-        None,
-        "Give each light the map's integral over its cell; share it smoothly among lights; or, as in the "
-        "paper, one pixel.",
-        flags=("--envmap-sampling",),
-        shown_default="cell; smooth for --rotate FROM:TO:N",
-        panel=LIGHT,
-    )
+    sampling: Sampling = "cell"
     pose: str | None = option(
         None,
         "Turn the head to a pose, in degrees; shows the face alone.",
@@ -161,10 +154,11 @@ class Relight:
         panel=IMAGE,
     )
     output: OutputOptions = field(default_factory=OutputOptions)
-    composite: Composite | None = option(
-        None,
+    composite: Composite = option(
+        "photo",
         "Show the photo with its face relit, or the rendered face alone, with alpha.",
         shown_default="photo; face with --pose",
+        typed=Composite | None,
         panel=IMAGE,
     )
     background: BackgroundChoice = option(
@@ -292,7 +286,7 @@ class Relight:
     def _checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> "Relight":
         """These options with the setups, and with what depends on other options; raises UsageError."""
         alone = self.composite == "face" or self.pose is not None
-        if self.pose is not None and self.composite == "photo":
+        if self.pose is not None and self.asked_for_photo:
             raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
         parse_pose(self.pose)
         parse_lights(self.rig)
@@ -313,9 +307,8 @@ class Relight:
             self,
             photo=photo,
             setups=collect_setups(sources, batch.output, photo.settings.seed, how),
-            sampling=self.sampling or ("smooth" if sweeps else "cell"),
+            sampling=sources.sampling or ("smooth" if sweeps else "cell"),
             composite="face" if alone else "photo",
-            asked_for_photo=self.composite == "photo",
             reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
         )
 
