@@ -157,7 +157,7 @@ def test_the_projection_is_the_slow_one() -> None:
 def test_the_projection_is_that_of_the_same_map_cut_finer(height: int, width: int) -> None:
     envmap = drawn(height, width, 3)
     finer = envmap.repeat_interleave(5, 0).repeat_interleave(7, 1)
-    coarse, fine = latlong_coefficients(envmap, 20), latlong_coefficients(finer, 20)
+    coarse, fine = latlong_coefficients(envmap, 10), latlong_coefficients(finer, 10)
     torch.testing.assert_close(coarse, fine, rtol=0, atol=1e-5)
 
 

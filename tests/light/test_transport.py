@@ -38,7 +38,7 @@ def test_occlusion_agrees_with_the_brute_force_oracle() -> None:
     assert 0.2 < found.mean() < 0.9
 
 
-@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (0.8, 0.0, 0.6), (-0.5, 0.7, 0.51)])
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (-0.5, 0.7, 0.51)])
 def test_shadows_agree_with_the_rasterizer_seen_from_the_light(
     head: tuple[np.ndarray, ...], direction: tuple
 ) -> None:
