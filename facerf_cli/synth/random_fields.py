@@ -17,6 +17,7 @@ from facerf_cli.raster.texture import texel_centres_uv
 # Range of u and of v: the UV map of the face, and the wider canvas for the skin of the whole head.
 UV_SPAN, CANVAS_SPAN = (0.0, 1.0), (-0.5, 1.5)
 LANDMARK_MM = (LANDMARK_UV - [0.5, 0]) * UV_SIZE_MM  # [68, 2], as `places_mm`
+Random = np.random.Generator
 _PAIRED = ("eyes", "brows", "nostrils")  # `inside_mm` covers only the left part of these
 
 

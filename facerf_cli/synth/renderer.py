@@ -20,7 +20,7 @@ from torch import Tensor
 from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.mesh import PARTS, HeadMesh, doubled_areas
 from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, widened_lobes
 from facerf_cli.synth.views import Facets, StageCamera, facets_of
 
@@ -148,8 +148,7 @@ def _spreads(head: HeadMesh, skin: np.ndarray, appearance: Appearance) -> list[l
 
 def _vertex_areas_m2(head: HeadMesh) -> np.ndarray:
     """A third of the area of all triangles at each vertex [V]."""
-    a, b, c = (head.vertices[head.triangles[:, k]].astype(np.float64) for k in range(3))
-    third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
+    third = doubled_areas(head.vertices[head.triangles].astype(np.float64)) / 6
     return np.bincount(head.triangles.ravel(), third.repeat(3), minlength=len(head.vertices))
 
 

@@ -26,7 +26,7 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.head.body import clearance_m
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh
+from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.renderer import lenses_in, over_lenses
 from facerf_cli.synth.stage_settings import StageSettings
 from facerf_cli.synth.subjects import Subject, subject_model
@@ -121,7 +121,7 @@ def photograph_subject(
         _BAKE,
         settings.seed,
         wanted=_visible_vertices(mesh, cameras),
-        two_sided=mesh.part == PARTS.index("hair"),
+        two_sided=mesh.is_part("hair"),
         clearance_m=clearance_m(mesh),
     )
     irradiance = renderer.scattered_irradiance(mesh, appearance, transport)
@@ -187,7 +187,7 @@ def write_subject(
 
 def _save_transport(path: Path, subject: Subject, transport: MeshTransport, settings: StageSettings) -> None:
     """Write the bake resampled to UV space, head frame, in the form of `bake_heads.bake_head`."""
-    skin = np.flatnonzero(subject.mesh.part == PARTS.index("skin"))
+    skin = np.flatnonzero(subject.mesh.is_part("skin"))
     texels = bake_attributes(subject.face_vertices, GRID, _TRANSPORT_SIDE).permute(1, 2, 0).reshape(-1, 3)
     rotation = subject.head_to_world.numpy()
     distances, near = cKDTree(subject.mesh.vertices[skin]).query(texels.numpy() @ rotation.T, 3)

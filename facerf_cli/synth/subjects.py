@@ -19,6 +19,7 @@ from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh, joined
 from facerf_cli.synth.head.worn import Headwear, draw_earrings, draw_hand, draw_headwear, draw_microphone
+from facerf_cli.synth.random_fields import Random
 from facerf_cli.synth.views import more_landmarks
 
 _SMALL_PX = 96  # images up to this side show coarse meshes
@@ -103,7 +104,7 @@ def _worn(
     lobes: list[np.ndarray],
     appearance: Appearance,
     headwear: Headwear | None,
-    random: np.random.Generator,
+    random: Random,
 ) -> tuple[list[HeadMesh], HeadMesh | None, dict[str, Any]]:
     """Draw what a head wears and holds, with lashes and beard; return also lenses and the traits."""
     beard = grow_beard(bare, appearance.traits, random)

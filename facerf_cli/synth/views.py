@@ -297,7 +297,7 @@ def more_landmarks(mesh: HeadMesh) -> dict[str, np.ndarray]:
 
 def _iris(mesh: HeadMesh, sign: int) -> dict[str, np.ndarray]:
     """Centre and outline of the iris on one side: means of the nearest vertices by the eyeball's texture."""
-    ball = np.flatnonzero((mesh.part == PARTS.index("eye")) & (mesh.vertices[:, 0] * sign > 0))
+    ball = np.flatnonzero((mesh.is_part("eye")) & (mesh.vertices[:, 0] * sign > 0))
     turn = np.arange(IRIS_POINTS) / IRIS_POINTS * 2 * np.pi
     ring = 0.5 + IRIS_DEG / 180 * np.stack([np.cos(turn), -np.sin(turn)], -1)
     found = {}

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.bank.portrait_samples import SMALL, PortraitSample, PortraitSource
+from facerf_cli.synth.bank.transport import SMALL, PortraitSample, PortraitSource
 from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
 
 _VALIDATION_SEED = 20216

@@ -31,14 +31,18 @@ from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
 from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
-from facerf_cli.synth.bank.face_crops import RenderedFaces
-from facerf_cli.synth.bank.head_images import add_head_images
+from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
-from facerf_cli.synth.bank.portrait_samples import PortraitSource, StoredTransport
 from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, load_backgrounds
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.synth.bank.transport import TransportBankSettings, add_proxies, add_transport
+from facerf_cli.synth.bank.transport import (
+    PortraitSource,
+    StoredTransport,
+    TransportBankSettings,
+    add_proxies,
+    add_transport,
+)
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings

@@ -56,15 +56,11 @@ def test_a_script_without_its_data_says_so_and_succeeds(
     assert line.startswith(f"{script}: skipped: needs ") and line.endswith(f"; give {DATA[script]}")
 
 
-@pytest.mark.parametrize(
-    "command", ["colour_charts --images 1", "relighting_speed --lights 4 --side 32 --images 10"]
-)
 def test_a_script_without_data_runs_to_its_end(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    script, *options = command.split()
-    monkeypatch.setattr(sys, "argv", [f"{script}.py", *options])
-    importlib.import_module(script).main()
+    monkeypatch.setattr(sys, "argv", ["colour_charts.py", "--images", "1"])
+    importlib.import_module("colour_charts").main()
     assert capsys.readouterr().out
 
 

@@ -13,7 +13,7 @@ from facerf_cli.synth.appearance.materials import Appearance, Material
 from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
-from facerf_cli.synth.views import StageCamera, more_landmarks, truth_of
+from facerf_cli.synth.views import StageCamera, more_landmarks, stage_cameras, truth_of
 
 SIDE_PX, RADIUS_M, FAR_M = 64, 0.05, 10.0
 
@@ -71,6 +71,14 @@ def test_normals_and_positions_are_in_camera_space() -> None:
     assert turned.classes[middle, middle, class_index("skin")] > 0.99
     np.testing.assert_allclose(turned.normals[middle, middle], [0, 0, 1], atol=0.03)
     assert turned.positions_m[middle, middle, 2] > -FAR_M + 0.9 * RADIUS_M
+
+
+def test_eight_cameras_stand_before_the_face_at_one_distance() -> None:
+    cameras = stage_cameras(64)
+    places = torch.stack([-c.head_to_camera.T.float() @ c.translation_m.float() for c in cameras])
+    assert len(cameras) == 8 and (places[:, 2] > 0).all()
+    assert torch.allclose(places.norm(dim=1), torch.tensor(1.2), atol=1e-5)
+    assert places[1, 0] < 0 < places[2, 0] and places[7, 1] > 0
 
 
 def test_layers_have_the_names_of_all_classes() -> None:

@@ -11,8 +11,7 @@ from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.synth.bank.face_crops import RenderedFaces
-from facerf_cli.synth.bank.head_images import add_head_images
+from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.loop import seeded
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.face.topology import UV_SIZE_MM
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.appearance.people import People, each
 from facerf_cli.synth.random_fields import (
     LANDMARK_MM,
@@ -22,22 +23,9 @@ from facerf_cli.synth.random_fields import (
     splat,
 )
 
-# The brow from its inner to its outer end: half height, direction of the hairs (degrees above the direction
-# outward) and their length.
-_BROW_HALF_MM = (3.3, 4.2, 3.7, 2.6, 1.1)
-_BROW_RISE_DEG = (74, 48, 26, 10, -6)
-_BROW_LENGTH_MM = (5.0, 7.5, 8.5, 8.0, 6.0)
+_TABLES = tables_of(__file__)
 _BROW_HAIRS = 420  # per brow
 _BEARD_HAIRS_MM2 = 0.6  # per square millimetre
-# Upper edge of the beard, and lower edge of the scalp's hair: (distance from the midline in u, v) | ...
-_BEARD_EDGE = """
-0 0.80 | 0.05 0.80 | 0.075 0.755 | 0.11 0.72 | 0.14 0.68 | 0.20 0.665 | 0.30 0.60 | 0.38 0.49 | 0.43 0.40 |
-0.47 0.33 | 0.55 0.36 | 0.62 1.2 | 1.0 1.3
-"""
-_SCALP_EDGE = """
-0 -0.03 | 0.16 -0.035 | 0.29 -0.05 | 0.377 -0.01 | 0.443 0.10 | 0.49 0.20 | 0.525 0.30 | 0.549 0.40 |
-0.59 0.41 | 0.615 0.26 | 0.70 0.25 | 0.78 0.28 | 0.844 0.40 | 0.918 0.63 | 1.0 0.80
-"""
 
 
 @dataclass(frozen=True)
@@ -83,10 +71,10 @@ def _brows(people: People, window: Window, generator: torch.Generator) -> Tensor
     across = 1.8 * torch.rand(count, generator=generator) - 0.9
     across = across + 0.25 * normal() * (1 - across.abs())
     middle, outward_deg = _brow_line(along)
-    half = _lookup(_BROW_HALF_MM, along) * (0.75 + 0.35 * fullness)
-    rise = torch.deg2rad(_lookup(_BROW_RISE_DEG, along) + 26 * across + 9 * normal() + outward_deg)
+    half = _lookup("brow_half_mm", along) * (0.75 + 0.35 * fullness)
+    rise = torch.deg2rad(_lookup("brow_rise_deg", along) + 26 * across + 9 * normal() + outward_deg)
     bend = torch.deg2rad(-18 - 16 * normal().abs()) * (1 - along)
-    length = _lookup(_BROW_LENGTH_MM, along) * (0.75 + 0.4 * torch.rand(count, generator=generator))
+    length = _lookup("brow_length_mm", along) * (0.75 + 0.4 * torch.rand(count, generator=generator))
     roots = middle + torch.stack([torch.zeros(count), across * half], -1)
     # A hair starts behind its place, so that it is centred there.
     roots = roots - 0.35 * length[:, None] * torch.stack([rise.cos(), -rise.sin()], -1)
@@ -108,8 +96,9 @@ def _brow_line(along: Tensor) -> tuple[Tensor, Tensor]:
     )
 
 
-def _lookup(values: tuple[float, ...], at: Tensor) -> Tensor:
-    """Values interpolated at positions [N] in 0..1."""
+def _lookup(table: str, at: Tensor) -> Tensor:
+    """Values of a table interpolated at positions [N] in 0..1."""
+    values = _TABLES[table]
     found = np.interp(at.numpy(), np.linspace(0, 1, len(values)), values)
     return torch.from_numpy(found).float()
 
@@ -118,7 +107,7 @@ def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tens
     """Distance [1 or B, 1, T, T] in millimetres below an edge, the same on both sides of the face."""
     x, y = places_mm(window)
     out = (x.abs() / float(UV_SIZE_MM[0])).clamp(max=1)
-    u, v = np.array(edge.replace("|", " ").split(), float).reshape(-1, 2).T
+    u, v = np.array(_TABLES[edge]).T
     edge_mm = torch.from_numpy(np.interp(out.numpy(), u, v) * UV_SIZE_MM[1]).float()
     return (y - edge_mm)[None, None] - shift_mm
 
@@ -127,7 +116,7 @@ def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tens
 def beard_density(window: Window) -> Tensor:
     """Density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
     x, y = places_mm(window)
-    lower = smooth(_below_edge(window, _BEARD_EDGE) / 20 + 0.5)
+    lower = smooth(_below_edge(window, "beard_edge") / 20 + 0.5)
     neck = smooth((186 - y) / 36)[None, None]
     moustache = smooth((36 - x.abs()) / 12) * smooth((y - 104) / 8) * smooth((134 - y) / 10)
     chin = 0.6 * blob(window, 8, 16) + 0.8 * blob(window, (0.5, 0.83), 8, 0.8)
@@ -201,4 +190,4 @@ def scalp_hair(people: People, window: Window, above_mm: Tensor, generator: torc
 
 def above_hairline(people: People, window: Window) -> Tensor:
     """Distance [B, 1, T, T] in millimetres above each person's hairline."""
-    return -_below_edge(window, _SCALP_EDGE, each(people.hairline_mm))
+    return -_below_edge(window, "scalp_edge", each(people.hairline_mm))

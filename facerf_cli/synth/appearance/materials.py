@@ -8,6 +8,7 @@ from torch import Tensor
 
 from facerf_cli.image.metrics import ita_deg
 from facerf_cli.raster.texture import texel_centres_uv
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.appearance.people import (
     People,
     draw_people,
@@ -21,14 +22,7 @@ from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_n
 
 _SIDE = 256  # of the textures of eyes and cloth
 _CLOTHS = ("plain", "plain", "plain", "heather", "stripes", "check")
-# Common colours of garments, linear Rec.709: whites, greys, black, blues, browns, greens, reds, pastels.
-_DYES = (
-    *((0.70, 0.69, 0.66), (0.72, 0.72, 0.72), (0.55, 0.52, 0.45), (0.25, 0.25, 0.26)),
-    *((0.09, 0.09, 0.10), (0.020, 0.020, 0.022), (0.025, 0.025, 0.025), (0.014, 0.022, 0.055)),
-    *((0.03, 0.06, 0.14), (0.10, 0.17, 0.30), (0.30, 0.42, 0.60), (0.36, 0.26, 0.15)),
-    *((0.10, 0.055, 0.03), (0.07, 0.075, 0.03), (0.02, 0.06, 0.035), (0.16, 0.014, 0.02)),
-    *((0.40, 0.03, 0.03), (0.50, 0.24, 0.24), (0.52, 0.40, 0.12), (0.24, 0.10, 0.22)),
-)
+_DYES = tables_of(__file__)["dyes"]  # of garments, linear Rec.709
 _HAIR_WISPS = 512  # different wisps in the texture of hair
 _PAINTED_HAIR = ("bald", "hairline_mm")  # parameters of painted scalp hair; here hair is geometry
 

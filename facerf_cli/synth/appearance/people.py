@@ -21,6 +21,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, rgb_to_xyz
 from facerf_cli.raster.texture import texel_centres_uv
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, places_mm, plain_noise
 
 DARKEST, LIGHTEST = 0.23, 0.0075  # melanin fractions of the darkest and of the lightest skin
@@ -123,26 +124,7 @@ def each(values: Tensor) -> Tensor:
 
 
 WAVELENGTHS_NM = np.arange(400, 721, 10.0)
-# Molar extinction /(cm mol/l) at `WAVELENGTHS_NM`, from Prahl's table.
-_OXYHAEMOGLOBIN = """
-266232 466840 480360 246072 102580 62816 44480 33209.2 26629.2 23684.4 20932.8 20035.2 24202.4 39956.8 53236
-43016 32613.2 44496 50104 14400.8 3200 1506 942 610 442 368 319.6 294 277.6 276 290 314 348
-"""
-_DEOXYHAEMOGLOBIN = """
-223296 303956 407560 528600 413280 103292 23388.8 16156.4 14550 16684 20862 25773.6 31589.6 39036.4 46592
-53412 53788 45072 37020 28324.4 14677.2 9443.6 6509.6 5148.8 4345.2 3750.12 3226.56 2795.12 2407.92 2051.96
-1794.28 1540.48 1325.88
-"""
-# CIE 1931 observer times D65 at `WAVELENGTHS_NM` (ISO/CIE 11664), in percent of white: x y z | x y z ...
-_OBSERVER = """
-0.112 0.003 0.532 | 0.377 0.01 1.799 | 1.189 0.035 5.72 | 2.33 0.095 11.389 | 3.459 0.228 17.372 |
-3.725 0.421 19.662 | 3.244 0.669 18.647 | 2.125 0.989 14.024 | 1.05 1.525 8.936 | 0.33 2.142 4.8 |
-0.051 3.343 2.82 | 0.095 5.131 1.617 | 0.628 7.041 0.778 | 1.688 8.784 0.431 | 2.871 9.426 0.201 |
-4.271 9.796 0.086 | 5.63 9.416 0.037 | 6.952 8.679 0.019 | 8.312 7.886 0.015 | 8.619 6.353 0.009 |
-9.054 5.375 0.007 | 8.507 4.265 0.003 | 7.096 3.162 0.002 | 5.067 2.089 0 | 3.55 1.386 0 |
-2.148 0.81 0 | 1.253 0.463 0 | 0.681 0.249 0 | 0.347 0.126 0 | 0.15 0.054 0 | 0.077 0.028 0 |
-0.041 0.015 0 | 0.017 0.006 0
-"""
+_TABLES = tables_of(__file__)
 _BLOOD_G_PER_L, _HAEMOGLOBIN_G_PER_MOL = 150.0, 64500.0  # haemoglobin in blood; its molar mass
 _OXYGENATION = 0.70  # fraction of haemoglobin
 _PHEOMELANIN_SHARE = 0.26  # fraction of melanin
@@ -175,7 +157,7 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
 
 def _blood_absorption() -> np.ndarray:
     """Absorption [33] of whole blood, per cm."""
-    oxy, deoxy = (np.array(text.split(), float) for text in (_OXYHAEMOGLOBIN, _DEOXYHAEMOGLOBIN))
+    oxy, deoxy = (np.array(_TABLES[name], float) for name in ("oxyhaemoglobin", "deoxyhaemoglobin"))
     molar = _OXYGENATION * oxy + (1 - _OXYGENATION) * deoxy
     return np.log(10) * molar * _BLOOD_G_PER_L / _HAEMOGLOBIN_G_PER_MOL
 
@@ -198,7 +180,7 @@ def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> t
 @lru_cache(maxsize=1)
 def observer_weights() -> np.ndarray:
     """Matrix [33, 3] from reflectance at `WAVELENGTHS_NM` to XYZ under D65; white has the colour of D65."""
-    return np.array(_OBSERVER.replace("|", " ").split(), float).reshape(-1, 3) / 100
+    return np.array(_TABLES["observer"], float) / 100
 
 
 @lru_cache(maxsize=1)

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 from torch import Tensor
 
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.appearance.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
 from facerf_cli.synth.appearance.people import People, draw_people, each, hair_albedo, paint_eyes, skin_albedo
 from facerf_cli.synth.head.mesh import arc_lengths
@@ -34,19 +35,7 @@ from facerf_cli.synth.random_fields import (
 
 _WRINKLE_WIDTH_MM = 0.9  # sigma of a wrinkle's profile
 _STEP_MM = 0.4  # between sample points along a wrinkle
-# Wrinkles on the right side of the image, each of which has a mirror image: name, depth at 75 years in
-# millimetres, and points (landmark, x offset, y offset in millimetres).
-_FOLDS: dict[str, tuple[float, tuple[tuple[int, float, float], ...]]] = {
-    "nasolabial": (0.50, ((35, 5, -6), (35, 10, 2), (54, 6, -9), (54, 8.5, 0), (54, 8, 7))),
-    "marionette": (0.28, ((54, 3, 3), (54, 5, 9), (54, 6, 17))),
-    "crow's foot, upper": (0.22, ((45, 6, -3), (45, 14, -8), (45, 22, -11))),
-    "crow's foot, middle": (0.24, ((45, 6, 0), (45, 15, 0), (45, 24, 1))),
-    "crow's foot, lower": (0.22, ((45, 5, 4), (45, 13, 8), (45, 21, 14))),
-    "under the eye": (0.25, ((42, -1, 6), (47, 0, 9), (46, 2, 9.5), (45, 2, 7))),
-    "tear trough": (0.22, ((42, -2, 5), (42, 2, 11), (47, 4, 16))),
-    "frown": (0.28, ((22, -5, 8), (22, -4, 1), (22, -5, -7))),
-    "cheek": (0.16, ((54, 20, -14), (54, 24, 0), (54, 22, 14))),
-}
+_FOLDS = tables_of(__file__)  # wrinkles by name
 _FOREHEAD_MM = (-12.0, 0.0, 11.0)  # heights of the forehead's lines around a line above the brows
 _FOREHEAD_HALF_MM = 46.0  # half length
 _FOREHEAD_DEPTH_MM = 0.3
@@ -89,9 +78,10 @@ def _fold_lines() -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     The mirror image of a fold is a separate fold and follows it.
     """
     folds = [
-        np.array([LANDMARK_MM[index] + [dx, dy] for index, dx, dy in points]) for _, points in _FOLDS.values()
+        np.array([LANDMARK_MM[int(index)] + [dx, dy] for index, dx, dy in fold["points"]])
+        for fold in _FOLDS.values()
     ]
-    depths = [depth for depth, _ in _FOLDS.values()]
+    depths = [fold["depth_mm"] for fold in _FOLDS.values()]
     folds = [fold * [side, 1] for fold in folds for side in (1, -1)]
     depths = [depth for depth in depths for _ in "ab"]
     x = np.linspace(-_FOREHEAD_HALF_MM, _FOREHEAD_HALF_MM, 7)
@@ -235,12 +225,7 @@ def paint_skin(people: People, window: Window, generator: torch.Generator, paint
 
 
 def _pigments(
-    people: People,
-    window: Window,
-    coarse: Tensor,
-    middle: Tensor,
-    fine: Tensor,
-    generator: torch.Generator,
+    people: People, window: Window, coarse: Tensor, middle: Tensor, fine: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Draw melanin and blood [B, 1, T, T], with facial regions, blotches, freckles and moles."""
     count = len(people.melanin)

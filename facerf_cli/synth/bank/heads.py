@@ -6,14 +6,14 @@ Noisy landmarks give the crop and the fit of each photo, as in the pipeline. Unw
 
 import re
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -29,20 +29,23 @@ from facerf_cli.face.topology import (
     grid_uv,
     landmark_weights,
 )
-from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.camera import Camera, crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv, unwrap
-from facerf_cli.run.workers import in_shards
+from facerf_cli.synth.bank import Entries, fill
 from facerf_cli.synth.bank.texture_samples import HeadFields, Sample, draw_sample, head_fields
+from facerf_cli.synth.random_fields import Random
 
 # Expression shapes that are never drawn: they do not move skin, or correct another shape.
 _LEFT_OUT = ("PupilDilate", "mouthClose", "eyeLook")
 _COMMON = ("jawOpen", "jaw_open", "mouthSmile", "smile")  # drawn more often, as in photos
 _SIDE = re.compile(r"(?<!jaw)_(L|R|left|right)$")  # paired shapes; the jaw moves to one side only
 _BAKE = BakeSettings(light_samples=4, bounce_samples=16)
+
+
+cached_face_model = lru_cache(maxsize=2)(load_face_model)  # a worker loads a model once
 
 
 @dataclass(frozen=True)
@@ -70,9 +73,10 @@ def bake_heads(
     Raises InputError for heads of another face model, which would be used under the wrong name and licence.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    _require_face_model(load_face_model(face_model).name, folder)
+    name = load_face_model(face_model).name
+    _require_face_model(name, folder)
     missing = [index for index in range(count) if not (folder / f"{index:05d}.safetensors").exists()]
-    in_shards(partial(_bake_shard, folder, face_model, seed, settings), missing, jobs)
+    fill(partial(_baked, folder, face_model, seed, settings), missing, jobs, {"face_model": name})
 
 
 def _require_face_model(name: str, folder: Path) -> None:
@@ -83,16 +87,9 @@ def _require_face_model(name: str, folder: Path) -> None:
             raise InputError(f"{path}: the head is of face model {found}, not of {name}; give another --bank")
 
 
-def _bake_shard(
-    folder: Path, face_model: str, seed: int, settings: HeadBakeSettings, indices: list[int]
-) -> None:
-    torch.set_num_threads(1)
-    model = load_face_model(face_model)
-    for index in indices:
-        tensors = bake_head(model, index, seed, settings)
-        unfinished = folder / f"{index:05d}.partial"
-        save_file(tensors, unfinished, metadata={"face_model": model.name})
-        unfinished.rename(folder / f"{index:05d}.safetensors")
+def _baked(folder: Path, face_model: str, seed: int, settings: HeadBakeSettings, index: int) -> Entries:
+    tensors = bake_head(cached_face_model(face_model), index, seed, settings)
+    return [(folder / f"{index:05d}.safetensors", tensors)]
 
 
 def bake_head(model: MorphableModel, index: int, seed: int, settings: HeadBakeSettings) -> dict[str, Tensor]:
@@ -128,7 +125,7 @@ def bake_head(model: MorphableModel, index: int, seed: int, settings: HeadBakeSe
     }
 
 
-def _free_deformation(random: np.random.Generator, settings: HeadBakeSettings) -> Tensor:
+def _free_deformation(random: Random, settings: HeadBakeSettings) -> Tensor:
     """Draw a smooth deformation [V, 3] (m) from the built-in model's Gaussian process."""
     basis = load_face_model(BUILTIN).identity
     weights = torch.from_numpy(random.normal(0, settings.free_std, len(basis))).float()
@@ -145,7 +142,7 @@ def mean_coefficients(model: MorphableModel) -> tuple[Tensor, Tensor]:
 
 
 def draw_coefficients(
-    model: MorphableModel, random: np.random.Generator, settings: HeadBakeSettings
+    model: MorphableModel, random: Random, settings: HeadBakeSettings
 ) -> tuple[Tensor, Tensor]:
     """Draw an identity alpha [Ki] and an expression beta [Ke] of a few shapes, nearly equal on both sides."""
     spread = random.uniform(*settings.identity_std)
@@ -248,7 +245,7 @@ class HeadPhoto:
     landmarks_px: Tensor  # [68, 2] in the crop, with the errors of a detector
 
 
-def photograph_head(vertices: Tensor, random: np.random.Generator, settings: ViewSettings) -> HeadPhoto:
+def photograph_head(vertices: Tensor, random: Random, settings: ViewSettings) -> HeadPhoto:
     """Take one random photo of a head [V, 3] (head frame)."""
     frontal = random.random() < settings.frontal_share
     spread = np.array([settings.yaw_deg, settings.pitch_deg, settings.roll_deg]) * (0.3 if frontal else 1.0)
@@ -278,7 +275,7 @@ def photograph_head(vertices: Tensor, random: np.random.Generator, settings: Vie
     return HeadPhoto(vertices_camera, rotation, camera, in_crop)
 
 
-def _detected(landmarks_px: Tensor, random: np.random.Generator, settings: ViewSettings) -> Tensor:
+def _detected(landmarks_px: Tensor, random: Random, settings: ViewSettings) -> Tensor:
     """Add the errors of a detector to landmarks [68, 2]: one per point, and one per part of the face."""
     eyes = landmarks_px[list(OUTER_EYE_CORNERS)]
     unit_px = float((eyes[0] - eyes[1]).norm())
@@ -336,19 +333,14 @@ def add_views(heads: Path, views: Path, fitted_with: str, count: int, jobs: int,
     """Write `count` fitted views of every baked head in `heads` to `views`; keep finished ones."""
     views.mkdir(parents=True, exist_ok=True)
     missing = [path for path in sorted(heads.glob("*.safetensors")) if not (views / path.name).exists()]
-    in_shards(partial(_add_views_shard, views, fitted_with, count, seed), missing, jobs)
+    name = load_face_model(fitted_with).name
+    fill(partial(_viewed, views, fitted_with, count, seed), missing, jobs, {"fitted_with": name})
 
 
-def _add_views_shard(views: Path, fitted_with: str, count: int, seed: int, heads: list[Path]) -> None:
-    torch.set_num_threads(1)
-    model = load_face_model(fitted_with)
-    for path in heads:
-        head = load_file(path)
-        tensors = build_views(
-            head["vertices"], model, count, head["visibility"].shape[-1], seed + int(path.stem)
-        )
-        with atomic_path(views / path.name) as temporary:
-            save_file(tensors, temporary, metadata={"fitted_with": model.name})
+def _viewed(views: Path, fitted_with: str, count: int, seed: int, path: Path) -> Entries:
+    head, model = load_file(path), cached_face_model(fitted_with)
+    seed, side = seed + int(path.stem), head["visibility"].shape[-1]
+    return [(views / path.name, build_views(head["vertices"], model, count, side, seed))]
 
 
 def load_bank(heads: Path, views: Path, provenance: dict[str, Any]) -> Bank:

@@ -13,7 +13,7 @@ make it*, 2021).
 import io
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.synth.bank import Batch
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.random_fields import Uniform
@@ -101,7 +102,7 @@ _BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the 
 
 
 @dataclass(frozen=True)
-class PortraitCrops:
+class PortraitCrops(Batch):
     """Crops of B photos as a screen shows them, and what the Parsing Network should see in them.
 
     crops [B, 3, S, S] in 0..1; alpha [B, S, S] in 0..1; label [B, S, S] long, class of what is covered;
@@ -116,10 +117,6 @@ class PortraitCrops:
     landmarks: Tensor
     known: Tensor
     present: Tensor
-
-    def to(self, device: torch.device) -> "PortraitCrops":
-        """Move the crops to `device`."""
-        return PortraitCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

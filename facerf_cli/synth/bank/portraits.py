@@ -22,12 +22,12 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
-from facerf_cli.run.workers import in_shards
 from facerf_cli.synth.appearance.materials import draw_appearance
+from facerf_cli.synth.bank import Entries, fill
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.portraits import BakedPortrait, bake_subject, photograph, view_of
-from facerf_cli.synth.random_fields import Uniform
+from facerf_cli.synth.random_fields import Random, Uniform
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.synth.subjects import draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
@@ -179,21 +179,18 @@ def add_portraits(
     """Photograph synthetic people into `folder`; keep finished ones. The face models take turns."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [index for index in people if not _path(folder, index).exists()]
-    in_shards(partial(_add_shard, folder, face_models, seed, settings), missing, jobs)
+    fill(partial(_photographed, folder, face_models, seed, settings), missing, jobs)
 
 
 def _path(folder: Path, index: int) -> Path:
     return folder / f"{index:05}.safetensors"
 
 
-def _add_shard(
-    folder: Path, face_models: list[str], seed: int, settings: PortraitBankSettings, people: list[int]
-) -> None:
-    torch.set_num_threads(1)
-    for index in people:
-        tensors = photos_of(face_models[index % len(face_models)], index, seed, settings)
-        with atomic_path(_path(folder, index)) as temporary:
-            save_file(tensors, temporary)
+def _photographed(
+    folder: Path, face_models: list[str], seed: int, settings: PortraitBankSettings, index: int
+) -> Entries:
+    face_model = face_models[index % len(face_models)]
+    return [(_path(folder, index), photos_of(face_model, index, seed, settings))]
 
 
 @torch.no_grad()
@@ -232,7 +229,7 @@ def photos_of(face_model: str, index: int, seed: int, settings: PortraitBankSett
     }
 
 
-def _draw_camera(side_px: int, random: np.random.Generator) -> StageCamera:
+def _draw_camera(side_px: int, random: Random) -> StageCamera:
     """Draw a camera: pose, distance, and how much of the person it shows."""
     limit = np.array(_POSE_MAX_DEG)
     pose_deg = (random.normal(0, _POSE_STD_DEG)).clip(-limit, limit)

@@ -21,6 +21,7 @@ from facerf_cli.face.topology import GRID, UV_SIZE_MM, grid_triangles
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.bank import Batch
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, noise, places_mm, smooth
 from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 
@@ -28,7 +29,7 @@ _FLASH_SHARE = 0.2  # share of draws that are lit by a flash near the camera
 
 
 @dataclass(frozen=True)
-class Sample:
+class Sample(Batch):
     """Textures of B faces with L target lights each, on the UV map of the fitted mesh, of equal exposure.
 
     Normals and lights are in camera space, of the source or of the target pose.
@@ -41,10 +42,6 @@ class Sample:
     lights: Tensor  # [B, L, 3] directions
     target: Tensor  # [B, L, 3, T, T]
     weight: Tensor  # [B, 1, T, T] of the loss
-
-    def to(self, device: torch.device) -> "Sample":
-        """Move the sample to `device`."""
-        return Sample(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 class SampleSource(Protocol):

@@ -6,26 +6,25 @@ skin, and skin under cloth is left out.
 """
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV, cylinder_uv
 from facerf_cli.light.transport import build_scene, hits_within
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.mesh import (
     GARMENTS,
-    PARTS,
     HeadMesh,
     cloth_like,
     joined,
     kept_triangles,
     loop_step,
     packed_mesh,
+    smooth_normals,
     smoothstep,
     strandless,
 )
 from facerf_cli.synth.head.worn import draw_neckwear
+from facerf_cli.synth.random_fields import Random
 
 _CHIN = 8  # landmark
 _LOWEST_CHIN_M = -0.085  # limit of the chin's height, so that an open mouth does not move the body
@@ -44,7 +43,7 @@ _NECKWEAR_SHARE = 0.15  # of people
 _SKIN_V = (1.02, 1.45)  # rows of the skin's texture, from the neck, that the body repeats
 
 
-def draw_body(head: HeadMesh, random: np.random.Generator, edge_m: float = 0.008) -> tuple[HeadMesh, str]:
+def draw_body(head: HeadMesh, random: Random, edge_m: float = 0.008) -> tuple[HeadMesh, str]:
     """Draw the upper body and a garment for a bare head; return all as one mesh, and the garment's name.
 
     The meshes are subdivided until their edges are shorter than `edge_m` on average.
@@ -54,7 +53,7 @@ def draw_body(head: HeadMesh, random: np.random.Generator, edge_m: float = 0.008
     origin = np.array([0, chin - _NECK_M, _neck_depth_m(head, chin - _NECK_M)])
     skin, faces = packed_mesh("body")
     skin = skin * grown + origin
-    low = (head.part == PARTS.index("skin")) & (head.vertices[:, 1] < chin - _LOW_M)
+    low = (head.is_part("skin")) & (head.vertices[:, 1] < chin - _LOW_M)
     drawn = _drawn_to(skin, head.vertices[low].astype(float))
     body = _body_skin(*_refined(skin + drawn, faces, edge_m), head, low)
     strapless = random.random() < _STRAPLESS_SHARE
@@ -73,7 +72,7 @@ def draw_body(head: HeadMesh, random: np.random.Generator, edge_m: float = 0.008
 
 def chin_height_m(head: HeadMesh) -> float:
     """Height of the underside of the chin, not below `_LOWEST_CHIN_M`."""
-    skin = head.part == PARTS.index("skin")
+    skin = head.is_part("skin")
     nearest = np.linalg.norm(head.uv[skin] - LANDMARK_UV[_CHIN], axis=-1).argmin()
     return max(float(head.vertices[skin][nearest, 1]) - 0.003, _LOWEST_CHIN_M)
 
@@ -85,7 +84,7 @@ def clearance_m(person: HeadMesh) -> np.ndarray:
 
 def _neck_depth_m(head: HeadMesh, level_m: float) -> float:
     """Depth z of the neck's middle at a height."""
-    skin = head.vertices[head.part == PARTS.index("skin")]
+    skin = head.vertices[head.is_part("skin")]
     ring = skin[np.abs(skin[:, 1] - level_m) < 0.006, 2]
     return float(ring.min() + ring.max()) / 2
 
@@ -113,17 +112,13 @@ def _refined(vertices: np.ndarray, faces: np.ndarray, edge_m: float) -> tuple[np
     return vertices, faces
 
 
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
-
-
 def _body_skin(vertices: np.ndarray, faces: np.ndarray, head: HeadMesh, low: np.ndarray) -> HeadMesh:
     """Skin of the body; near that of the head `low` [V] it has the head's normals and lies just under it."""
     tree = cKDTree(head.vertices[low].astype(float))
     distance, nearest = tree.query(vertices)
     share = np.exp(-((distance / 0.006) ** 2))[:, None]
     outward = head.normals[low][nearest]
-    normals = _normals(vertices, faces) * (1 - share) + outward * share
+    normals = smooth_normals(vertices, faces) * (1 - share) + outward * share
     uv = cylinder_uv(vertices)
     period = 2 * (_SKIN_V[1] - _SKIN_V[0])
     folded = np.abs((uv[:, 1] - _SKIN_V[0] + period / 2) % period - period / 2)
@@ -141,7 +136,7 @@ def _garment(
     outward = np.concatenate([body.normals, head.normals[low]]).astype(float)
     tree = cKDTree(points)
     for _ in range(3):
-        normals = _normals(vertices, faces)
+        normals = smooth_normals(vertices, faces)
         distance, near = tree.query(vertices)
         off = ((vertices - points[near]) * outward[near]).sum(-1)
         aside = np.sqrt(np.maximum(distance**2 - off**2, 0))
@@ -155,7 +150,7 @@ def _garment(
 def _without_hidden(skin: HeadMesh, garment: HeadMesh, chin: float) -> HeadMesh:
     """The person without the triangles of low skin that the garment hides."""
     scene = build_scene(garment.vertices, garment.triangles)
-    low = np.flatnonzero((skin.part == PARTS.index("skin")) & (skin.vertices[:, 1] < chin - _LOW_M))
+    low = np.flatnonzero((skin.is_part("skin")) & (skin.vertices[:, 1] < chin - _LOW_M))
     points, normals = skin.vertices[low], skin.normals[low]
     hidden = np.zeros(len(skin.vertices), bool)
     over, under = (

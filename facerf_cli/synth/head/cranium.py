@@ -20,42 +20,13 @@ from scipy.spatial.distance import cdist
 
 from facerf_cli.face.topology import BOTTOM_M, GRID, HALF_ANGLE_DEG, TOP_M, grid_uv
 from facerf_cli.run.workers import one_thread
+from facerf_cli.synth import tables_of
 
 BACK_U = 0.5 + 180 / (2 * HALF_ANGLE_DEG)  # the seam at the back of the head; its other side is 1 - BACK_U
 _CROWN_MM_PER_DEG = 1.4  # arc length over the crown
 CROWN_LEVEL = -90 * _CROWN_MM_PER_DEG / 1000 / (TOP_M - BOTTOM_M)  # of the pole
 NECK_LEVEL = 1.506  # of the lower end of the neck
 
-_AZIMUTHS_DEG = (0, 16, 32, 48, 61, 73, 87, 103, 120, 140, 160, 180)
-# Distances from the axis in millimetres at these azimuths. A row begins with the height in millimetres; in
-# the table of the crown it begins with the elevation in degrees as seen from the point (0, 92, 0).
-_CROWN_MM = """
- 90 |  52.5  52.5  52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5 52.5
- 70 |  56.5  56    55.5 55   54.5 54.5 54   53.5 53   52.5 52.5 52.5
- 50 |  65    64    63   61   59.5 58.5 57.5 57   56.5 55.5 55   55
- 32 |  78    76.5  73   69   66   64   63   62   61   60   59   58.5
- 16 |  93    90.5  84   77.5 73   70.5 68.5 67.5 66.5 65.5 64   63.5
-"""
-_SECTIONS_MM = """
-  92 | 108   106    96.5 87   81   77   75   73.5 73   72   70.5 70
-  76 | 113.5 111.5 102   91   84.5 80.5 78   77   76.5 76   75   74.5
-  59 | 117.5 116.5 106   92.5 85.5 81.5 79   78   78   77.5 77   76.5
-  42 | 111   111   107.5 93   85.5 81   78   76.5 76.5 76.5 75.5 75.5
-  25 | 108.5 109   106   95   84.5 78.5 75.5 73.5 73   72.5 72   72
-   8 | 112.5 112   109   94.5 82.5 75   71.5 68.5 67   66.5 66   65.5
-  -8 | 119   114.5 107.5 91.5 80   71.5 66.5 63   60.5 59   58.5 58
- -24 | 124   115   104   88.5 76   66.5 61.5 57.5 53.5 51.5 51   50.5
- -40 | 120.5 115   100   83.5 69.5 62.5 58.5 53.5 49.5 48.5 48   47.5
- -54 | 119.5 110    94   73.5 63   60   57   51.5 48.5 47.5 47   46.5
- -66 | 120   106.5  81   63   60   59   56   51.5 49   48.5 47.5 47.5
- -76 | 114    93    65.5 59   59   58.5 56   52.5 51   49.5 48.5 48.5
- -84 |  79.5  68    59   57   58   58.5 56.5 54.5 53.5 52   51   50.5
- -92 |  67    62.5  56.5 56   58   58   57   56   56   54.5 53   52.5
--104 |  61    57.5  54   55.5 57   58.5 59   60   60   58   56   56
--120 |  54    52.5  52   54   57   60   62.5 64   63.5 61.5 60   59.5
--140 |  48    48.5  50   53.5 58.5 63   67.5 70   69.5 66.5 64   63
--172 |  46    47.5  51   57   65   72.5 79   82.5 82   78   74   72
-"""
 _ROUNDING_MM = 0.3  # standard deviation of the table's rounding, which the spline smooths away
 _REACHES_MM = ((55.0, 1.0), (14.0, 0.03))  # (reach, variance) of broad and of small differences at the border
 _RING_STEP, _RING_INSIDE = 4, 5  # every fourth vertex of the border, and of a ring five cells further in
@@ -75,14 +46,14 @@ def average_head_mm(u: np.ndarray, level: np.ndarray) -> np.ndarray:
 @cache
 def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
     """Splines of distance from the axis and of height, in mm, over (arc length above `TOP_M`, azimuth)."""
-    crown, sections = _table(_CROWN_MM), _table(_SECTIONS_MM)
+    tables = {name: np.array(rows, float) for name, rows in tables_of(__file__).items()}
+    crown, sections, half = tables["crown_mm"], tables["sections_mm"], tables["azimuths_deg"]
     top = TOP_M * 1000
     elevation = np.radians(crown[:, :1])
     across = np.concatenate([crown[:, 1:] * np.cos(elevation), sections[:, 1:]])[::-1]
     heights = np.broadcast_to(sections[:, :1], sections[:, 1:].shape)
     y = np.concatenate([top + crown[:, 1:] * np.sin(elevation), heights])[::-1]
     length = np.concatenate([crown[:, 0] * _CROWN_MM_PER_DEG, sections[:, 0] - top])[::-1]
-    half = np.array(_AZIMUTHS_DEG, float)
     azimuths = np.concatenate([half[-4:-1] - 360, -half[:0:-1], half, 360 - half[-2:-5:-1]])
     folded = np.where(np.abs(azimuths) > 180, 360 - np.abs(azimuths), np.abs(azimuths))
     column = np.searchsorted(half, folded)
@@ -90,13 +61,6 @@ def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
     return (
         RectBivariateSpline(length, azimuths, across[:, column], s=smoothing),
         RectBivariateSpline(length, azimuths, y[:, column], s=smoothing),
-    )
-
-
-def _table(text: str) -> np.ndarray:
-    """The numbers [rows, columns] of a table in text form."""
-    return np.array(
-        [[float(cell) for cell in row.replace("|", " ").split()] for row in text.strip().splitlines()]
     )
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, ring_triangles, strandless, unit
+from facerf_cli.synth.head.mesh import HeadMesh, joined, ring_triangles, strandless, unit
+from facerf_cli.synth.random_fields import Random
 
 GLASSES = ("round", "rectangular", "square", "aviator", "half-rim")
 
@@ -28,7 +29,7 @@ class Glasses:
     lenses: HeadMesh
 
 
-def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: np.random.Generator) -> Glasses:
+def draw_glasses(head: HeadMesh, landmarks_m: np.ndarray, random: Random) -> Glasses:
     """Draw glasses for a bare head with these landmarks [68, 3]."""
     kind = str(random.choice(GLASSES))
     metal = kind == "aviator" or random.random() < 0.4
@@ -70,7 +71,7 @@ class _HeadSurface:
     """The outermost skin and eyes of a head along the z or the x axis."""
 
     def __init__(self, head: HeadMesh) -> None:
-        outer = np.isin(head.part, [PARTS.index("skin"), PARTS.index("eye")])
+        outer = head.is_part("skin", "eye")
         self.points = head.vertices[outer].astype(float)
         front = self.points[self.points[:, 2] > 0.02]
         self._front, self._front_z = cKDTree(front[:, :2]), front[:, 2]
@@ -111,7 +112,7 @@ def _greatest(tree: cKDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
     )
 
 
-def _rims(kind: str, landmarks_m: np.ndarray, random: np.random.Generator) -> list[np.ndarray]:
+def _rims(kind: str, landmarks_m: np.ndarray, random: Random) -> list[np.ndarray]:
     """Draw the outlines [64, 3] of both lenses, left in the image first, from the inner end over the top."""
     size = random.uniform(0.92, 1.08)
     half_width, half_height, power = {

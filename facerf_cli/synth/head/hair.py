@@ -18,9 +18,20 @@ from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.appearance.facial_hair import beard_density
 from facerf_cli.synth.head.hair_styles import ROWS, HairStyle, draw_style, scalp_margin_m, tail_paths, tied
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, Hull, hull_of, joined, part_class, smoothstep, unit
+from facerf_cli.synth.head.mesh import (
+    PARTS,
+    HeadMesh,
+    Hull,
+    doubled_areas,
+    drawn_places,
+    hull_of,
+    joined,
+    part_class,
+    smoothstep,
+    unit,
+)
 from facerf_cli.synth.head.worn import Headwear
-from facerf_cli.synth.random_fields import CANVAS_SPAN, Window
+from facerf_cli.synth.random_fields import CANVAS_SPAN, Random, Window
 
 MAX_VERTICES = 250_000  # of all hair; further wisps are dropped
 
@@ -32,7 +43,7 @@ _SHORTEST_STEP_M = 1e-4  # of a wisp
 
 
 def draw_hair(
-    head: HeadMesh, random: np.random.Generator, headwear: Headwear | None = None
+    head: HeadMesh, random: Random, headwear: Headwear | None = None
 ) -> tuple[HeadMesh | None, HairStyle]:
     """Draw a style and grow it on a head. If the head wears clothes, long hair falls over them."""
     style = draw_style(random)
@@ -43,7 +54,7 @@ def draw_hair(
     return hair if len(hair.vertices) else None, style
 
 
-def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> HeadMesh:
+def grow_hair(head: HeadMesh, style: HairStyle, random: Random) -> HeadMesh:
     """Grow the hair alone, as part "hair"; without vertices if the style has none.
 
     Normals are those of a soft volume and not of the ribbons. uv: a random number of the wisp, and the
@@ -76,33 +87,28 @@ def grow_hair(head: HeadMesh, style: HairStyle, random: np.random.Generator) -> 
     return joined(hair, _tail(head, style, hull, random)) if style.tail else hair
 
 
-def _tail(head: HeadMesh, style: HairStyle, hull: Hull, random: np.random.Generator) -> HeadMesh:
+def _tail(head: HeadMesh, style: HairStyle, hull: Hull, random: Random) -> HeadMesh:
     """Grow the ponytail, bun or braids of a style."""
     paths, normals = tail_paths(style.tail, head.vertices, hull, style.knot_mm / 1000, random)
     shape = replace(style, segments=ROWS - 1, crowding=1.0)
     return ribbons(paths, normals, normals[:, 0], shape, random)
 
 
-def _roots(
-    head: HeadMesh, style: HairStyle, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _roots(head: HeadMesh, style: HairStyle, random: Random) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Draw roots [W, 3], the normals of the skin there [W, 3], and their height above the hairline [W]."""
-    triangles = head.triangles[head.part[head.triangles[:, 0]] == PARTS.index("skin")]
+    triangles = head.faces_of("skin")
     corners = head.vertices[triangles].astype(float)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     centre = corners.mean(1)
     margin = scalp_margin_m(centre, style)
     ragged = margin + random.normal(0, _RAGGED_M, len(margin))
-    chance = area * np.clip(ragged / 0.007 + 0.25, 0, 1) ** 1.5
+    chance = doubled_areas(corners) * np.clip(ragged / 0.007 + 0.25, 0, 1) ** 1.5
     chance = chance * (1 - style.thinning * _bare_top(centre))
     if style.comb == "parted":  # a parting shows its roots, so it needs more of them
         chance = chance * (1 + 3 * np.exp(-(((centre[:, 0] - style.parting_mm / 1000) / 0.008) ** 2)))
     if not style.wisps or not chance.any():
         return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-    chosen = random.choice(len(triangles), style.wisps, p=chance / chance.sum())
-    weights = random.dirichlet([1, 1, 1], style.wisps)[..., None]
-    normals = unit((head.normals[triangles[chosen]] * weights).sum(1))
-    return (corners[chosen] * weights).sum(1), normals, margin[chosen]
+    roots, normals, chosen = drawn_places(head, triangles, chance, style.wisps, random)
+    return roots, normals, margin[chosen]
 
 
 def _bare_top(points: np.ndarray) -> np.ndarray:
@@ -112,9 +118,7 @@ def _bare_top(points: np.ndarray) -> np.ndarray:
     return 0.97 * np.clip((0.075 - distance) / 0.025, 0, 1)
 
 
-def _lengths(
-    roots: np.ndarray, margin: np.ndarray, style: HairStyle, random: np.random.Generator
-) -> np.ndarray:
+def _lengths(roots: np.ndarray, margin: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
     """Draw the lengths [W] of wisps in metres."""
     top = smoothstep((roots[:, 1] - 0.055) / 0.05)
     length = style.side_mm + (style.top_mm - style.side_mm) * top
@@ -131,12 +135,7 @@ class _Wisps:
     """Wisps with the random numbers that stay the same when they grow a second time."""
 
     def __init__(
-        self,
-        roots: np.ndarray,
-        normals: np.ndarray,
-        style: HairStyle,
-        hull: Hull,
-        random: np.random.Generator,
+        self, roots: np.ndarray, normals: np.ndarray, style: HairStyle, hull: Hull, random: Random
     ) -> None:
         self.roots, self.normals, self.style, self.hull = roots, normals, style, hull
         count = len(roots)
@@ -212,7 +211,7 @@ def _combed(points: np.ndarray, normals: np.ndarray, roots: np.ndarray, style: H
     return direction - (direction * normals).sum(-1, keepdims=True) * normals
 
 
-def _ragged(roots: np.ndarray, style: HairStyle, random: np.random.Generator) -> np.ndarray:
+def _ragged(roots: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
     """Draw how much lower or higher the wisps [W] of a fringe end: lock by lock, and each alone."""
     locks = roots[random.choice(len(roots), min(len(roots), _FRINGE_LOCKS), replace=False)]
     lock = cKDTree(locks).query(roots)[1]
@@ -227,15 +226,13 @@ def _covers_face(paths: np.ndarray, style: HairStyle, ragged_m: np.ndarray) -> n
     return (azimuth < _FACE_DEG) & (y < low) & (y > _CHIN_M)
 
 
-def _leaders(roots: np.ndarray, style: HairStyle, random: np.random.Generator) -> np.ndarray:
+def _leaders(roots: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
     """Index [W] of the wisp that leads each wisp's clump: the nearest leader on the scalp."""
     leaders = random.choice(len(roots), max(1, len(roots) // style.clump_wisps), replace=False)
     return leaders[cKDTree(roots[leaders]).query(roots)[1]]
 
 
-def _clumped(
-    paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: np.random.Generator
-) -> np.ndarray:
+def _clumped(paths: np.ndarray, leader: np.ndarray, style: HairStyle, random: Random) -> np.ndarray:
     """Paths drawn toward the leader of their clump, increasingly toward the tip."""
     share = _shares(style)
     pull = style.clump * random.uniform(0.3, 1, len(paths))[:, None] * share**0.8
@@ -251,7 +248,7 @@ def _curled(
     length_m: np.ndarray,
     leader: np.ndarray,
     style: HairStyle,
-    random: np.random.Generator,
+    random: Random,
 ) -> np.ndarray:
     """Paths wound into helices, with some random frizz."""
     along = _tangents(paths)
@@ -273,11 +270,7 @@ def _tangents(paths: np.ndarray) -> np.ndarray:
 
 
 def ribbons(
-    paths: np.ndarray,
-    normals: np.ndarray,
-    root_normals: np.ndarray,
-    style: HairStyle,
-    random: np.random.Generator,
+    paths: np.ndarray, normals: np.ndarray, root_normals: np.ndarray, style: HairStyle, random: Random
 ) -> HeadMesh:
     """Mesh paths [W, R, 3] as tapered ribbons that face outward: two vertices per row, one at the tip."""
     wisps, rows = paths.shape[:2]
@@ -334,31 +327,25 @@ def _density() -> np.ndarray:
     return np.asarray(beard_density(Window(256, CANVAS_SPAN))[0, 0].numpy())
 
 
-def grow_beard(
-    head: HeadMesh, traits: dict[str, float | str | bool], random: np.random.Generator
-) -> HeadMesh | None:
+def grow_beard(head: HeadMesh, traits: dict[str, float | str | bool], random: Random) -> HeadMesh | None:
     """Grow the beard and moustache that the traits of a person describe; None if there is none."""
     beard, moustache = float(traits["beard"]), float(traits["moustache"])
     if max(beard, moustache) < _LEAST_COVER:
         return None
-    faces = head.triangles[head.part[head.triangles[:, 0]] == PARTS.index("skin")]
+    faces = head.faces_of("skin")
     uv = head.uv[faces].mean(1).astype(float)
     corners = head.vertices[faces].astype(float)
     place = ((uv - CANVAS_SPAN[0]) / (CANVAS_SPAN[1] - CANVAS_SPAN[0]) * 256).astype(int).clip(0, 255)
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     centre = corners.mean(1)
     on_lip = (uv[:, 1] < _MOUTH_V) & (np.abs(centre[:, 0]) < _LIP_M)
     cover = np.where(on_lip, moustache, beard)
     if float(traits["goatee"]):
         cover = cover * smoothstep(0.042 - np.abs(centre[:, 0]), 0, 0.012)
-    chance = area * _density()[place[:, 1], place[:, 0]] ** 1.3 * cover
+    chance = doubled_areas(corners) * _density()[place[:, 1], place[:, 0]] ** 1.3 * cover
     if chance.sum() <= 0:
         return None
     count = int(_WISPS * max(beard, 0.35 * moustache))
-    chosen = random.choice(len(faces), count, p=chance / chance.sum())
-    weights = random.dirichlet([1, 1, 1], count)[..., None]
-    roots = (corners[chosen] * weights).sum(1)
-    normals = unit((head.normals[faces[chosen]] * weights).sum(1).astype(float))
+    roots, normals, chosen = drawn_places(head, faces, chance, count, random)
     longest = random.uniform(0.004, 0.03) * max(beard, 0.3)
     chin = 0.5 + 0.5 * smoothstep(-roots[:, 1], 0.03, 0.08)
     length = np.where(on_lip[chosen], min(longest, 0.009), longest * chin) * random.uniform(0.5, 1.1, count)
@@ -366,7 +353,7 @@ def grow_beard(
 
 
 def _grown(
-    head: HeadMesh, roots: np.ndarray, normals: np.ndarray, length_m: np.ndarray, random: np.random.Generator
+    head: HeadMesh, roots: np.ndarray, normals: np.ndarray, length_m: np.ndarray, random: Random
 ) -> HeadMesh:
     """Grow wisps down along the skin, a little outward."""
     hull = hull_of(head)
@@ -384,7 +371,7 @@ def _grown(
     return ribbons(paths, np.broadcast_to(normals[:, None], paths.shape), normals, _BEARD, random)
 
 
-def grow_lashes(landmarks_m: np.ndarray, random: np.random.Generator) -> HeadMesh:
+def grow_lashes(landmarks_m: np.ndarray, random: Random) -> HeadMesh:
     """Grow lashes along the lids between landmarks [68, 3], curved away from the eye."""
     paths = []
     for ids, count in _LIDS:

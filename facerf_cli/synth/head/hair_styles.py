@@ -1,20 +1,18 @@
 """Hair styles: how hair is cut, combed and tied, drawn at random, and the hairline above which it grows."""
 
-import tomllib
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.head.mesh import Hull, unit
+from facerf_cli.synth.random_fields import Random
 
 # Share and fields of each style, by name: the file says how.
-_STYLES: dict[str, dict[str, Any]] = tomllib.loads(
-    Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-)
+_STYLES = tables_of(__file__)
 STYLES = tuple(_STYLES)
 
 # The hairline: height in metres at an azimuth in degrees from the nose, the same on both sides of the head.
@@ -59,7 +57,7 @@ class HairStyle:
     tuck: float = 0.0  # 1: behind the ears
 
 
-def draw_style(random: np.random.Generator, name: str | None = None) -> HairStyle:
+def draw_style(random: Random, name: str | None = None) -> HairStyle:
     """Draw a random style, or a random variant of the style `name`."""
     shares = [style["share"] for style in _STYLES.values()]
     drawn = str(random.choice(STYLES, p=np.array(shares) / sum(shares)))
@@ -131,7 +129,7 @@ def knot_m(hull: Hull, height_m: float) -> np.ndarray:
 
 
 def tail_paths(
-    kind: str, person_m: np.ndarray, hull: Hull, height_m: float, random: np.random.Generator
+    kind: str, person_m: np.ndarray, hull: Hull, height_m: float, random: Random
 ) -> tuple[np.ndarray, np.ndarray]:
     """Draw paths and normals [W, ROWS, 3] of a ponytail, a bun or two braids.
 
@@ -161,9 +159,7 @@ def tail_paths(
     return paths, unit(paths - paths.mean(0))
 
 
-def _braid(
-    person_m: np.ndarray, side: int, count: int, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _braid(person_m: np.ndarray, side: int, count: int, random: Random) -> tuple[np.ndarray, np.ndarray]:
     """Paths and normals [W, ROWS, 3] of three strands that cross on their way down to the chest."""
     long_m, turns = random.uniform(0.18, 0.28), 3.5
     rows = np.linspace(0, 1, ROWS)

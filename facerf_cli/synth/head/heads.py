@@ -20,7 +20,6 @@ from torch import Tensor
 from facerf_cli.face.morphable import EXPRESSION_STD, HEAD_PARTS, HeadModel, MorphableModel
 from facerf_cli.face.topology import HALF_ANGLE_DEG, LANDMARK_UV
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.mesh import (
     PARTS,
     HeadMesh,
@@ -29,6 +28,7 @@ from facerf_cli.synth.head.mesh import (
     part_class,
     quartered,
     skin_classes,
+    smooth_normals,
 )
 from facerf_cli.synth.head.shell import shell_head
 
@@ -172,7 +172,7 @@ def build_head(
     vertices = plan.refine @ coarse
     for eye in plan.eyes:
         _clear_of_ball(vertices, plan.skin, vertices[eye.fine])
-    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(plan.triangles)).numpy()
+    normals = smooth_normals(vertices, plan.triangles)
     return HeadMesh(
         vertices=vertices[plan.source].astype(np.float32),
         normals=normals[plan.source].astype(np.float32),

@@ -24,8 +24,10 @@ from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, LANDMARK_UV, TOP_
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.cranium import average_head_mm
+from facerf_cli.synth.random_fields import Random
 
 PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame", "hat")  # of HeadMesh.part, by index
+_OF_VERTICES = ("vertices", "normals", "part", "uv", "tangents", "label")  # fields of HeadMesh
 CLOTH_M = 0.5  # size of the texture of cloth
 
 
@@ -47,19 +49,21 @@ class HeadMesh:
     tangents: np.ndarray
     label: np.ndarray
 
+    def is_part(self, *parts: str) -> np.ndarray:
+        """[V] bool: vertices of some parts."""
+        return np.isin(self.part, [PARTS.index(part) for part in parts])
+
+    def faces_of(self, *parts: str) -> np.ndarray:
+        """Triangles [F, 3] of some parts."""
+        return self.triangles[self.is_part(*parts)[self.triangles[:, 0]]]
+
 
 def joined(*meshes: HeadMesh) -> HeadMesh:
     """Concatenate several meshes into one."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-    return HeadMesh(
-        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
-        normals=np.concatenate([mesh.normals for mesh in meshes]),
-        triangles=np.concatenate([m.triangles + offset for m, offset in zip(meshes, offsets, strict=True)]),
-        part=np.concatenate([mesh.part for mesh in meshes]),
-        uv=np.concatenate([mesh.uv for mesh in meshes]),
-        tangents=np.concatenate([mesh.tangents for mesh in meshes]),
-        label=np.concatenate([mesh.label for mesh in meshes]),
-    )
+    triangles = [mesh.triangles + offset for mesh, offset in zip(meshes, offsets, strict=True)]
+    of_vertices = {name: np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in _OF_VERTICES}
+    return HeadMesh(triangles=np.concatenate(triangles), **of_vertices)
 
 
 def strandless(
@@ -84,8 +88,7 @@ def strandless(
 def kept_triangles(mesh: HeadMesh, kept: np.ndarray) -> HeadMesh:
     """Select triangles [F] bool of a mesh, without the vertices that only others use."""
     used, triangles = np.unique(mesh.triangles[kept], return_inverse=True)
-    fields = ("vertices", "normals", "part", "uv", "tangents", "label")
-    of_vertices = {name: getattr(mesh, name)[used] for name in fields}
+    of_vertices = {name: getattr(mesh, name)[used] for name in _OF_VERTICES}
     return replace(mesh, triangles=triangles.reshape(-1, 3), **of_vertices)
 
 
@@ -129,9 +132,31 @@ def ring_surface(part: str, rings: np.ndarray, closed: bool = True) -> HeadMesh:
 
 def cloth_like(part: str, vertices: np.ndarray, triangles: np.ndarray) -> HeadMesh:
     """Make a mesh of one part with smooth normals; its texture lies flat on it, seen from the front."""
-    normals = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(triangles)).numpy()
+    normals = smooth_normals(vertices, triangles)
     uv = np.stack([0.5 + vertices[:, 0] / CLOTH_M, 0.5 - vertices[:, 1] / CLOTH_M], -1)
     return strandless(part, vertices, normals, triangles, uv)
+
+
+def smooth_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Unit normals [V, 3] of a mesh, area-weighted."""
+    return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(triangles)).numpy()
+
+
+def doubled_areas(corners: np.ndarray) -> np.ndarray:
+    """Twice the areas [F] of triangles with these corners [F, 3, 3]."""
+    sides = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return np.asarray(np.linalg.norm(np.cross(*sides), axis=-1))
+
+
+def drawn_places(
+    head: HeadMesh, triangles: np.ndarray, chance: np.ndarray, count: int, random: Random
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw places [N, 3] on triangles [F, 3] by chances [F]; return also normals [N, 3] and triangles [N]."""
+    chosen = random.choice(len(triangles), count, p=chance / chance.sum())
+    weights = random.dirichlet([1, 1, 1], count)[..., None]
+    ids = triangles[chosen]
+    normals = unit((head.normals[ids] * weights).sum(1))
+    return (head.vertices[ids].astype(float) * weights).sum(1), normals, chosen
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -281,7 +306,6 @@ _MIDDLE_M = 0.045  # height of the capsule's middle: the widest part of the skul
 _SLICE_M = (0.07, 0.09)  # range of heights in which front and back of the skull are measured
 _STEP_M = 0.002  # step over which the slope of the field is measured
 _SMOOTH_CELLS = 0.8  # sigma of the Gaussian that smooths the field
-_OUTER = [PARTS.index("skin"), PARTS.index("cloth")]  # parts that the field covers
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +351,7 @@ class Hull:
 
 def hull_of(head: HeadMesh) -> Hull:
     """Build the hull of a head's skin and clothes, if it wears any."""
-    corners = head.vertices[head.triangles[np.isin(head.part[head.triangles[:, 0]], _OUTER)]].astype(float)
+    corners = head.vertices[head.faces_of("skin", "cloth")].astype(float)
     coarse = corners[np.linalg.norm(corners[:, 0] - corners[:, 1], axis=-1) > _ARC_M]
     sampled = [corners.mean(1), corners[:, 0], *(coarse[:, k] for k in (1, 2))]
     points = np.concatenate([*sampled, *((coarse[:, k] + coarse[:, k - 1]) / 2 for k in range(3))])

@@ -6,27 +6,26 @@ The surface of the face is sampled finely and continued over skull, sides and ne
 and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, UV_SIZE_MM, landmark_weights
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head import mouth
 from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface
 from facerf_cli.synth.head.mesh import (
-    PARTS,
     HeadMesh,
     arc_lengths,
     capped,
     joined,
-    part_class,
     skin_classes,
+    smooth_normals,
     smoothstep,
+    strandless,
     unit,
 )
 from facerf_cli.synth.head.openings import Sheet, lips, outline, skin_sheet
@@ -377,17 +376,10 @@ def _part(
     used[triangles] = True
     place = np.arange(len(vertices_mm)) if same is None else same
     normals = _normals(vertices_mm, triangles, place)[used]
-    return HeadMesh(
-        vertices=(vertices_mm[used] / 1000).astype(np.float32),
-        normals=normals.astype(np.float32),
-        triangles=(np.cumsum(used) - 1)[triangles],
-        part=np.full(len(normals), PARTS.index(name), np.uint8),
-        uv=uv[used].astype(np.float32),
-        tangents=np.zeros((len(normals), 3), np.float32),
-        label=np.full(len(normals), part_class(name), np.uint8) if label is None else label[used],
-    )
+    mesh = strandless(name, vertices_mm[used] / 1000, normals, (np.cumsum(used) - 1)[triangles], uv[used])
+    return mesh if label is None else replace(mesh, label=label[used])
 
 
 def _normals(vertices: np.ndarray, triangles: np.ndarray, same: np.ndarray) -> np.ndarray:
     """Unit normals [V, 3], area-weighted; vertices with the same place share their normal."""
-    return vertex_normals(torch.from_numpy(vertices), torch.from_numpy(same[triangles])).numpy()[same]
+    return smooth_normals(vertices, same[triangles])[same]

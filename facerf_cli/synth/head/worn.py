@@ -26,6 +26,7 @@ from facerf_cli.synth.head.mesh import (
     strandless,
     unit,
 )
+from facerf_cli.synth.random_fields import Random
 
 NECKWEAR = ("turtleneck", "scarf")
 
@@ -34,20 +35,20 @@ _NECK_ROWS = 26  # rings of a surface
 _FLARE_M = 0.03  # below the chin the neck is at its narrowest
 
 
-def draw_neckwear(head: HeadMesh, chin_m: float, random: np.random.Generator) -> HeadMesh:
+def draw_neckwear(head: HeadMesh, chin_m: float, random: Random) -> HeadMesh:
     """Draw a turtleneck or a scarf for a bare head whose chin is at this height, as part "cloth"."""
     if random.choice(NECKWEAR) == "turtleneck":
         return _turtleneck(hull_of(head), chin_m, random)
     return draw_wraps(head, chin_m, int(random.integers(1, 3)), random)
 
 
-def draw_wraps(head: HeadMesh, chin_m: float, count: int, random: np.random.Generator) -> HeadMesh:
+def draw_wraps(head: HeadMesh, chin_m: float, count: int, random: Random) -> HeadMesh:
     """Draw turns of a scarf around the neck of a bare head, each below the one before."""
     hull = hull_of(head)
     return joined(*(_wrap(hull, chin_m, index, random) for index in range(count)))
 
 
-def _turtleneck(hull: Hull, chin_m: float, random: np.random.Generator) -> HeadMesh:
+def _turtleneck(hull: Hull, chin_m: float, random: Random) -> HeadMesh:
     """A band that stands around the neck and is folded over at its upper edge."""
     azimuth = np.linspace(0, 2 * np.pi, _NECK_AROUND, endpoint=False)
     slope = 0.012 * ((1 - np.cos(azimuth)) / 2) ** 0.8  # lower at the front than at the back
@@ -62,7 +63,7 @@ def _turtleneck(hull: Hull, chin_m: float, random: np.random.Generator) -> HeadM
     return _loft(hull, chin_m, azimuth, level, off)
 
 
-def _wrap(hull: Hull, chin_m: float, index: int, random: np.random.Generator) -> HeadMesh:
+def _wrap(hull: Hull, chin_m: float, index: int, random: Random) -> HeadMesh:
     """One turn of a scarf: a soft roll, hanging lower in front, with folds along it."""
     azimuth = np.linspace(0, 2 * np.pi, _NECK_AROUND, endpoint=False)
     around = np.linspace(0, 2 * np.pi, _NECK_ROWS)[:, None]
@@ -133,7 +134,7 @@ class Headwear:
         return kept_triangles(hair, ~hidden[hair.triangles].any(-1))
 
 
-def draw_headwear(head: HeadMesh, chin_m: float, random: np.random.Generator) -> Headwear:
+def draw_headwear(head: HeadMesh, chin_m: float, random: Random) -> Headwear:
     """Draw one piece for a bare head whose chin is at this height, as part "hat"."""
     hull, kind = hull_of(head), str(random.choice(HEADWEAR))
     off = _HAIR_M + random.uniform(0.003, 0.007)
@@ -200,9 +201,7 @@ def _smooth_around(values: np.ndarray) -> np.ndarray:
     return np.convolve(np.concatenate([values[-7:], values, values[:7]]), kernel, "valid")
 
 
-def _visor(
-    hull: Hull, edge_m: tuple[float, float, float], off_m: float, random: np.random.Generator
-) -> HeadMesh:
+def _visor(hull: Hull, edge_m: tuple[float, float, float], off_m: float, random: Random) -> HeadMesh:
     """The visor of a cap: a curved plate in front of the edge."""
     reach, drop = random.uniform(0.055, 0.075), random.uniform(0.008, 0.025)
     azimuth = np.linspace(-1.15, 1.15, 60)
@@ -236,9 +235,7 @@ def _fedora(hull: Hull, edge_m: tuple[float, float, float], off_m: float) -> Hea
     return cloth_like("hat", placed, faces)
 
 
-def _headscarf(
-    head: HeadMesh, hull: Hull, chin_m: float, off_m: float, random: np.random.Generator
-) -> HeadMesh:
+def _headscarf(head: HeadMesh, hull: Hull, chin_m: float, off_m: float, random: Random) -> HeadMesh:
     """Cloth around skull, cheeks and neck that leaves the face free, wrapped below the chin."""
     azimuth = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
     signed = (azimuth + np.pi) % (2 * np.pi) - np.pi
@@ -274,7 +271,7 @@ _ARM_M = 0.3  # length of the forearm
 _SKIN_UV = (0.5, 1.2)  # a plain place of the skin's texture
 
 
-def draw_hand(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
+def draw_hand(head: HeadMesh, random: Random) -> HeadMesh:
     """Draw a hand whose fingers touch cheek or chin, with the sleeve of its arm."""
     vertices, faces = packed_mesh("hand")
     step, faces = loop_step(faces, len(vertices))
@@ -302,7 +299,7 @@ def draw_hand(head: HeadMesh, random: np.random.Generator) -> HeadMesh:
     return joined(hand, sleeve)
 
 
-def draw_microphone(random: np.random.Generator) -> HeadMesh:
+def draw_microphone(random: Random) -> HeadMesh:
     """Draw a microphone below the mouth, as part "frame"; it counts as held by a hand."""
     top = np.array([random.uniform(-0.04, 0.04), random.uniform(-0.11, -0.07), random.uniform(0.16, 0.19)])
     foot = top + unit(np.array([random.uniform(-0.5, 0.5), -1.0, random.uniform(0.1, 0.5)])) * 0.35
@@ -316,7 +313,7 @@ def draw_microphone(random: np.random.Generator) -> HeadMesh:
     return whole
 
 
-def draw_earrings(lobes: list[np.ndarray], random: np.random.Generator) -> HeadMesh:
+def draw_earrings(lobes: list[np.ndarray], random: Random) -> HeadMesh:
     """Draw a stud, a drop or a hoop at each lobe [3], as part "frame"; it counts as part of the ear."""
     kind = random.choice(["stud", "drop", "hoop"])
     size = random.uniform(0.0022, 0.004) if kind != "hoop" else random.uniform(0.007, 0.018)

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from facerf_cli.synth.random_fields import Random
 from facerf_cli.synth.sky.painting import (
     RING,
     Grid,
-    Random,
     Rectangle,
     disc,
     draw_white,

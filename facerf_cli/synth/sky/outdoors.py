@@ -1,17 +1,23 @@
 """Kinds of procedural envmaps outdoors: sun, dusk, overcast, night, with their clouds and land.
 
 Units differ by kind (kcd/m2 by day, relative ones otherwise); `skies.py` normalises the finished map.
+
+Clear sky and sun are those of Preetham, Shirley and Smits, 'A Practical Analytic Model for Daylight' (1999).
+The sky is appendix A.2: Perez's distribution, and the luminance and chromaticity of the zenith. The sun is
+appendix A.1 with the spectra of table 2: the radiance above the atmosphere, reduced by Rayleigh, aerosol and
+ozone extinction. Mixed gases and water vapour are left out, as they absorb only beyond 690 nm.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from facerf_cli.synth.sky.daylight import SUN_RADIUS_DEG, SUN_SR, preetham_sky, sun_irradiance
+from facerf_cli.synth import tables_of
+from facerf_cli.synth.random_fields import Random
 from facerf_cli.synth.sky.painting import (
     RING,
     Grid,
-    Random,
     Rectangle,
     disc,
     draw_white,
@@ -23,6 +29,99 @@ from facerf_cli.synth.sky.painting import (
     sample_tile,
     toward,
 )
+
+_TABLES = {name: np.array(values, float) for name, values in tables_of(__file__).items()}
+# Rec.709 primaries, white D65.
+_XYZ_TO_REC709 = np.array(
+    [
+        [3.2404542, -1.5371385, -0.4985314],
+        [-0.969266, 1.8760108, 0.041556],
+        [0.0556434, -0.2040259, 1.0572252],
+    ]
+)
+SUN_RADIUS_DEG = 0.2665  # angular radius of the disc
+SUN_SR = 2 * np.pi * (1 - np.cos(np.radians(SUN_RADIUS_DEG)))  # its solid angle
+_SUN_NM = np.arange(380, 751, 10.0)  # wavelengths of the spectra of sun and ozone
+_SUN = 10 * _TABLES["sun"]
+_OZONE_CM = 0.35  # thickness of the ozone layer (appendix A.1)
+_LUMENS_PER_WATT = 683.0  # at the peak of photopic vision
+
+
+def preetham_sky(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> np.ndarray:
+    """Compute sky radiance [H, W, 3], linear Rec.709 (kcd/m2), without the disc of the sun.
+
+    Directions below the horizon get the radiance of the horizon.
+    """
+    xyz = sky_xyz(directions, sun, turbidity)
+    return np.asarray(np.clip(xyz @ _XYZ_TO_REC709.T.astype(xyz.dtype), 0, None))
+
+
+def sky_xyz(directions: np.ndarray, sun: np.ndarray, turbidity: float) -> np.ndarray:
+    """Compute sky radiance [..., 3] as CIE XYZ, Y in kcd/m2, along directions [..., 3]."""
+    cos_theta = np.clip(directions[..., 1], 0.01, 1)  # B / cos(theta) diverges at the horizon
+    cos_gamma = np.clip(directions @ sun, -1, 1)
+    sun_theta = np.arccos(np.clip(sun[1], 0, 1))
+    chi = (4 / 9 - turbidity / 120) * (np.pi - 2 * sun_theta)
+    zenith_y = max((4.0453 * turbidity - 4.9710) * np.tan(chi) - 0.2155 * turbidity + 2.4192, 0.1)
+    powers_t, powers_theta = turbidity ** np.array([2, 1, 0]), sun_theta ** np.array([3, 2, 1, 0])
+    zenith = np.array([zenith_y, *(powers_t @ _TABLES["zenith"] @ powers_theta)])
+    values = []
+    gamma = np.arccos(cos_gamma)
+    for level, slopes in zip(zenith, _TABLES["perez"], strict=True):
+        perez = [float(value) for value in slopes @ [turbidity, 1.0]]
+        at_zenith = _perez(perez, 1.0, float(sun_theta), float(np.cos(sun_theta)))
+        values.append(_perez(perez, cos_theta, gamma, cos_gamma) * float(level / at_zenith))
+    luminance, x, y = values
+    return np.stack([x / y, np.ones_like(x), (1 - x - y) / y], -1) * luminance[..., None]
+
+
+def _perez(
+    c: list[float], cos_theta: np.ndarray | float, gamma: np.ndarray | float, cos_gamma: np.ndarray | float
+) -> np.ndarray:
+    """Perez's distribution, equation 3 of the paper."""
+    haze = 1 + c[2] * np.exp(c[3] * gamma) + c[4] * cos_gamma**2
+    return np.asarray((1 + c[0] * np.exp(c[1] / cos_theta)) * haze)
+
+
+def sun_irradiance(elevation_deg: float, turbidity: float) -> np.ndarray:
+    """Compute the irradiance [3] on a plane across the sunlight, linear Rec.709 (klx)."""
+    xyz = _sun_to_xyz() @ (transmittance(_SUN_NM, elevation_deg, turbidity) * _SUN)
+    return np.asarray(np.clip(_XYZ_TO_REC709 @ xyz, 0, None))
+
+
+def transmittance(wavelength_nm: np.ndarray, elevation_deg: float, turbidity: float) -> np.ndarray:
+    """Compute the share of sunlight [W] that reaches the ground at each wavelength [W] (appendix A.1)."""
+    theta_deg, um = 90 - elevation_deg, wavelength_nm / 1000
+    air_mass = 1 / (np.cos(np.radians(theta_deg)) + 0.15 * (93.885 - theta_deg) ** -1.253)
+    beta = 0.04608365822050 * turbidity - 0.04586025928522  # Angstrom's turbidity coefficient
+    ozone = np.interp(wavelength_nm, _SUN_NM, _TABLES["ozone"]) * _OZONE_CM
+    return np.asarray(np.exp(-air_mass * (0.008735 * um**-4.08 + beta * um**-1.3 + ozone)))
+
+
+@lru_cache(maxsize=1)
+def _sun_to_xyz() -> np.ndarray:
+    """Matrix [3, W] from the spectral radiance of the sun (table 2) to its XYZ irradiance in klx."""
+    per_nm = SUN_SR * 10.0  # from W / (cm2 um sr) over the disc to W / (m2 nm)
+    step_nm = _SUN_NM[1] - _SUN_NM[0]
+    return np.asarray(_LUMENS_PER_WATT / 1000 * per_nm * step_nm * _colour_matching(_SUN_NM))
+
+
+def _colour_matching(wavelength_nm: np.ndarray) -> np.ndarray:
+    """CIE 1931 colour matching functions [3, W] at wavelengths [W].
+
+    They are the multi-lobe fit of Wyman, Sloan and Shirley, 'Simple Analytic Approximations to the CIE XYZ
+    Color Matching Functions', JCGT 2(2), 2013.
+    """
+    x = _lobe(wavelength_nm, 1.056, 599.8, 37.9, 31.0) + _lobe(wavelength_nm, 0.362, 442.0, 16.0, 26.7)
+    x = x + _lobe(wavelength_nm, -0.065, 501.1, 20.4, 26.2)
+    y = _lobe(wavelength_nm, 0.821, 568.8, 46.9, 40.5) + _lobe(wavelength_nm, 0.286, 530.9, 16.3, 31.1)
+    z = _lobe(wavelength_nm, 1.217, 437.0, 11.8, 36.0) + _lobe(wavelength_nm, 0.681, 459.0, 26.0, 13.8)
+    return np.stack([x, y, z])
+
+
+def _lobe(nm: np.ndarray, height: float, middle: float, left: float, right: float) -> np.ndarray:
+    return np.asarray(height * np.exp(-0.5 * ((nm - middle) / np.where(nm < middle, left, right)) ** 2))
+
 
 EYE_M = 1.6  # height of the head above the ground
 # Linear RGB albedos of ground; the list repeats the common ones.

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
+from facerf_cli.synth.random_fields import Random
 
-Random = np.random.Generator
 RING = 2048  # samples of a function of azimuth
 _TILE_PX = 256
 

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from facerf_cli.errors import UsageError
+from facerf_cli.synth.random_fields import Random
 from facerf_cli.synth.sky.interiors import hall, stage, studio, windows
 from facerf_cli.synth.sky.outdoors import dusk, night, overcast, sun
-from facerf_cli.synth.sky.painting import Grid, Random, make_grid
+from facerf_cli.synth.sky.painting import Grid, make_grid
 
 _PEAK = 60000.0  # below the largest half float, 65504
 KINDS: dict[str, Callable[[Grid, Random], np.ndarray]] = {

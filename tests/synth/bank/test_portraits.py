@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
+from facerf_cli.synth import bank
 from facerf_cli.synth.bank import portraits
 from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, photos_of
 
@@ -51,7 +52,7 @@ def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return {"of": torch.tensor([index])}
 
     monkeypatch.setattr(portraits, "photos_of", draw)
-    monkeypatch.setattr(portraits, "in_shards", lambda work, items, jobs: work(items))
+    monkeypatch.setattr(bank, "in_shards", lambda work, items, jobs: work(items))
     add_portraits(tmp_path, ["a", "b"], range(3), 1, 0)
     add_portraits(tmp_path, ["a", "b"], range(4), 1, 0)
     assert made == [0, 1, 2, 3] and len(list(tmp_path.iterdir())) == 4

@@ -14,9 +14,11 @@ from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.synth import bank
 from facerf_cli.synth.bank import transport
-from facerf_cli.synth.bank.portrait_samples import PortraitSample, StoredTransport
 from facerf_cli.synth.bank.transport import (
+    PortraitSample,
+    StoredTransport,
     StoredView,
     TransportBankSettings,
     add_transport,
@@ -118,7 +120,7 @@ def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
 
 def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
     """Normals, lights, shadows and their summary are mirrored alike."""
-    from facerf_cli.synth.bank.portrait_samples import mirrored
+    from facerf_cli.synth.bank.transport import mirrored
 
     sample = drawn(folder, 2)
     other = mirrored(sample)
@@ -150,7 +152,7 @@ def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return [{"of": torch.tensor([index])}] * settings.views
 
     monkeypatch.setattr(transport, "transport_of", draw)
-    monkeypatch.setattr(transport, "in_shards", lambda work, items, jobs: work(items))
+    monkeypatch.setattr(bank, "in_shards", lambda work, items, jobs: work(items))
     add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
     add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
     assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6

@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from facerf_cli.synth.sky import daylight
-from facerf_cli.synth.sky.daylight import SUN_SR, preetham_sky, sky_xyz, sun_irradiance, transmittance
+from facerf_cli.synth.sky import outdoors
+from facerf_cli.synth.sky.outdoors import SUN_SR, preetham_sky, sky_xyz, sun_irradiance, transmittance
 from facerf_cli.synth.sky.painting import make_grid, toward
 
 # The authors' code prints five decimals where appendix A.2 prints four: an independent copy of the table.
@@ -77,9 +77,7 @@ def full_sun(elevation_deg: float, turbidity: float) -> np.ndarray:
         nm, [689, 690, 700, 710, 720, 730, 740, 750], [0, 0.016, 0.024, 0.0125, 1, 0.87, 0.061, 0.001]
     )
     wet = np.exp(-0.2385 * water * 2 * mass / (1 + 20.07 * water * 2 * mass) ** 0.45)
-    spectrum = np.interp(nm, daylight._SUN_NM, daylight._SUN) * daylight.transmittance(
-        nm, elevation_deg, turbidity
-    )
+    spectrum = np.interp(nm, outdoors._SUN_NM, outdoors._SUN) * transmittance(nm, elevation_deg, turbidity)
     return 0.683 * SUN_SR * 10 * 5.0 * matching @ (spectrum * wet)
 
 
@@ -100,7 +98,7 @@ def test_clean_air_has_rayleighs_optical_depth() -> None:
 
 def test_the_sun_above_the_air_gives_its_known_illuminance() -> None:
     """127.5 to 133 klx, as published (IES; Darula, Kittler and Gueymard 2005)."""
-    assert 126 < (daylight._sun_to_xyz() @ daylight._SUN)[1] < 134
+    assert 126 < (outdoors._sun_to_xyz() @ outdoors._SUN)[1] < 134
 
 
 def test_the_brightest_sky_is_beside_the_sun_and_blue_far_from_it() -> None:

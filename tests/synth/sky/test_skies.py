@@ -2,9 +2,16 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.synth.sky.daylight import SUN_RADIUS_DEG
 from facerf_cli.synth.sky.interiors import Lights, draw_room
-from facerf_cli.synth.sky.outdoors import Land, Layer, Skyline, add_clouds, add_land, sun_is_visible
+from facerf_cli.synth.sky.outdoors import (
+    SUN_RADIUS_DEG,
+    Land,
+    Layer,
+    Skyline,
+    add_clouds,
+    add_land,
+    sun_is_visible,
+)
 from facerf_cli.synth.sky.painting import (
     Rectangle,
     disc,
