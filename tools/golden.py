@@ -95,9 +95,11 @@ def fewer_cameras(capture: Path, to: Path) -> None:
 
 
 def chosen(only: str) -> list[str]:
-    """Names of the runs whose name, or whose verb, is among the words of `only`; all without words."""
+    """Names of the runs whose name, or whose verb, is among `only`; without words all but the slow ones."""
     words = [word for word in only.split(",") if word]
-    names = [name for name, line in RUNS.items() if not words or name in words or line.split()[0] in words]
+    quick = [name for name in RUNS if name not in TABLE["slow"]["runs"]]
+    named = [name for name, line in RUNS.items() if name in words or line.split()[0] in words]
+    names = named if words else quick
     if not names:
         raise SystemExit(f"--only {only}: no such verb or run; the runs are {', '.join(RUNS)}")
     return names
