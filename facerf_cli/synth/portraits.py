@@ -125,7 +125,9 @@ def view_of(subject: Subject, transport: MeshTransport, camera: StageCamera) -> 
     points = torch.from_numpy(facets.corners @ mesh.vertices[facets.vertices]).float()
     truth = truth_of(mesh, subject.appearance, camera)
     owner = np.repeat(pixels, np.diff(shares.indptr))
-    lenses = _lenses(subject, camera, -truth.positions_m[..., 2])
+    lenses = Lenses(torch.zeros(0, dtype=torch.long), torch.zeros(0, 3), torch.zeros(0, 3))
+    if subject.lenses is not None:
+        lenses = lenses_in(subject.lenses, camera, -truth.positions_m[..., 2])
     return BakedPortrait(
         pixel=torch.from_numpy(owner).int(),
         share=torch.from_numpy(shares.data).half(),
@@ -145,12 +147,6 @@ def view_of(subject: Subject, transport: MeshTransport, camera: StageCamera) -> 
         lens_normals=lenses.normals.half(),
         lens_views=lenses.views.half(),
     )
-
-
-def _lenses(subject: Subject, camera: StageCamera, depth_m: np.ndarray) -> Lenses:
-    if subject.lenses is None:
-        return Lenses(torch.zeros(0, dtype=torch.long), torch.zeros(0, 3), torch.zeros(0, 3))
-    return lenses_in(subject.lenses, camera, depth_m)
 
 
 def _landmarks_px(subject: Subject, camera: StageCamera) -> Tensor:

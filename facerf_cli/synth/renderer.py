@@ -80,7 +80,8 @@ def scattered_irradiance(
     settings: RenderSettings = RenderSettings(),
 ) -> np.ndarray:
     """Compute irradiance [3, V, L], direct, bounced and scattered; 1 on a surface that faces a light."""
-    albedo = _vertex_albedo(head, appearance)[transport.sites].T[..., None]  # [3, S, 1]
+    surface = sample(appearance, torch.from_numpy(head.part), torch.from_numpy(head.uv).float())
+    albedo = surface.albedo.float().numpy()[transport.sites].T[..., None]  # [3, S, 1]
     skin = np.flatnonzero(transport.baked & (head.part == _SKIN))
     spreads = _spreads(head, skin, appearance) if settings.scattering and len(skin) else [[], [], []]
     irradiance = np.empty((3, len(head.vertices), len(transport.directions)), np.float32)
@@ -117,18 +118,14 @@ def _cosines(head: HeadMesh, directions: np.ndarray) -> np.ndarray:
     return cosines.numpy()
 
 
-def _vertex_albedo(head: HeadMesh, appearance: Appearance) -> np.ndarray:
-    surface = sample(appearance, torch.from_numpy(head.part), torch.from_numpy(head.uv).float())
-    return surface.albedo.float().numpy()
-
-
 def _spreads(head: HeadMesh, skin: np.ndarray, appearance: Appearance) -> list[list[csr_matrix]]:
     """Sparse matrices [N, N] per channel that, applied in turn, scatter light among the skin vertices [N].
 
     Each is a Gaussian over neighbours, weighted by their area, that face a similar direction (not across the
     gap of the lips). A wide Gaussian takes several passes of narrow ones, which have few neighbours.
     """
-    area = _vertex_areas_m2(head)[skin]
+    third = doubled_areas(head.vertices[head.triangles].astype(np.float64)) / 6  # of a triangle's area
+    area = np.bincount(head.triangles.ravel(), third.repeat(3), minlength=len(head.vertices))[skin]
     points, normals = head.vertices[skin], head.normals[skin]
     distance, near = cKDTree(points).query(points, range(1, min(_NEAR, len(skin)) + 1))
     weights = area[near] * (np.einsum("nc,nkc->nk", normals, normals[near]) > 0.3)
@@ -144,12 +141,6 @@ def _spreads(head: HeadMesh, skin: np.ndarray, appearance: Appearance) -> list[l
         values = kernel[kept].astype(np.float32)
         result.append([csr_matrix((values, (rows[kept], near[kept])), shape=(len(skin),) * 2)] * passes)
     return result
-
-
-def _vertex_areas_m2(head: HeadMesh) -> np.ndarray:
-    """A third of the area of all triangles at each vertex [V]."""
-    third = doubled_areas(head.vertices[head.triangles].astype(np.float64)) / 6
-    return np.bincount(head.triangles.ravel(), third.repeat(3), minlength=len(head.vertices))
 
 
 def _shaded(

@@ -147,7 +147,9 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
     pigment = (1 - _PHEOMELANIN_SHARE) * eumelanin + _PHEOMELANIN_SHARE * pheomelanin
     epidermis = melanin * pigment + (1 - melanin) * bloodless
     dermis = blood * _blood_absorption() + (1 - blood) * bloodless
-    below = _infinite_layer(dermis, 43.6 * (0.41 * (nm / 500) ** -4 + 0.59 * (nm / 500) ** -0.562))
+    # Kubelka-Munk reflectance of an infinitely deep layer; K = 2 mu_a, S = 3/4 mu_s'.
+    ratio = 2 * dermis / (0.75 * (43.6 * (0.41 * (nm / 500) ** -4 + 0.59 * (nm / 500) ** -0.562)))
+    below = 1 + ratio - np.sqrt(ratio * (ratio + 2))
     reflected, passed = _layer(
         epidermis, 66.7 * (0.29 * (nm / 500) ** -4 + 0.71 * (nm / 500) ** -0.689), _EPIDERMIS_CM
     )
@@ -160,12 +162,6 @@ def _blood_absorption() -> np.ndarray:
     oxy, deoxy = (np.array(_TABLES[name], float) for name in ("oxyhaemoglobin", "deoxyhaemoglobin"))
     molar = _OXYGENATION * oxy + (1 - _OXYGENATION) * deoxy
     return np.log(10) * molar * _BLOOD_G_PER_L / _HAEMOGLOBIN_G_PER_MOL
-
-
-def _infinite_layer(absorption: np.ndarray, scattering: np.ndarray) -> np.ndarray:
-    """Kubelka-Munk reflectance of an infinitely deep layer; K = 2 mu_a, S = 3/4 mu_s'."""
-    ratio = 2 * absorption / (0.75 * scattering)
-    return 1 + ratio - np.sqrt(ratio * (ratio + 2))
 
 
 def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> tuple[np.ndarray, np.ndarray]:

@@ -95,24 +95,15 @@ def image_head(
     fields, vertices = head_fields(head), head["vertices"]
     around = _surroundings(vertices, random)
     photos = [photograph_head(vertices, random, settings.views) for _ in range(count)]
+    shifts_m = [(photo.vertices_camera - vertices @ photo.rotation.T).mean(0) for photo in photos]
     images = [
-        _image(fields, around, photo, _translation(vertices, photo), settings, generator) for photo in photos
+        _image(fields, around, photo, shift_m, settings, generator)
+        for photo, shift_m in zip(photos, shifts_m, strict=True)
     ]
-    landmarks_px = torch.stack([_true_landmarks(photo) for photo in photos])
+    landmarks_px = torch.stack([project(photo.true_landmarks(), photo.camera) for photo in photos])
     fit = fit_batch(load_face_model(), landmarks_px, crop_camera(settings.crop_px))
     found = {name: getattr(fit, name).float() for name in ("rotation", "translation_m", "alpha", "beta")}
     return {"pictures": torch.stack(images), "landmarks_px": landmarks_px, **found}
-
-
-def _translation(vertices: Tensor, photo: HeadPhoto) -> Tensor:
-    """Translation [3] of head_to_camera, in metres."""
-    return (photo.vertices_camera - vertices @ photo.rotation.T).mean(0)
-
-
-def _true_landmarks(photo: HeadPhoto) -> Tensor:
-    """Project the landmarks [68, 2] of the true mesh."""
-    corners, weights = landmark_weights()
-    return project((photo.vertices_camera[corners] * weights[..., None]).sum(1), photo.camera)
 
 
 @dataclass(frozen=True)
@@ -170,7 +161,10 @@ def _image(
     coarse, face_triangles = _coarse_grid()
     vertices = torch.cat([photo.vertices_camera[coarse], around.vertices @ photo.rotation.T + translation_m])
     triangles = torch.cat([face_triangles, around.triangles + len(coarse)])
-    fragments = rasterize(vertices, triangles, _with_margin(photo.camera, settings.margin_px))
+    lens, margin_px = photo.camera, settings.margin_px
+    side_px = lens.width_px + 2 * margin_px
+    wider = Camera(lens.focal_px, side_px, side_px, lens.cx_px + margin_px, lens.cy_px + margin_px)
+    fragments = rasterize(vertices, triangles, wider)
     face_attributes = F.pad(torch.cat([grid_uv()[coarse], torch.ones(len(coarse), 1)], 1), (0, 3))
     attributes = torch.cat([face_attributes, F.pad(colours, (3, 0))])
     pixels = interpolate(attributes, triangles, fragments)  # u, v, is face, colour around the face
@@ -189,11 +183,6 @@ def _coarse_grid() -> tuple[Tensor, Tensor]:
     new = torch.arange(ids.numel()).view(ids.shape)
     a, b, c, d = (x.reshape(-1) for x in (new[:-1, :-1], new[:-1, 1:], new[1:, :-1], new[1:, 1:]))
     return ids.reshape(-1), torch.cat([torch.stack([a, c, d], -1), torch.stack([a, d, b], -1)])
-
-
-def _with_margin(camera: Camera, margin_px: int) -> Camera:
-    side_px = camera.width_px + 2 * margin_px
-    return Camera(camera.focal_px, side_px, side_px, camera.cx_px + margin_px, camera.cy_px + margin_px)
 
 
 def _face_radiance(fields: HeadFields, skin: Skin, weights: Tensor, camera_m: Tensor) -> Tensor:

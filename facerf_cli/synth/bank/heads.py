@@ -211,14 +211,15 @@ def build_views(
     photos = [photograph_head(vertices, random, settings) for _ in range(count)]
     landmarks = torch.stack([photo.landmarks_px for photo in photos])
     fits = fit_batch(fitted_with, landmarks, crop_camera(settings.crop_px))
-    triangles = grid_triangles()
+    triangles, identity = grid_triangles(), texel_centres_uv(side).permute(2, 0, 1)
     views = []
     for photo, fitted_camera in zip(photos, fits.vertices_camera(fitted_with), strict=True):
         image, camera = _uv_image(photo), crop_camera(settings.crop_px)
         texture, visible = unwrap(image, fitted_camera.float(), triangles, camera, side)
         on_face = texture[2].clamp_min(1e-6)
         seen = visible * (texture[2] > _LEAST_COVER)
-        warp = _fill_warp(texture[:2] / on_face, seen)
+        offset = (texture[:2] / on_face - identity) * (seen > 0)
+        warp = identity + inpaint(offset, (seen > 0.3).float())  # invisible texels move as their neighbours
         views.append(
             (
                 photo.rotation,
@@ -244,6 +245,16 @@ class HeadPhoto:
     camera: Camera  # of the crop, with the true focal length and principal point
     landmarks_px: Tensor  # [68, 2] in the crop, with the errors of a detector
 
+    def true_landmarks(self) -> Tensor:
+        """Landmarks [68, 3] of the mesh, camera space."""
+        return landmarks_of(self.vertices_camera)
+
+
+def landmarks_of(vertices: Tensor) -> Tensor:
+    """Landmarks [68, 3] of the canonical mesh [V, 3]."""
+    corners, weights = landmark_weights()
+    return (vertices[corners] * weights[..., None]).sum(1)
+
 
 def photograph_head(vertices: Tensor, random: Random, settings: ViewSettings) -> HeadPhoto:
     """Take one random photo of a head [V, 3] (head frame)."""
@@ -259,9 +270,7 @@ def photograph_head(vertices: Tensor, random: Random, settings: ViewSettings) ->
     )
     vertices_camera = vertices @ rotation.T + centre_m.float()
     photo = Camera(focal_px, _PHOTO_SIDE_PX, _PHOTO_SIDE_PX, _PHOTO_SIDE_PX / 2, _PHOTO_SIDE_PX / 2)
-    corners, weights = landmark_weights()
-    landmarks_px = project((vertices_camera[corners] * weights[..., None]).sum(1), photo)
-    landmarks_px = _detected(landmarks_px, random, settings)
+    landmarks_px = _detected(project(landmarks_of(vertices_camera), photo), random, settings)
     crop = from_landmarks(landmarks_px.numpy(), settings.crop_px)
     scale = crop.size_px / crop.side_px
     camera = Camera(
@@ -293,12 +302,6 @@ def _uv_image(photo: HeadPhoto) -> Tensor:
     attributes = torch.cat([grid_uv(), torch.ones(GRID * GRID, 1)], -1)
     image = interpolate(attributes, triangles, fragments) * fragments.covered[..., None]
     return image.permute(2, 0, 1)
-
-
-def _fill_warp(warp: Tensor, seen: Tensor) -> Tensor:
-    """Fill in the warp [2, T, T] of invisible texels from the offsets of their neighbours."""
-    identity = texel_centres_uv(warp.shape[-1]).permute(2, 0, 1)
-    return identity + inpaint((warp - identity) * (seen > 0), (seen > 0.3).float())
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,8 @@ def simulate_camera(
     target = target * (MEAN_RADIANCE / _mean(albedo, visible))[:, None]
     source = source / _mean(source, visible)
     clip = uniform(1.6, 6.0)
-    source = _blurred((source / clip).clamp(0, 1), uniform(0, 1.2)) ** torch.exp(uniform(-0.22, 0.22))
+    sigma_texels = uniform(0, 1.2).view(-1, 1).expand(-1, 3).clamp_min(0.05)
+    source = scatter((source / clip).clamp(0, 1), sigma_texels) ** torch.exp(uniform(-0.22, 0.22))
     noise = torch.randn(source.shape, generator=generator) * uniform(0, 0.02)
     source = (source + noise * (source + 0.02).sqrt()).clamp(0, 1)
     return source / _mean(source, visible) * MEAN_RADIANCE, target
@@ -140,11 +141,6 @@ def _mean(field: Tensor, visible: Tensor) -> Tensor:
     """Mean over channels and visible texels [B, 1, 1, 1] of a field [B, 3, T, T]."""
     total = (field.mean(1, keepdim=True) * visible).sum((2, 3), keepdim=True)
     return total / visible.sum((2, 3), keepdim=True).clamp_min(1e-6) + 1e-6
-
-
-def _blurred(field: Tensor, sigma: Tensor) -> Tensor:
-    """Blur a field [B, 3, T, T] by Gaussians of sigma [B, 1, 1, 1] texels."""
-    return scatter(field, sigma.view(-1, 1).expand(-1, 3).clamp_min(0.05))
 
 
 _LIDS_MM, _LASHES_MM = 3.0, 7.0  # distance from the eye
@@ -169,15 +165,10 @@ def head_fields(head: dict[str, Tensor]) -> HeadFields:
     side = head["visibility"].shape[-1]
     positions = bake_attributes(head["vertices"], GRID, side)
     normals = normal_map(head["vertices"], grid_triangles(), side)
-    along_u = F.normalize(_central_difference(positions, -1), dim=0)
-    along_v = F.normalize(_central_difference(positions, -2), dim=0)
+    along_u, along_v = (F.normalize(torch.gradient(positions, dim=dim)[0], dim=0) for dim in (-1, -2))
     lit = head["visibility"] * lid_shadows(head["directions"], side)
     visibility = lit.round().byte()
     return HeadFields(positions, normals, (along_u, along_v), head["directions"], visibility, head["bounce"])
-
-
-def _central_difference(field: Tensor, dim: int) -> Tensor:
-    return torch.gradient(field, dim=dim)[0]
 
 
 def lid_shadows(directions: Tensor, side: int) -> Tensor:
@@ -259,7 +250,10 @@ def draw_sample(
     faces = [_draw_face(head, views, lights, generator) for head, views in heads]
     side = faces[0].head.normals.shape[-1]
     skin = with_occluders(draw_skin(len(faces), side, generator), Window(side), generator)
-    shaded = [_shade_face(face, _single_skin(skin, i)) for i, face in enumerate(faces)]
+    single = [
+        Skin(*columns) for columns in zip(*(vars(skin)[f.name].split(1) for f in fields(Skin)), strict=True)
+    ]
+    shaded = [_shade_face(face, one) for face, one in zip(faces, single, strict=True)]
     source = torch.stack([s for s, _ in shaded])
     target = torch.stack([t for _, t in shaded])
     warp = torch.stack([face.view.warp for face in faces])
@@ -347,11 +341,6 @@ def _to_camera(positions: Tensor, rotation: Tensor) -> Tensor:
     """Unit directions [3, T, T] from the surface to the camera, in the head frame."""
     camera_in_head = rotation.T @ torch.tensor([0.0, 0.0, _VIEW_DISTANCE_M])
     return unit_along(camera_in_head.view(3, 1, 1) - positions, 0)
-
-
-def _single_skin(skin: Skin, index: int) -> Skin:
-    """One of a batch of skins, as a batch of one."""
-    return Skin(*(getattr(skin, field.name)[index : index + 1] for field in fields(Skin)))
 
 
 def _shade_face(face: _LitFace, skin: Skin) -> tuple[Tensor, Tensor]:

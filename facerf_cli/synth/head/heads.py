@@ -57,19 +57,12 @@ class Slit:
         """Offsets along y [N] that bring the edges of a head [N, 3] together, whether they gape or cross."""
         ends = [shape[edge][[0, -1], 0] for edge in (self.upper, self.lower)]
         columns = np.linspace(max(ends[0][0], ends[1][0]), min(ends[0][1], ends[1][1]), _COLUMNS)
-        upper, lower = (
-            np.interp(columns, *_rising(shape[edge, 0], shape[edge, 1])) for edge in (self.upper, self.lower)
-        )
+        rising = (edge[np.argsort(shape[edge, 0])] for edge in (self.upper, self.lower))
+        upper, lower = (np.interp(columns, shape[edge, 0], shape[edge, 1]) for edge in rising)
         width = upper - lower + self.overlap_m
         width = np.convolve(np.pad(width, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], "valid")
         width *= np.minimum(1, np.minimum(np.arange(_COLUMNS), np.arange(_COLUMNS)[::-1]) / 2)
         return -self.weight * np.interp(shape[:, 0], columns, width, left=0, right=0)
-
-
-def _rising(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x [K] sorted, and y [K] in the same order."""
-    order = np.argsort(x)
-    return x[order], y[order]
 
 
 def eye_slit(mean: np.ndarray, shut: np.ndarray, loop: np.ndarray, triangles: np.ndarray) -> Slit:
@@ -285,14 +278,14 @@ def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
         owner = np.concatenate([np.repeat(owner[fine], 4), owner[~fine]])
         divided_uv = quartered(uv[fine]) + _slide(step, flat_uv, divided, quartered(uv[fine]))
         uv = np.concatenate([divided_uv, uv[~fine]])
-    eyes = _eyes(head, triangles[owner == _EYE], refine)
+    balls = _pieces(triangles[owner == _EYE], refine.shape[0])  # the connected components
     source, split, kinds, flat = _cut(triangles, owner, uv)
     parts = np.array([PARTS.index(name) for name in HEAD_PARTS], np.uint8)
     return _Plan(
         refine=refine,
         triangles=triangles,
         skin=np.unique(triangles[owner == _SKIN]),
-        eyes=eyes,
+        eyes=tuple(_Eye(ball[ball < count], ball) for ball in balls),
         lips=_lip_slit(head, names),
         lids=_lid_slits(head, names),
         source=source,
@@ -366,12 +359,6 @@ def _slide(step: csr_matrix, flat_uv: np.ndarray, triangles: np.ndarray, uv: np.
     moved = (step @ flat_uv)[triangles] - uv
     moved[..., 0] -= _TURN * np.round(moved[..., 0] / _TURN)
     return np.where(np.abs(moved).max(-1, keepdims=True) < _SLIDE_UV, moved, 0.0)
-
-
-def _eyes(head: HeadModel, triangles: np.ndarray, refine: csr_matrix) -> tuple[_Eye, ...]:
-    """Each eyeball: a connected component of the eyes' triangles."""
-    old = len(head.mean)
-    return tuple(_Eye(ball[ball < old], ball) for ball in _pieces(triangles, refine.shape[0]))
 
 
 def _cut(

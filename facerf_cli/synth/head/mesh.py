@@ -202,7 +202,7 @@ def part_class(part: str) -> int:
 def skin_classes(uv: np.ndarray) -> np.ndarray:
     """Classes [V] uint8 of skin at (u, v) [V, 2] of the continued UV map; ears: see `ears_of`."""
     classes = np.full(len(uv), class_index("skin"), np.uint8)
-    azimuth_deg, height_m = _place(uv)
+    azimuth_deg, height_m = (uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG, TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)
     classes[height_m < np.interp(np.abs(azimuth_deg), _JAW_DEG, _JAW_M)] = class_index("neck")
     low, high = LANDMARK_UV[17:].min(0) - _MARGIN_UV, LANDMARK_UV[17:].max(0) + _MARGIN_UV
     central = np.flatnonzero(((uv > low) & (uv < high)).all(-1))
@@ -225,11 +225,6 @@ def ears_of(mean_m: np.ndarray) -> np.ndarray:
     out_mm = 1000 * np.hypot(mean_m[:, 0], mean_m[:, 2]) - np.hypot(smooth[:, 0], smooth[:, 2])
     found: np.ndarray = near & (out_mm > _EAR_OUT_MM)
     return found
-
-
-def _place(uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth in degrees and height in metres [V] of places of the UV map on the mean head."""
-    return (uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG, TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)
 
 
 def loop_step(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
@@ -270,9 +265,10 @@ def _old_vertices(
     both = np.concatenate([edges, edges[:, ::-1]])
     both_inner = np.concatenate([inner, inner])
     valence = np.bincount(both[:, 0], minlength=count)
-    share = np.zeros(count)
+    share = np.zeros(count)  # weight of each neighbour of an old vertex inside the surface
     regular = valence > 0
-    share[regular] = _neighbour_weight(valence[regular])
+    turn = 2 * math.pi / valence[regular]
+    share[regular] = (5 / 8 - (3 / 8 + np.cos(turn) / 4) ** 2) / valence[regular]
     smooth = both[~border[both[:, 0]]]
     rim = both[~both_inner]
     rim_valence = np.bincount(rim[:, 0], minlength=count)
@@ -283,11 +279,6 @@ def _old_vertices(
         (rim[:, 0], rim[:, 1], np.where(rim_valence[rim[:, 0]] == 2, 1 / 8, 0.0)),
         (every, every, own),
     ]
-
-
-def _neighbour_weight(valence: np.ndarray) -> np.ndarray:
-    """Weight of each neighbour of an old vertex inside the surface, by its number of neighbours."""
-    return (5 / 8 - (3 / 8 + np.cos(2 * math.pi / valence) / 4) ** 2) / valence
 
 
 def quartered(uv: np.ndarray) -> np.ndarray:
