@@ -78,7 +78,7 @@ class PortraitPhoto:
     alpha: Tensor
     classes: Tensor
     albedo: Tensor  # [3, S, S] times alpha
-    normals: Tensor  # [3, S, S] unit_along, camera space; 0 off the person
+    normals: Tensor  # [3, S, S] unit, camera space; 0 off the person
     specular: Tensor  # [S, S] share of the person's radiance that highlights make, without those of lenses
 
 

@@ -2,8 +2,7 @@
 
 Irradiance is stored at the vertices of the mesh. Per channel, all images of a camera are one sparse product:
 area x albedo x barycentric weights [facets, V] times irradiance [V, L]. Highlights are shaded per facet.
-
-They lie over finished images, since nothing else here is transparent. What they refract is left out.
+Lenses lie over finished images, since nothing else here is transparent; what they refract is left out.
 """
 
 import math

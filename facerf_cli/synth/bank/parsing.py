@@ -1,13 +1,11 @@
 """Training crops for the Parsing Network: stored photos of synthetic people, altered for every sample.
 
-Synthetic people have brows and lips painted at the same places of one mesh. A network that is trained on them
-guesses where these are from the rest of the face; real brows lie higher or lower, and real lips are thinner
-or thicker.
+A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a background,
+sometimes with another person in it or something before the face. A camera then degrades it. Wide variation is
+what makes training on synthetic people serve for real ones (Wood et al., *Fake it till you make it*, 2021).
 
-A stored photo (`portraits.py`) is mirrored or not, turned, scaled and shifted in the crop, over a
-background, sometimes with another person in it or something before the face. A camera then degrades it.
-Wide variation is what makes training on synthetic people serve for real ones (Wood et al., *Fake it till you
-make it*, 2021).
+Synthetic people have brows and lips at the same places of one mesh, and a network could guess them from the
+rest of the face. So most faces are warped: real brows lie higher or lower, real lips are thinner or thicker.
 """
 
 import io

@@ -1,10 +1,9 @@
 """Photos of synthetic people with their truth, and backgrounds to lay behind them.
 
-Shapes that cover each other have the statistics of natural images (Lee et al., *Occlusion models for natural
-images*, 2001); a network that has seen them takes no pattern of a background for a person.
-
 Each person is photographed by several cameras, and each view under several lights, with other skin and other
-clothes. The background stays black; every training sample adds its own (`parsing.py`).
+clothes. The background stays black; every training sample adds its own (`parsing.py`): a view of a sky, or
+shapes that cover each other, which have the statistics of natural images (Lee et al., *Occlusion models for
+natural images*, 2001). A network that has seen them takes no pattern of a background for a person.
 """
 
 import math

@@ -1,12 +1,9 @@
 """Texture samples: a source and its targets under one light each, drawn from baked heads.
 
-The shadows of lids and lashes on open eyes are added to the baked visibility here: the face mesh, one smooth
-sheet over lids and eyes, does not cast them.
-
-They are relit as dark matte surfaces on the face; a texture cannot show their distance from it.
-
-The light transport is baked. A head is shaded on its own UV map; the warp of a fitted view then resamples the
-textures to the UV map of the fit, which misses the head by the errors of the fit.
+A head is shaded on its own UV map, from its baked light transport; the warp of a fitted view then resamples
+the textures to the UV map of the fit, which misses the head by the errors of the fit. The face mesh, one
+smooth sheet over lids and eyes, casts no shadows of lids and lashes on open eyes: they are added here.
+Fringes and glasses are dark matte surfaces on the face: a texture cannot show their distance from it.
 """
 
 from collections.abc import Sequence
@@ -154,7 +151,7 @@ class HeadFields:
 
     positions: Tensor  # [3, T, T], m
     normals: Tensor  # [3, T, T]
-    tangents: tuple[Tensor, Tensor]  # [3, T, T] each, unit_along, along u and v
+    tangents: tuple[Tensor, Tensor]  # [3, T, T] each, unit, along u and v
     directions: Tensor  # [L, 3] toward the lights
     visibility: Tensor  # [L, T, T], times 255
     bounce: Tensor  # [L, T, T], square root times 255

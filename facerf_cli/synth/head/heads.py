@@ -1,9 +1,8 @@
 """The bare head of a person: skin, eyes with a gaze, mouth and teeth.
 
-A linear face model leaves closed lips and lids open or lets them cross, by a different width for each person.
-
 A face model that has a whole head (`HeadModel`) gives its mesh; around any other face a head is built
-(`shell.py`).
+(`shell.py`). A linear model leaves closed lips and lids open or lets them cross, by another width for each
+person: a `Slit` closes them.
 """
 
 from dataclasses import dataclass

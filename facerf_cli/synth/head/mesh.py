@@ -1,12 +1,11 @@
-"""Meshes of heads and what is worn: their parts and classes, subdivision, hulls, and packed MakeHuman meshes.
+"""Meshes of heads and what is worn: parts and classes, subdivision, hulls, and packed MakeHuman meshes.
 
-As a matrix from old to new vertices, which serves all shapes, colours and labels of a mesh at once; trimesh's
-`subdivide_loop` gives the vertices of one shape.
+Loop's subdivision is a matrix from old to new vertices, which serves all shapes, colours and labels of a mesh
+at once; trimesh's `subdivide_loop` gives the vertices of one shape.
 
-The field is that of a capsule: above the middle of the skull a point is measured along the ray from that
-middle, below it along the horizontal from the vertical line through it. Crown, neck and shoulders thus all
-have one radius for each azimuth and arc. Arc is 0 at the height of the middle, positive above, negative
-below.
+A hull is measured from a capsule: above the middle of the skull along the ray from that middle, below it
+along the horizontal from the vertical line through it. Crown, neck and shoulders thus all have one radius for
+each azimuth and arc. Arc is 0 at the height of the middle, positive above, negative below.
 """
 
 import math

@@ -1,9 +1,8 @@
 """A whole head around the face of any face model, for models that have no head: shell, ears and eyeballs.
 
-The ear is modelled in its own plane: `a` back from the mouth of the ear canal, `b` up, in millimetres.
-
 The surface of the face is sampled finely and continued over skull, sides and neck (`cranium.py`). Where eyes
-and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled.
+and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled. The ear
+is modelled in its own plane: `a` back from the mouth of the ear canal, `b` up, in millimetres.
 """
 
 from dataclasses import replace

@@ -1,7 +1,7 @@
 """Headwear, neckwear and earrings, and a hand or a microphone held before the face.
 
-Every piece encloses the skull at a distance off the hull of the bare head, down to an edge whose height
-depends on the azimuth. Hair under it lies flat, and hair that would pierce it is left out.
+Headwear encloses the skull at a distance off the hull of the bare head, down to an edge whose height depends
+on the azimuth. Hair under it lies flat, and hair that would pierce it is left out.
 """
 
 from dataclasses import dataclass, replace
