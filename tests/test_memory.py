@@ -57,7 +57,7 @@ def test_a_refusal_names_what_is_needed_and_what_is_allowed() -> None:
 
 def test_what_is_held_counts_with_what_is_asked_for() -> None:
     memory.set_limit(1 << 30)
-    with memory.beside(1 << 29):
+    with memory.holding(1 << 29):
         assert memory.left_bytes() == 1 << 29
         memory.require("a.exr", 1 << 29, "crop it")
         with pytest.raises(InputError, match=r"needs 1\.25 GB of memory, and 1\.00 GB are allowed"):

@@ -1,6 +1,6 @@
 """What each output was made from, so that only stale ones are made again: recipes, and a folder's index.
 
-A recipe is all that shapes an output beside its input.
+A recipe is all that shapes an output, apart from its input.
 
 `.facerf-index.jsonl` holds three kinds of rows: files that were read (size, time, inode and SHA-256, so that
 an unchanged file is not read again), recipes, and outputs (their recipe, input and SHA-256). The last

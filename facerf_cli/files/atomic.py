@@ -1,6 +1,6 @@
 """Atomic writes, and one run at a time in an output folder.
 
-An output is written into a hidden folder beside it, made durable, and renamed.
+An output is written into a hidden folder next to it, made durable, and renamed.
 The hidden folder belongs to this process alone: its name is random and `mkdir` refuses a name that exists, so
 no link that another user has put there is followed. A power cut leaves the old output or the new one: the
 data is on the disk before the rename, and the rename before the next step (Pillai et al., 'All File Systems
@@ -69,7 +69,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def hidden_folder(path: Path) -> Iterator[Path]:
-    """Yield a hidden folder beside an output, of this process alone, which goes with the block."""
+    """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
     room = path.with_name(_room_name(path.stem))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

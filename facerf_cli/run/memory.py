@@ -20,7 +20,7 @@ _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
 _SELDOM, _USUAL = (50_000, 10, 10), gc.get_threshold()
 _set: list[int] = []  # the limit, once it was set
-_held: list[int] = []  # what is held beside that which is asked for
+_held: list[int] = []  # what is held besides what is asked for
 
 
 def set_limit(limit_bytes: int) -> None:
@@ -42,7 +42,7 @@ def default_limit(jobs: int = 1) -> int:
 
 
 @contextmanager
-def beside(held_bytes: int) -> Iterator[None]:
+def holding(held_bytes: int) -> Iterator[None]:
     """Count what is held meanwhile with whatever is asked for."""
     _held.append(held_bytes)
     try:

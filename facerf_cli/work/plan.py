@@ -37,17 +37,17 @@ _FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")
 
 def beside_photo(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
     """What is read meanwhile is held with a photo [H, W]."""
-    return memory.beside(_PHOTO_PX * math.prod(size_px))
+    return memory.holding(_PHOTO_PX * math.prod(size_px))
 
 
 def beside_person(size_px: tuple[int, ...], images: int = 0) -> AbstractContextManager[None]:
     """What is read meanwhile is held with a photo [H, W], its person and further images of its size."""
-    return memory.beside((_PERSON_PX + images * _IMAGE_PX) * math.prod(size_px))
+    return memory.holding((_PERSON_PX + images * _IMAGE_PX) * math.prod(size_px))
 
 
 def beside_stack(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
     """What is read meanwhile is held with a stack of images [H, W]."""
-    return memory.beside(_STACK_PX * math.prod(size_px))
+    return memory.holding(_STACK_PX * math.prod(size_px))
 
 
 def prediction_bytes() -> int:
