@@ -153,7 +153,7 @@ def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[
         raise InputError(
             f"{path}: no landmarks (none of {keys}); give an embedding of FLAME's landmarks"
         ) from None
-    except (IndexError, KeyError, TypeError, OverflowError, ValueError) as error:
+    except (LookupError, AttributeError, TypeError, OverflowError, ValueError) as error:
         raise InputError(
             f"{path}: no landmarks ({one_line(str(error))[:160]}); give an embedding of FLAME's landmarks"
         ) from None
@@ -171,9 +171,11 @@ def _embedding_table(path: Path) -> Mapping[str, Any]:
         table = read_inert_pickle(path)
     else:
         with path.open("rb") as file:
-            if np.lib.format.read_magic(file) != (1, 0):
-                raise ValueError("its .npy version is not 1.0")
-            _, _, kind = np.lib.format.read_array_header_1_0(file)
+            try:
+                np.lib.format.read_magic(file)
+                _, _, kind = np.lib.format.read_array_header_1_0(file)
+            except Exception as error:  # whatever damage does: numpy parses a header as a text of Python
+                raise ValueError(one_line(str(error))) from None
             if not kind.hasobject:
                 raise ValueError("it holds plain numbers, not a table")
             table = read_inert_stream(file, path)
