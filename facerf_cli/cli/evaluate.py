@@ -10,7 +10,14 @@ import typer
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.option import Only, Without
-from facerf_cli.work.evaluation_settings import DATA, MEASURES, METHODS, EvaluateOptions, SplitOptions
+from facerf_cli.work.evaluation_settings import (
+    DATA,
+    METHODS,
+    EvaluateOptions,
+    PairsOptions,
+    SplitOptions,
+    YaleOptions,
+)
 from facerf_cli.work.photo_options import FieldOptions, LightOptions, PhotoOptions, SolveOptions
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
@@ -173,38 +180,7 @@ def yale_b(
         ),
     ],
     *,
-    shifts: Annotated[
-        Path | None,
-        typer.Option(
-            "--shifts",
-            metavar="CSV",
-            help="Align images by rows subject,light,dy,dx: pixels down and right that move an image onto "
-            "its subject's frontal one.",
-            show_default="no alignment",
-            rich_help_panel=DATA,
-        ),
-    ] = None,
-    subjects: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--subjects",
-            metavar="NAME,...",
-            help="Measure these subjects only, such as yaleB05,yaleB15. Repeatable.",
-            show_default="all",
-            rich_help_panel=DATA,
-        ),
-    ] = None,
-    room: Annotated[
-        float,
-        typer.Option(
-            "--room",
-            metavar="SHARE",
-            min=0.0,
-            max=1.0,
-            help="Light from all around that comes with each flash, as a room sends it back: a share of it.",
-            rich_help_panel=DATA,
-        ),
-    ] = 0.0,
+    yale: YaleOptions,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
     field: FieldOptions,
     options: Annotated[EvaluateOptions, Only(*_GIVEN_LIGHTS, *_BATCH)],
@@ -224,7 +200,7 @@ def yale_b(
         options = replace(options, reflectance=["portrait"])
     from facerf_cli.work.evaluate_items import run_yale_b
 
-    raise typer.Exit(run_yale_b(folder, options, photo, shifts, subjects or [], field.network_alone, room))
+    raise typer.Exit(run_yale_b(folder, options, photo, yale, field.network_alone))
 
 
 def pairs(
@@ -238,45 +214,7 @@ def pairs(
             show_default=False,
         ),
     ],
-    truth: Annotated[
-        Path,
-        typer.Option(
-            "--truth",
-            metavar="DIR",
-            help="Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...",
-            show_default=False,
-        ),
-    ],
-    *,
-    masks: Annotated[
-        Path | None,
-        typer.Option(
-            "--masks",
-            metavar="DIR",
-            help="Compare inside masks: images with the truths' names, white inside.",
-            show_default="the truths' alpha, else everything",
-            rich_help_panel=DATA,
-        ),
-    ] = None,
-    facts: Annotated[
-        Path | None,
-        typer.Option(
-            "--facts",
-            metavar="CSV",
-            help="Read a row for each image: name, person, and columns for the tables (text) or for the list "
-            "of images (numbers).",
-            show_default="a person is a truth's topmost folder",
-            rich_help_panel=DATA,
-        ),
-    ] = None,
-    face_distance: Annotated[
-        bool,
-        typer.Option(
-            "--face-distance",
-            help="Detect the truths' faces and measure Face dis, too.",
-            rich_help_panel=MEASURES,
-        ),
-    ] = False,
+    compared: PairsOptions,
     options: Annotated[EvaluateOptions, Only(*_GIVEN_IMAGES, *_BATCH)],
 ) -> None:
     """Measure folders of predictions against a folder of truths, image by image.
@@ -286,11 +224,10 @@ def pairs(
     """
     options = replace(options, reflectance=[])
     options.check()
-    options.require_output_apart([*predictions, truth, *([] if masks is None else [masks])])
+    options.require_output_apart([*predictions, *filter(None, (compared.truth, compared.masks))])
     from facerf_cli.work.evaluate_items import run_pairs
 
-    settings = settings_of(context)
-    raise typer.Exit(run_pairs(predictions, truth, options, settings, masks, facts, face_distance))
+    raise typer.Exit(run_pairs(predictions, compared, options, settings_of(context)))
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):

@@ -44,7 +44,7 @@ from facerf_cli.network.files import checkpoint_file
 from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import load_models
 from facerf_cli.work.evaluate import run_protocol
-from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
+from facerf_cli.work.evaluation_settings import EvaluateOptions, PairsOptions, SplitOptions, YaleOptions
 from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, Refine, networks_of
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
@@ -460,21 +460,23 @@ def _preset_couples(couples: dict[Item, _Couple], options: EvaluateOptions) -> d
 
 
 def run_yale_b(
-    folder: Path,
-    options: EvaluateOptions,
-    photo: PhotoOptions,
-    shifts: Path | None,
-    subjects: Sequence[str],
-    network_alone: bool,
-    room: float,
+    folder: Path, options: EvaluateOptions, photo: PhotoOptions, yale: YaleOptions, network_alone: bool
 ) -> int:
-    """Measure the subjects of Extended Yale B, all if none are named; the exit code."""
-    database = read_yale_b(folder, None if shifts is None else read_shifts(shifts))
-    chosen = _chosen(database, subjects)
+    """Measure the subjects of Extended Yale B, all if none are named; the exit code.
+
+    Args:
+        folder: The database.
+        options: The shared options.
+        photo: How faces are found and fitted.
+        yale: The images that are measured.
+        network_alone: True to leave the photo's correction out of the field.
+    """
+    database = read_yale_b(folder, None if yale.shifts is None else read_shifts(yale.shifts))
+    chosen = _chosen(database, yale.subjects or ())
     settings = FaceSettings("yale-b", options, photo, network_alone=network_alone)
     items = [Item(folder / name, options.output / "cases" / name, name) for name in chosen]
-    work = YaleWork(settings, shifts, room, database)
-    return settings.run(layout(database, chosen, network_alone, room), items, work)
+    work = YaleWork(settings, yale, database)
+    return settings.run(layout(database, chosen, network_alone, yale.room), items, work)
 
 
 def _chosen(database: YaleB, given: Sequence[str]) -> list[str]:
@@ -491,8 +493,7 @@ class YaleWork:
     """Compares one subject's cases."""
 
     settings: FaceSettings
-    shifts: Path | None
-    room: float
+    yale: YaleOptions
     database: YaleB = field(metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
@@ -507,23 +508,18 @@ class YaleWork:
             self.settings.network_alone,
             photo.geometry or models.default_geometry,
             photo.landmarks_from,
-            self.room,
+            self.yale.room,
         )
 
 
 def run_pairs(
-    predictions: Sequence[Path],
-    truth: Path,
-    options: EvaluateOptions,
-    settings: Settings,
-    masks: Path | None,
-    facts: Path | None,
-    face_distance: bool,
+    predictions: Sequence[Path], compared: PairsOptions, options: EvaluateOptions, settings: Settings
 ) -> int:
     """Measure folders of predictions against a folder of truths; the exit code."""
-    pairs = collect_pairs(predictions, truth, masks, facts)
+    truth = compared.truth
+    pairs = collect_pairs(predictions, truth, compared.masks, compared.facts)
     by = dict.fromkeys(n for pair in pairs for n, value in pair.facts.items() if isinstance(value, str))
-    asked = {"lpips": options.vgg_weights is not None, "face_distance": face_distance}
+    asked = {"lpips": options.vgg_weights is not None, "face_distance": compared.face_distance}
     metrics = ("si_mse", "mse", "psnr", "ssim", *(name for name, wanted in asked.items() if wanted))
     tables = Layout("pairs", f"Predictions against {folder_name(truth)}", metrics, tuple(by))
     size = math.ceil(len(pairs) / _PARTS)
@@ -531,7 +527,7 @@ def run_pairs(
     items = [Item(truth, options.output / f"part-{n:02d}", f"part-{n:02d}") for n, _ in enumerate(starts)]
     parts = {item.name: tuple(pairs[start : start + size]) for item, start in zip(items, starts, strict=True)}
     names = tuple(map(folder_name, predictions))
-    work = PairsWork(names, tuple(predictions), masks, facts, face_distance, settings, parts)
+    work = PairsWork(names, tuple(predictions), compared, settings, parts)
     return run_protocol(tables, items, work, options, settings)
 
 
@@ -541,14 +537,12 @@ class PairsWork:
 
     names: tuple[str, ...]
     predictions: tuple[Path, ...]
-    masks: Path | None
-    facts: Path | None
-    face_distance: bool
+    compared: PairsOptions
     settings: Settings
     parts: Mapping[str, tuple[ImagePair, ...]] = field(metadata=NOT_IN_RECIPE)
 
     def __call__(self, item: Item) -> Iterator[Comparison]:
         """Yield the comparisons of a part of the pairs."""
-        models = load_models_once(PhotoOptions(self.settings)) if self.face_distance else None
+        models = load_models_once(PhotoOptions(self.settings)) if self.compared.face_distance else None
         for pair in self.parts[item.name]:
             yield compare_pair(pair, models.networks.parsing if models else None)

@@ -33,6 +33,65 @@ class SplitOptions:
 
 
 @dataclass(frozen=True)
+class YaleOptions:
+    """The images of Extended Yale B that are measured."""
+
+    shifts: Path | None = option(
+        None,
+        "Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its "
+        "subject's frontal one.",
+        "CSV",
+        shown_default="no alignment",
+        panel=DATA,
+    )
+    subjects: list[str] | None = option(
+        None,
+        "Measure these subjects only, such as yaleB05,yaleB15. Repeatable.",
+        "NAME,...",
+        in_recipe=False,  # an item is a subject
+        shown_default="all",
+        panel=DATA,
+    )
+    room: float = option(
+        0.0,
+        "Light from all around that comes with each flash, as a room sends it back: a share of it.",
+        "SHARE",
+        least=0.0,
+        most=1.0,
+        panel=DATA,
+    )
+
+
+@dataclass(frozen=True)
+class PairsOptions:
+    """The images that predictions are compared with."""
+
+    truth: Path = option(
+        ...,
+        "Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...",
+        "DIR",
+        in_recipe=False,  # an item's input
+        shown_default=False,
+    )
+    masks: Path | None = option(
+        None,
+        "Compare inside masks: images with the truths' names, white inside.",
+        "DIR",
+        shown_default="the truths' alpha, else everything",
+        panel=DATA,
+    )
+    facts: Path | None = option(
+        None,
+        "Read a row for each image: name, person, and columns for the tables (text) or for the list of "
+        "images (numbers).",
+        "CSV",
+        shown_default="a person is a truth's topmost folder",
+        panel=DATA,
+    )
+    face_distance: bool = option(False, "Detect the truths' faces and measure Face dis, too.", panel=MEASURES)
+
+
+@dataclass(frozen=True)
 class EvaluateOptions(BatchOptions):
     """Settings of what is measured, by which methods, and where it goes, for other processes too."""
 

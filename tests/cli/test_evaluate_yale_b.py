@@ -15,7 +15,7 @@ from facerf_cli.evaluation import yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
 from facerf_cli.work.evaluate_items import FaceSettings, YaleWork
-from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.work.evaluation_settings import EvaluateOptions, YaleOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
 from tests.evaluation.method_doubles import FaceModelOnly
@@ -121,7 +121,7 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
 
 def test_the_work_goes_to_other_processes(folder: Path) -> None:
     settings = FaceSettings("yale-b", EvaluateOptions(folder), PhotoOptions(Settings()), network_alone=False)
-    sent = pickle.loads(pickle.dumps(YaleWork(settings, None, 0.1, read_yale_b(folder))))
-    assert sent.room == 0.1 and sent.settings == settings
+    sent = pickle.loads(pickle.dumps(YaleWork(settings, YaleOptions(room=0.1), read_yale_b(folder))))
+    assert sent.yale.room == 0.1 and sent.settings == settings
     assert sent.database.flashes("yaleB07") == sorted(FEW)
     np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)
