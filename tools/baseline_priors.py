@@ -1,6 +1,6 @@
 """Learn the priors of the baselines from procedural skins and envmaps.
 
-`python -m tools.baseline_priors FILE` writes the asset that `baselines/priors.py` loads. Its seeds
+`python -m tools.baseline_priors FILE` writes the asset that `baselines/synthesis.py` loads. Its seeds
 are used by no dataset. The prior of light is the mean and covariance of procedural maps of mean radiance 1,
 rotated about the vertical: more light comes from above, and the colours of directions are correlated.
 """

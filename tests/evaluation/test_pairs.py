@@ -11,7 +11,6 @@ from facerf_cli.evaluation.measure import Measures, measure
 from facerf_cli.evaluation.pairs import collect_pairs, compare_pair
 from facerf_cli.files.images import write_exr
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 NAMES = ("anna/one", "anna/two", "bert/one")
 SHAPE = (6, 9, 3)
@@ -187,9 +186,3 @@ def test_files_that_hold_no_image(truths: Path, ours: Path, trouble: str) -> Non
         (ours / "anna/one.exr").write_text("no picture")
     with pytest.raises(InputError, match=r"anna/one\.(npy|exr)"):
         compare_pair(collect_pairs([ours], truths)[0])
-
-
-def test_a_truth_without_a_face_has_no_face_distance(truths: Path, ours: Path) -> None:
-    pair = collect_pairs([ours], truths)[0]
-    with pytest.raises(InputError, match="no face found"):
-        compare_pair(pair, SHIPPED_NETWORKS.parsing)
