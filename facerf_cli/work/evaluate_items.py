@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
@@ -49,7 +49,6 @@ from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, Refine, networks_of
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
 
-T = TypeVar("T")
 Protocol = Literal["olat", "reconstruction", "transfer", "geometry", "yale-b"]
 Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person: pairs whose sources are compared together
 
@@ -401,47 +400,31 @@ def _require_enough(found: int, needed: int, what: str, dataset: Path, per_subje
 def _couples(inputs: Sequence[str], output: Path) -> dict[Item, _Couple]:
     """An item for each couple: two files each as they are named, and two each of a folder in its order."""
     inputs = list(expand_inputs(inputs))
-    files = [name for name in inputs if not os.path.isdir(name)]
-    if len(files) % 2:
-        raise UsageError(
-            f"{len(files)} photos: an odd number; give two of each person, A B A B ..., or a folder for each "
-            "person"
-        )
     items = collect_items(inputs, output, PHOTO_SUFFIXES)
     by_path = {os.path.abspath(item.input_path): item for item in items}
-    named = [by_path[os.path.abspath(name)] for name in files]
-    couples = [_Couple(first.name, first, second) for first, second in _two_by_two(named)]
-    groups: dict[Path, list[Item]] = {}
+    named = [by_path[os.path.abspath(name)] for name in inputs if not os.path.isdir(name)]
+    groups: dict[Path | None, list[Item]] = {None: named}
     for item in items:
         if item not in named:
             groups.setdefault(item.input_path.parent, []).append(item)
+    couples: dict[Item, _Couple] = {}
+    given: set[frozenset[Path]] = set()
+    advice = "give two of each person, A B A B ..., or a folder for each person"
     for folder, members in groups.items():
         if len(members) % 2:
             raise UsageError(
-                f"{folder}: {len(members)} photos, an odd number; give two, four, ... of a person"
+                f"{folder or members[-1].input_path}: {len(members)} photos, an odd number; {advice}"
             )
-        place = Path(members[0].name).parent.as_posix()
-        person = folder.resolve().name if place == "." else place
-        couples += [_Couple(person, first, second) for first, second in _two_by_two(members)]
-    _require_different(couples)
-    return {couple.item: couple for couple in couples}
-
-
-def _two_by_two(members: Sequence[T]) -> Iterator[tuple[T, T]]:
-    return zip(members[::2], members[1::2], strict=True)
-
-
-def _require_different(couples: Sequence[_Couple]) -> None:
-    """Raise UsageError for a couple of one photo, or of the same two photos as another couple."""
-    given: set[frozenset[Path]] = set()
-    for couple in couples:
-        first, second = couple.first.input_path, couple.second.input_path
-        files = frozenset(path.resolve() for path in (first, second))
-        if len(files) < 2:
-            raise UsageError(f"{first}: given twice; give two photos of a person, A B A B ...")
-        if files in given:
-            raise UsageError(f"{first} and {second}: given as a couple twice; give them once")
-        given.add(files)
+        for first, second in zip(members[::2], members[1::2], strict=True):
+            files = frozenset(item.input_path.resolve() for item in (first, second))
+            if len(files) < 2 or files in given:
+                raise UsageError(f"{first.input_path} and {second.input_path}: given twice; {advice}")
+            given.add(files)
+            place = Path(first.name).parent.as_posix()
+            of_folder = folder.resolve().name if folder and place == "." else place
+            couple = _Couple(of_folder if folder else first.name, first, second)
+            couples[couple.item] = couple
+    return couples
 
 
 def _preset_couples(couples: dict[Item, _Couple], options: EvaluateOptions) -> dict[Item, _Couple]:
