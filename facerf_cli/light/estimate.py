@@ -166,22 +166,20 @@ def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(channels, -1)).float()
 
 
-def estimate_smooth_weights(
-    directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor, reaches: float = _REACHES
-) -> Tensor:
+def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
     """Solve Eq. (leastsq) for a plausible light: non-negative, smooth where the face does not determine it.
 
     The lights have directions [L, 3] and images [L, 3, N], which are to sum to an image [3, N]. A face
     determines few of the hundreds of weights, and a solution for each channel alone has coloured specks. So
     all channels first share one grey light, tinted, that is smooth except for lone bright lights; then each
     channel differs from it by weights that are smooth over the sphere. Lights that hardly reach the face
-    (their mean radiance on it is below the share `reaches` of the brightest light's) are not solved for:
+    (their mean radiance on it is below a tenth of the brightest light's) are not solved for:
     their weights continue those around them. Covered and misfitted elements lose weight;
     where `clipped` [3, N] bool, only too dark a result is an error.
     """
     from_near = _difference_from_neighbours(directions.double().numpy())
     radiance = olats.double().mean((1, 2)).numpy()
-    continued = _continuation(from_near, radiance > reaches * radiance.max())  # [L, S]
+    continued = _continuation(from_near, radiance > _REACHES * radiance.max())  # [L, S]
     channels = [
         _Channel(lights.double().T.numpy() @ continued, target.double().numpy(), white.numpy())
         for lights, target, white in zip(olats.unbind(1), image, clipped, strict=True)

@@ -110,15 +110,13 @@ def _repel(points: np.ndarray, step: float) -> np.ndarray:
     return moved / np.linalg.norm(moved, axis=-1, keepdims=True)
 
 
-def brightest_direction(light: RigLight, front_only: bool = False) -> Tensor:
+def brightest_direction(light: RigLight) -> Tensor:
     """The unit direction [3] in which the blurred luminance of a light is greatest; 0 for a dark light.
 
     The blur, a von Mises-Fisher lobe, adds up the weights of neighbouring lights that share one light
-    source. `front_only` leaves out the lights behind the face (z < 0), which shading hardly determines.
+    source.
     """
     luminance = light.weights.double() @ torch.tensor(_LUMINANCE, dtype=torch.float64)
-    if front_only:
-        luminance = luminance * (light.directions[:, 2] > 0)
     where = latlong_directions(_BLUR_ROWS, 2 * _BLUR_ROWS, torch.float64).reshape(-1, 3)
     sharpness = 1 / math.radians(_BLUR_DEG) ** 2
     blurred = torch.exp(sharpness * (where @ light.directions.double().T - 1)) @ luminance

@@ -124,9 +124,3 @@ def test_green_counts_more_than_blue_and_darkness_has_no_direction() -> None:
     light = RigLight(rig, torch.tensor([[0.0, 1.0, 0], [0, 0, 1.0]]))
     assert brightest_direction(light)[0] > 0.99
     assert (brightest_direction(RigLight(rig, torch.zeros(2, 3))) == 0).all()
-
-
-def test_front_only_leaves_out_what_is_behind() -> None:
-    light = RigLight(torch.tensor([[0.0, 0, -1], [0, 0.6, 0.8]]), torch.tensor([[5.0] * 3, [1.0] * 3]))
-    assert brightest_direction(light)[2] < -0.9
-    assert brightest_direction(light, front_only=True)[2] > 0.7
